@@ -1,0 +1,309 @@
+"""The loop between functional and pointwise map. Every refiner plugs its half-steps into it."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Int32
+
+from .filters import FilterBank, Meyer
+from .functional_map import (
+    Convention,
+    PseudoInverse,
+    dual_eigenvectors,
+    multiscale_kernel,
+    project_matches,
+    wavelet_energy,
+)
+from .pointwise_map import decode, matching_objective
+from .spectrum import Spectrum
+
+
+class RESULTS(eqx.Enumeration):
+    """How a refinement ended; each failure carries the sentence to show a person."""
+
+    successful = ""
+    nonfinite_spectrum = (
+        "A spectrum holds NaN or infinity, so nothing was refined; recompute it and check the mesh it is of."
+    )
+    invalid_initial_map = (
+        "The initial map names target vertices that do not exist or are masked, so nothing was refined; it "
+        "needs one index from 0 to n - 1 per source vertex."
+    )
+    nonfinite_functional_map = (
+        "The functional map became NaN or infinite. In float32 this can be overflow (scale the surfaces to "
+        "area 1, or use float64); with the least-squares pseudo-inverse it can be that there are fewer "
+        "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
+    )
+
+
+class Problem(eqx.Module):
+    """A pair of shapes and what a refiner prepared for it once, to be used in every iteration."""
+
+    spectrum_x: Spectrum
+    spectrum_y: Spectrum
+    prepared: Any = None
+
+
+class Refiner(eqx.Module):
+    """One method of refinement: how a functional map follows from a pointwise map, and the way back."""
+
+    @abc.abstractmethod
+    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool) -> Problem:
+        """Compute what stays the same in all iterations.
+
+        `sampled` says that the spectra are sampled ones, whose eigenvectors are not orthonormal.
+        """
+
+    @abc.abstractmethod
+    def update(self, problem: Problem, pointwise_map: Int[Array, " m"]) -> Float[Array, "k_out k_in"]:
+        """The functional map that follows from a pointwise map."""
+
+    @abc.abstractmethod
+    def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
+        """The pointwise map that follows from a functional map."""
+
+    @abc.abstractmethod
+    def energy(
+        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """What the method wants to be small, for the history."""
+
+    @abc.abstractmethod
+    def objective(
+        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """What `recover` minimises, for the history."""
+
+
+class History(eqx.Module):
+    """What happened in each iteration; NaN for iterations that an early stop made needless.
+
+    **Attributes:**
+
+    - `changed`: (iterations,), share of source vertices whose match changed. While iterating on samples it
+      is the share of samples; NaN where there is nothing to compare with (their first and last iteration).
+    - `energy`: (iterations,), `Refiner.energy` of the functional map and the pointwise map it was made of;
+      for `WaveletPreservation` the energy of eq. (5).
+    - `objective`: (iterations,), `Refiner.objective` of the functional map and the map recovered from it.
+    """
+
+    changed: Float[Array, " iterations"]
+    energy: Float[Array, " iterations"]
+    objective: Float[Array, " iterations"]
+
+
+class Refinement(eqx.Module):
+    """The outcome of `refine`, a pytree.
+
+    **Attributes:**
+
+    - `pointwise_map`: T: X -> Y (m,), one vertex of Y per vertex of X; -1 throughout on failure.
+    - `functional_map`: the C that gave it.
+    - `result`: a member of `RESULTS`; compare with `RESULTS.successful`.
+    - `iterations`: how many were done (fewer than asked for after an early stop).
+    - `history`: a `History` when asked for, else None.
+    """
+
+    pointwise_map: Int32[Array, " m"]
+    functional_map: Float[Array, "k_out k_in"]
+    result: RESULTS
+    iterations: Int32[Array, ""]
+    history: History | None
+
+
+class WaveletPreservation(Refiner):
+    """Multiscale spectral manifold wavelets preservation with a tight frame: Algorithm 1 of the MWP paper.
+
+    The functional map is filtered, `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (eq. 8), which is one
+    elementwise product with a (k, k) kernel; the pointwise map is its nearest neighbours. For this to be
+    the minimiser of the energy (5) the bank has to be Parseval.
+
+    **Arguments:**
+
+    - `bank`: the filters.
+    - `convention`: which way C goes; see `jaxsmw.core.functional_map`. `"pushforward"`, as the paper
+      prints, is there for study: on real pairs it fails (`spectral_embeddings` says why).
+    - `pseudo_inverse`: see `dual_eigenvectors`. Samples are always taken by least squares.
+    - `lambda_max`: where the bank ends: `"own"`, each shape's largest eigenvalue, which makes a difference
+      in size cancel; or `"common"`, the larger of the two.
+    """
+
+    bank: FilterBank = Meyer()
+    convention: Convention = eqx.field(static=True, default="pullback")
+    pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
+    lambda_max: Literal["own", "common"] = eqx.field(static=True, default="own")
+
+    def responses(
+        self, spectrum_x: Spectrum, spectrum_y: Spectrum
+    ) -> tuple[Float[Array, "filters k_x"], Float[Array, "filters k_y"]]:
+        """The bank on both shapes' eigenvalues."""
+        lambda_max_x, lambda_max_y = spectrum_x.eigenvalues[-1], spectrum_y.eigenvalues[-1]
+        if self.lambda_max == "common":
+            lambda_max_x = lambda_max_y = jnp.maximum(lambda_max_x, lambda_max_y)
+        return (
+            self.bank(spectrum_x.eigenvalues, lambda_max_x),
+            self.bank(spectrum_y.eigenvalues, lambda_max_y),
+        )
+
+    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool) -> Problem:
+        """Prepare the multiscale kernel and the dual eigenvectors of the shape that C leads to."""
+        responses_x, responses_y = self.responses(spectrum_x, spectrum_y)
+        pseudo_inverse: PseudoInverse = "least_squares" if sampled else self.pseudo_inverse
+        if self.convention == "pullback":
+            kernel = multiscale_kernel(responses_x, responses_y)
+            dual_out = dual_eigenvectors(spectrum_x, pseudo_inverse)
+        else:
+            kernel = multiscale_kernel(responses_y, responses_x)
+            dual_out = dual_eigenvectors(spectrum_y, pseudo_inverse)
+        return Problem(spectrum_x, spectrum_y, (kernel, dual_out))
+
+    def update(self, problem: Problem, pointwise_map: Int[Array, " m"]) -> Float[Array, "k_out k_in"]:
+        """Eq. (8)."""
+        kernel, dual_out = problem.prepared
+        spectrum_in = problem.spectrum_y if self.convention == "pullback" else problem.spectrum_x
+        unfiltered = project_matches(
+            pointwise_map, dual_out, spectrum_in.eigenvectors, convention=self.convention
+        )
+        return unfiltered * kernel
+
+    def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
+        """Nearest neighbours; see `decode`."""
+        return decode(functional_map, problem.spectrum_x, problem.spectrum_y, convention=self.convention)
+
+    def energy(
+        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """Eq. (5); see `wavelet_energy`."""
+        spectra = problem.spectrum_x, problem.spectrum_y
+        return wavelet_energy(
+            functional_map, pointwise_map, *spectra, *self.responses(*spectra), convention=self.convention
+        )
+
+    def objective(
+        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """The mean squared distance found by the search; see `matching_objective`."""
+        return matching_objective(
+            functional_map, pointwise_map, problem.spectrum_x, problem.spectrum_y, convention=self.convention
+        )
+
+
+@eqx.filter_jit
+def refine(
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    pointwise_map: Int[Array, " m"],
+    *,
+    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
+    iterations: int = 3,
+    samples_x: Int[Array, " s_x"] | None = None,
+    samples_y: Int[Array, " s_y"] | None = None,
+    stop_when_unchanged: bool = False,
+    history: bool = False,
+) -> Refinement:
+    """Refine a pointwise map T: X -> Y by turns of functional map and pointwise map (Algorithm 1).
+
+    Pure and jit-compiled; compiled again only when sizes or static settings change. For many pairs of
+    equal size use `jax.vmap`, or `jax.lax.map` where memory counts.
+
+    With samples this is the MWP authors' fast variant: the first functional map comes from all vertices,
+    then the turns are taken between the samples alone, and the last search is over all vertices.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+    - `pointwise_map`: the initial T, one vertex of Y per vertex of X.
+    - `refiner`: the method.
+    - `iterations`: how many functional maps, each followed by its pointwise map; at least 1.
+    - `samples_x`, `samples_y`: vertices of X and of Y to iterate on, both or neither; more of them than
+      there are eigenvectors, evenly spread.
+    - `stop_when_unchanged`: skip the remaining iterations once no match changes. (Under `vmap` all pairs
+      cost as much as the slowest, but each still stops where it would alone.)
+    - `history`: record a `History`, for about a tenth more time.
+
+    **Returns:** A `Refinement`. Nothing is raised for bad numbers: check its `result`.
+
+    **Raises:** `ValueError` for fewer than one iteration or samples on one side only.
+    """
+    if iterations < 1:
+        raise ValueError(f"refine needs at least 1 iteration, not {iterations}")
+    if (samples_x is None) != (samples_y is None):
+        raise ValueError("samples are needed on both shapes or on neither")
+
+    whole = working = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
+    working_map = pointwise_map = pointwise_map.astype(jnp.int32)
+    if samples_x is not None and samples_y is not None:
+        working = refiner.prepare(spectrum_x.sample(samples_x), spectrum_y.sample(samples_y), sampled=True)
+        working_map = jnp.full(samples_x.shape, -1, jnp.int32)
+    dtype = spectrum_x.eigenvectors.dtype
+    undefined = jnp.asarray(jnp.nan, dtype)
+
+    def search(problem: Problem, functional_map: Array, before: Array) -> tuple[Array, Array, Array]:
+        after = refiner.recover(problem, functional_map)
+        mask = problem.spectrum_x.mask
+        changed = jnp.sum((after != before) & mask) / jnp.sum(mask)
+        objective = refiner.objective(problem, functional_map, after) if history else undefined
+        return after, changed.astype(dtype), objective
+
+    def energy(problem: Problem, functional_map: Array, pointwise_map: Array) -> Array:
+        return refiner.energy(problem, functional_map, pointwise_map) if history else undefined
+
+    def turn(carry: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        before, functional_map, its_energy, finite, count, _ = carry
+        after, changed, objective = search(working, functional_map, before)
+        following = refiner.update(working, after)
+        finite &= jnp.all(jnp.isfinite(following))
+        carry = (after, following, energy(working, following, after), finite, count + 1, changed == 0)
+        nothing_to_compare = (before[0] < 0) if samples_x is not None else jnp.asarray(False)
+        return carry, (jnp.where(nothing_to_compare, jnp.nan, changed), its_energy, objective)
+
+    def step(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        if not stop_when_unchanged:
+            return turn(carry)
+        return lax.cond(carry[-1], lambda carry: (carry, (undefined,) * 3), turn, carry)
+
+    functional_map = refiner.update(whole, pointwise_map)
+    carry = (
+        working_map,
+        functional_map,
+        energy(whole, functional_map, pointwise_map),
+        jnp.all(jnp.isfinite(functional_map)),
+        jnp.asarray(1, jnp.int32),
+        jnp.asarray(False),
+    )
+    carry, records = lax.scan(step, carry, None, length=iterations - 1)
+    before, functional_map, its_energy, finite, count, _ = carry
+    if samples_x is None:
+        refined, changed, objective = search(whole, functional_map, before)
+    else:
+        refined, _, objective = search(whole, functional_map, pointwise_map)
+        changed = undefined
+
+    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, finite)
+    refined = jnp.where(result == RESULTS.successful, refined, -1)
+    recorded = None
+    if history:
+        last = (changed, its_energy, objective)
+        recorded = History(*(jnp.append(series, value) for series, value in zip(records, last, strict=True)))
+    return Refinement(refined, functional_map, result, count, recorded)
+
+
+def _diagnose(
+    spectrum_x: Spectrum, spectrum_y: Spectrum, pointwise_map: Int32[Array, " m"], finite: Bool[Array, ""]
+) -> RESULTS:
+    """The result code, the first cause first."""
+    vertices_y = spectrum_y.mask.shape[0]
+    in_range = (pointwise_map >= 0) & (pointwise_map < vertices_y)
+    valid = in_range & spectrum_y.mask[jnp.clip(pointwise_map, 0, vertices_y - 1)]
+    finite_spectra = jnp.asarray(True)
+    for spectrum in (spectrum_x, spectrum_y):
+        for leaf in (spectrum.eigenvalues, spectrum.eigenvectors, spectrum.vertex_areas):
+            finite_spectra &= jnp.all(jnp.isfinite(leaf))
+    result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
+    result = RESULTS.where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
+    return RESULTS.where(finite_spectra, result, RESULTS.nonfinite_spectrum)

@@ -1,0 +1,54 @@
+"""The Spectrum: all that the traced core knows of a shape."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Spectrum(eqx.Module):
+    """The first k eigenpairs of a shape's Laplace–Beltrami operator, as a pytree of arrays.
+
+    `W phi = lambda A phi` with W the positive semi-definite cotangent stiffness and A the lumped vertex
+    areas; the eigenvectors are orthonormal in the areas, `Phi^T A Phi = I`.
+
+    Written for one shape. A stack of shapes of equal size (every leaf with a leading axis) goes through
+    `jax.vmap`; sizes differ, so smaller shapes are padded with vertices that have `mask` False, zero area
+    and zero eigenvectors. A vertex that no face uses is just such a vertex.
+
+    **Attributes:**
+
+    - `eigenvalues`: (k,), ascending, in units of 1 / length².
+    - `eigenvectors`: (n, k).
+    - `vertex_areas`: (n,), in units of length²; zero where masked.
+    - `mask`: (n,), True for vertices of the surface.
+    """
+
+    eigenvalues: Float[Array, " k"]
+    eigenvectors: Float[Array, "n k"]
+    vertex_areas: Float[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    def truncate(self, number_of_eigenvectors: int) -> Spectrum:
+        """The same shape with its first eigenpairs only."""
+        return Spectrum(
+            self.eigenvalues[:number_of_eigenvectors],
+            self.eigenvectors[:, :number_of_eigenvectors],
+            self.vertex_areas,
+            self.mask,
+        )
+
+    def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
+        """The shape seen at some evenly spread vertices only, each standing for the same share of the area.
+
+        The eigenvectors are no longer orthonormal there, so only the least-squares pseudo-inverse makes
+        sense of them.
+        """
+        share = jnp.sum(self.vertex_areas) / vertices.shape[0]
+        return Spectrum(
+            self.eigenvalues,
+            self.eigenvectors[vertices],
+            jnp.full(vertices.shape, share),
+            self.mask[vertices],
+        )

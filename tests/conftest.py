@@ -1,0 +1,26 @@
+"""What every test shares: double precision on, and where the real shapes lie."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The directory with real shapes (`data/`) and reference results (`oracle/`).
+
+    `JAXSMW_SHARED` names it; by default it is `shared/` beside the checkout. Without it the tests on real
+    shapes skip, except where `CI` is set: there a silent skip would hide that nothing was tested.
+    """
+    default = Path(__file__).resolve().parents[2] / "shared"
+    directory = Path(os.environ.get("JAXSMW_SHARED", default))
+    if not (directory / "data").is_dir() or not (directory / "oracle").is_dir():
+        message = f"no real shapes at {directory}: set JAXSMW_SHARED to the directory with data/ and oracle/"
+        if os.environ.get("CI"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return directory
