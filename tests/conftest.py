@@ -1,12 +1,19 @@
-"""What every test shares: double precision on, and where the real shapes lie."""
+"""What every test shares: double precision and strict promotion on, and where the real shapes lie."""
 
 import os
 from pathlib import Path
 
+import hypothesis
 import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Compiling is slow the first time, which is no failure.
+hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("default")
 
 
 @pytest.fixture(scope="session")

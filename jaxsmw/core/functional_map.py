@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Float, Int
 
-from .filters import frame_function
-from .spectrum import Spectrum
+from jaxsmw.core.filters import frame_function
+from jaxsmw.core.spectrum import Spectrum
 
 Convention = Literal["pullback", "pushforward"]
 PseudoInverse = Literal["area", "least_squares"]

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
-from .functional_map import Convention
-from .spectrum import Spectrum
+from jaxsmw.core.functional_map import Convention
+from jaxsmw.core.spectrum import Spectrum
 
 # Queries scored at once, and database rows per chunk. Measured on two CPU cores (scripts/benchmark_speed.py):
 # a block of scores has to stay in the cache, and a chunk's maximum vectorises where an argmax does not.

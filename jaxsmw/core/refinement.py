@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from .filters import FilterBank, Meyer
-from .functional_map import (
+from jaxsmw.core.filters import FilterBank, Meyer
+from jaxsmw.core.functional_map import (
     Convention,
     PseudoInverse,
     dual_eigenvectors,
@@ -19,8 +19,8 @@ from .functional_map import (
     project_matches,
     wavelet_energy,
 )
-from .pointwise_map import decode, matching_objective
-from .spectrum import Spectrum
+from jaxsmw.core.pointwise_map import decode, matching_objective
+from jaxsmw.core.spectrum import Spectrum
 
 
 class RESULTS(eqx.Enumeration):

@@ -1,0 +1,45 @@
+from .core.filters import FilterBank, Meyer, frame_function
+from .core.functional_map import encode, multiscale_kernel, wavelet_energy
+from .core.pointwise_map import decode, nearest_neighbor
+from .core.refinement import RESULTS, History, Refinement, Refiner, WaveletPreservation, refine
+from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from .core.spectrum import Spectrum
+from .errors import InputError
+from .geometry.eigenbasis import compute_spectrum
+from .geometry.mesh import Mesh, make_mesh, read_mesh, write_mesh
+from .geometry.sampling import farthest_point_samples
+from .geometry.shot import shot_descriptors
+from .matching import Correspondence, initial_map, match
+
+__version__: str
+__all__ = [
+    "RESULTS",
+    "Correspondence",
+    "FilterBank",
+    "History",
+    "InputError",
+    "Mesh",
+    "Meyer",
+    "Refinement",
+    "Refiner",
+    "Spectrum",
+    "WaveletPreservation",
+    "compute_spectrum",
+    "decode",
+    "encode",
+    "farthest_point_samples",
+    "frame_function",
+    "heat_kernel_signature",
+    "initial_map",
+    "make_mesh",
+    "match",
+    "multiscale_kernel",
+    "nearest_neighbor",
+    "read_mesh",
+    "refine",
+    "shot_descriptors",
+    "wave_kernel_signature",
+    "wavelet_energy",
+    "wavelet_signature",
+    "write_mesh",
+]

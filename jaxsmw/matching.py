@@ -1,0 +1,252 @@
+"""One pair from meshes to correspondence: the pieces of the library in their usual order."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Int64
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from jaxsmw.core.pointwise_map import nearest_neighbor
+from jaxsmw.core.refinement import RESULTS, History, Refiner, WaveletPreservation, refine
+from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.laplacian import Laplacian
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.geometry.shot import shot_descriptors
+
+logger = logging.getLogger("jaxsmw")
+
+Descriptor = Literal["shot", "wks", "hks", "wavelet"]
+
+_SIGNATURES = {
+    "wks": wave_kernel_signature,
+    "hks": heat_kernel_signature,
+    "wavelet": wavelet_signature,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """The outcome of `match`: for every vertex of X the vertex of Y that is the same point.
+
+    **Attributes:**
+
+    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
+    - `pointwise_map`: T: X -> Y, (m,), 0-based vertices of Y.
+    - `initial_map`: what it started from, (m,).
+    - `functional_map`: the last C; (k, k), functions on Y to functions on X unless the refiner says
+      otherwise.
+    - `spectrum_x`, `spectrum_y`: the spectra it was computed with, for area 1.
+    - `iterations`: how many were done.
+    - `history`: a `jaxsmw.History` if asked for.
+    - `seconds`: wall time of each stage. The first refinement of a size includes its compilation.
+    """
+
+    mesh_x: Mesh
+    mesh_y: Mesh
+    pointwise_map: Int64[np.ndarray, " m"]
+    initial_map: Int64[np.ndarray, " m"]
+    functional_map: Float[np.ndarray, "k_out k_in"]
+    spectrum_x: Spectrum
+    spectrum_y: Spectrum
+    iterations: int
+    history: History | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def match(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    *,
+    init: Descriptor | ArrayLike = "shot",
+    number_of_eigenvectors: int = 100,
+    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
+    iterations: int = 3,
+    number_of_samples: int | None = None,
+    laplacian: Laplacian = "auto",
+    stop_when_unchanged: bool = False,
+    history: bool = False,
+) -> Correspondence:
+    """Say for every vertex of one mesh which vertex of the other is the same point.
+
+    Spectra of both meshes, an initial map, then `jaxsmw.refine`. Computed in JAX's default float type.
+    Stages are logged to the logger `"jaxsmw"` as they begin.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
+    - `init`: where to start: `"shot"`, `"wks"`, `"hks"` or `"wavelet"` for nearest neighbours of that
+      descriptor (only SHOT tells left from right); an array (m,) of vertices of Y for a map of your own;
+      an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in
+      geodesic distance to them (four or more, spread over the body and its sides).
+    - `number_of_eigenvectors`: k of both shapes.
+    - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
+    - `iterations`: how many; at least 1.
+    - `number_of_samples`: iterate on so many farthest-point samples of each shape (more than k) and search
+      all vertices in the last iteration only.
+    - `laplacian`: see `jaxsmw.compute_spectrum`.
+    - `stop_when_unchanged`, `history`: see `jaxsmw.refine`.
+
+    **Returns:** A `Correspondence`. A vertex of X that no face uses gets the match of the nearest one that
+    a face does use; unused vertices of Y are never matched.
+
+    **Raises:** `InputError` for anything about the arguments that cannot work; `ArithmeticError` if numbers
+    went wrong on the way.
+    """
+    if iterations < 1:
+        raise InputError(f"{iterations} iterations were asked for; at least 1 is needed.")
+    if number_of_samples is not None and number_of_samples < number_of_eigenvectors:
+        raise InputError(
+            f"{number_of_samples} samples cannot tell {number_of_eigenvectors} eigenvectors apart; use more "
+            "samples (five per eigenvector is usual) or fewer eigenvectors."
+        )
+    seconds: dict[str, float] = {}
+    with _stage("eigenbases", seconds):
+        spectrum_x, spectrum_y = (
+            compute_spectrum(mesh, number_of_eigenvectors, laplacian=laplacian) for mesh in (mesh_x, mesh_y)
+        )
+    with _stage("initial map", seconds):
+        start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init)
+    samples: dict[str, Int[Array, " s"]] = {}
+    if number_of_samples is not None:
+        with _stage("samples", seconds):
+            for side, mesh in (("samples_x", mesh_x), ("samples_y", mesh_y)):
+                samples[side] = jnp.asarray(farthest_point_samples(mesh, number_of_samples))
+    with _stage("refinement", seconds):
+        refinement = jax.block_until_ready(
+            refine(
+                spectrum_x,
+                spectrum_y,
+                jnp.asarray(start),
+                refiner=refiner,
+                iterations=iterations,
+                stop_when_unchanged=stop_when_unchanged,
+                history=history,
+                **samples,
+            )
+        )
+    if refinement.result != RESULTS.successful:
+        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {RESULTS[refinement.result]}")
+    pointwise_map = np.asarray(refinement.pointwise_map).astype(np.int64)
+    return Correspondence(
+        mesh_x=mesh_x,
+        mesh_y=mesh_y,
+        pointwise_map=_extend_to_unused(mesh_x, pointwise_map),
+        initial_map=start,
+        functional_map=np.asarray(refinement.functional_map),
+        spectrum_x=spectrum_x,
+        spectrum_y=spectrum_y,
+        iterations=int(refinement.iterations),
+        history=refinement.history,
+        seconds=seconds,
+    )
+
+
+def initial_map(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    *,
+    init: Descriptor | ArrayLike = "shot",
+) -> Int64[np.ndarray, " m"]:
+    """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
+
+    **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
+    """
+    if isinstance(init, str):
+        if init == "shot":
+            features_x, features_y = shot_descriptors(mesh_x), shot_descriptors(mesh_y)
+        elif init in _SIGNATURES:
+            features_x, features_y = (np.asarray(_SIGNATURES[init](s)) for s in (spectrum_x, spectrum_y))
+        else:
+            raise InputError(
+                f"{init!r} is no initial map; choose among shot, {', '.join(_SIGNATURES)}, landmarks or a map."
+            )
+    else:
+        given = np.asarray(init)
+        if not np.issubdtype(given.dtype, np.integer):
+            raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
+        if given.ndim == 1:
+            return _extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
+        features_x, features_y = _landmark_features(given, mesh_x, mesh_y)
+    dtype = spectrum_x.eigenvectors.dtype
+    nearest = nearest_neighbor(
+        jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=spectrum_y.mask
+    )
+    return _extend_to_unused(mesh_x, np.asarray(nearest).astype(np.int64))
+
+
+def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
+    m, n = len(mesh_x.vertices), len(mesh_y.vertices)
+    if len(given) != m:
+        raise InputError(f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices.")
+    if given.min() < 0 or given.max() >= n:
+        raise InputError(
+            f"the initial map runs from {given.min()} to {given.max()}, but the vertices of {mesh_y.name} are "
+            f"0 to {n - 1}; count from 0."
+        )
+    unused = ~mesh_y.used_vertices[given] & mesh_x.used_vertices
+    if unused.any():
+        raise InputError(
+            f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that no face uses, "
+            f"for example {np.flatnonzero(unused)[0]} to {given[unused][0]}; send them to the surface."
+        )
+    return given.astype(np.int64)
+
+
+def _landmark_features(
+    landmarks: np.ndarray, mesh_x: Mesh, mesh_y: Mesh
+) -> tuple[Float[np.ndarray, "m l"], Float[np.ndarray, "n l"]]:
+    """Geodesic distances to each landmark, in units of the square root of the area."""
+    if landmarks.shape[1:] != (2,) or not len(landmarks):
+        raise InputError(
+            f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) for "
+            "landmarks."
+        )
+    features = []
+    for mesh, vertices in ((mesh_x, landmarks[:, 0]), (mesh_y, landmarks[:, 1])):
+        outside = (vertices < 0) | (vertices >= len(mesh.vertices))
+        if outside.any() or not mesh.used_vertices[vertices].all():
+            wrong = vertices[outside] if outside.any() else vertices[~mesh.used_vertices[vertices]]
+            raise InputError(
+                f"landmark {wrong[0]} is no vertex of the surface of {mesh.name}, whose vertices are 0 to "
+                f"{len(mesh.vertices) - 1}."
+            )
+        distances = geodesic_distances(mesh, vertices.astype(np.int64)).T / np.sqrt(mesh.area)
+        # Another component is farther than anything on the landmark's own.
+        features.append(np.where(np.isfinite(distances), distances, 100.0))
+    return features[0], features[1]
+
+
+def _extend_to_unused(mesh_x: Mesh, pointwise_map: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+    """Give vertices that no face uses the match of the nearest one that a face does use."""
+    used = mesh_x.used_vertices
+    if used.all():
+        return pointwise_map
+    _, nearest = KDTree(mesh_x.vertices[used]).query(mesh_x.vertices[~used])
+    extended = pointwise_map.copy()
+    extended[~used] = pointwise_map[used][nearest]
+    return extended
+
+
+@contextmanager
+def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    logger.info(name)
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start

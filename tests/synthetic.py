@@ -1,0 +1,62 @@
+"""Synthetic spectra and simple meshes that several test files share."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsmw.core.spectrum import Spectrum
+
+
+def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) -> Spectrum:
+    """A Spectrum of no shape at all: orthonormal in random areas, eigenvalues growing as Weyl's law says."""
+    generator = np.random.default_rng(seed)
+    areas = generator.uniform(0.5, 1.5, n)
+    areas /= areas.sum()
+    orthonormal, _ = np.linalg.qr(generator.normal(size=(n, k)))
+    eigenvalues = np.concatenate([[0.0], np.cumsum(generator.uniform(0.5, 1.5, k - 1)) * 4 * np.pi])
+    return Spectrum(
+        jnp.asarray(eigenvalues, dtype),
+        jnp.asarray(orthonormal / np.sqrt(areas)[:, None], dtype),
+        jnp.asarray(areas, dtype),
+        jnp.ones(n, bool),
+    )
+
+
+def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the unit square, triangulated."""
+    y, x = np.mgrid[0 : 1 : rows * 1j, 0 : 1 : columns * 1j]
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    lower = np.stack([corner, corner + 1, corner + columns], axis=1)
+    upper = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
+    return vertices, np.concatenate([lower, upper])
+
+
+def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the unit sphere, from an icosahedron: 10 * 4^subdivisions + 2 vertices."""
+    golden = (1 + np.sqrt(5)) / 2
+    vertices = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
+    vertices = np.array(
+        vertices + [np.roll(v, 1) for v in vertices] + [np.roll(v, 2) for v in vertices], float
+    )
+    edge = np.linalg.norm(vertices[:, None] - vertices, axis=2)
+    near = edge < 2.1
+    faces = np.array(
+        [
+            (a, b, c) if np.linalg.det(vertices[[a, b, c]]) > 0 else (a, c, b)
+            for a in range(12)
+            for b in range(a + 1, 12)
+            for c in range(b + 1, 12)
+            if near[a, b] and near[b, c] and near[a, c]
+        ]
+    )
+    for _ in range(subdivisions):
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        unique, position = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+        middle = len(vertices) + position.reshape(3, -1)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        a, b, c = faces.T
+        ab, bc, ca = middle
+        faces = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces

@@ -1,0 +1,182 @@
+"""Eigenbases against closed forms, an independent program, and meshes that make trouble."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from synthetic import grid_mesh, sphere_mesh
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry import eigenbasis
+from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
+from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
+from jaxsmw.geometry.mesh import Mesh, make_mesh, read_mesh
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch):
+    monkeypatch.setenv("JAXSMW_CACHE", "off")
+
+
+def orthonormality(spectrum) -> float:
+    gram = spectrum.eigenvectors.T @ (spectrum.vertex_areas[:, None] * spectrum.eigenvectors)
+    return float(np.abs(gram - np.eye(len(gram))).max())
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    return make_mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]),
+    )
+
+
+def test_sphere_has_its_closed_form():
+    """l (l + 1) with multiplicity 2 l + 1, on the sphere of area 1 times 4 pi; a coarse mesh comes close."""
+    mesh = make_mesh(*sphere_mesh(4))
+    spectrum = compute_spectrum(mesh, 49)
+    exact = 4 * np.pi * np.concatenate([np.full(2 * l + 1, l * (l + 1)) for l in range(7)])  # noqa: E741
+    np.testing.assert_allclose(spectrum.eigenvalues[1:], exact[1:], rtol=0.03)
+    assert spectrum.eigenvalues[0] < 1e-9
+    np.testing.assert_allclose(spectrum.eigenvectors[:, 0], 1, atol=1e-8)
+    np.testing.assert_allclose(jnp.sum(spectrum.vertex_areas), 1)
+    assert orthonormality(spectrum) < 1e-10
+
+
+def test_square_has_its_closed_form():
+    """pi^2 (i^2 + j^2): a free boundary, an area of one already."""
+    spectrum = compute_spectrum(make_mesh(*grid_mesh(60, 60)), 20)
+    i, j = np.mgrid[:8, :8]
+    exact = np.sort((np.pi**2 * (i**2 + j**2)).ravel())[:20]
+    np.testing.assert_allclose(spectrum.eigenvalues, exact, rtol=0.02, atol=1e-8)
+
+
+def test_equals_a_dense_generalised_solver():
+    mesh = make_mesh(*grid_mesh(30, 25))
+    mesh = make_mesh(mesh.vertices + 0.004 * np.random.default_rng(0).normal(size=(750, 3)), mesh.faces)
+    eigenvalues, eigenvectors, areas = eigenpairs(mesh, 40)
+    stiffness, full_areas = assemble_laplacian(mesh)
+    exact, vectors = scipy.linalg.eigh(stiffness.toarray(), np.diag(full_areas / full_areas.sum()))
+    np.testing.assert_allclose(eigenvalues, np.maximum(exact[:40], 0), rtol=1e-9, atol=1e-8)
+    overlap = np.abs(eigenvectors.T @ (areas[:, None] * vectors[:, :40]))
+    np.testing.assert_allclose(np.diag(overlap), 1, atol=1e-6)
+
+
+def test_unit_of_the_file_does_not_matter():
+    vertices, faces = sphere_mesh(3)
+    small, large = (eigenpairs(make_mesh(vertices * scale, faces), 30) for scale in (1e-3, 1e4))
+    np.testing.assert_allclose(small[0], large[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(small[2], large[2], rtol=1e-12)
+
+
+def test_repeats_bit_for_bit_with_canonical_signs():
+    mesh = make_mesh(*sphere_mesh(3))
+    first, second = eigenpairs(mesh, 30), eigenpairs(mesh, 30)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    largest = np.abs(first[1]).argmax(axis=0)
+    assert (first[1][largest, np.arange(30)] > 0).all()
+
+
+def test_components_keep_every_multiplicity():
+    """Two spheres: every eigenvalue twice, three zeros with the lone triangle's."""
+    sphere = make_mesh(*sphere_mesh(3))
+    triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
+    mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
+    spectrum = compute_spectrum(mesh, 50)
+    single, flat = (
+        eigenpairs(part, k)[0] * mesh.area / part.area for part, k in ((sphere, 30), (triangle, 2))
+    )
+    np.testing.assert_allclose(
+        spectrum.eigenvalues, np.sort(np.concatenate([single, single, flat, flat[1:]]))[:50], rtol=1e-6, atol=1e-9
+    )
+    assert (spectrum.eigenvalues[:3] < 1e-9).all() and spectrum.eigenvalues[3] > 1
+    assert orthonormality(spectrum) < 1e-10
+
+
+def test_unused_vertices_are_masked():
+    vertices, faces = sphere_mesh(2)
+    plain = compute_spectrum(make_mesh(vertices, faces), 10)
+    spectrum = compute_spectrum(make_mesh(np.insert(vertices, 7, 100.0, axis=0), faces + (faces >= 7)), 10)
+    assert not spectrum.mask[7] and spectrum.mask.sum() == len(vertices)
+    assert (spectrum.eigenvectors[7] == 0).all() and spectrum.vertex_areas[7] == 0
+    np.testing.assert_allclose(spectrum.eigenvalues, plain.eigenvalues, atol=1e-9)
+
+
+@pytest.mark.parametrize("k", [1, 2, 60, 160, 161])
+def test_few_and_nearly_all_eigenvectors(k):
+    mesh = make_mesh(*sphere_mesh(2))
+    assert orthonormality(compute_spectrum(mesh, k)) < 1e-9
+
+
+def test_tiny_mesh():
+    spectrum = compute_spectrum(make_mesh(np.eye(3), [[0, 1, 2]]), 2)
+    assert spectrum.eigenvalues[0] == 0 < spectrum.eigenvalues[1]
+
+
+@pytest.mark.parametrize("k", [0, -1, 162, 10**9])
+def test_impossible_numbers_of_eigenvectors(k):
+    with pytest.raises(InputError, match="162 used vertices"):
+        compute_spectrum(make_mesh(*sphere_mesh(2)), k)
+
+
+def test_nonmanifold_meshes_go_to_the_robust_laplacian():
+    vertices, faces = grid_mesh(12, 12)
+    vertices = vertices + 0.02 * np.random.default_rng(0).normal(size=vertices.shape)
+    fin = make_mesh(np.concatenate([vertices, [[0.5, 0.5, 0.4]]]), np.concatenate([faces, [[65, 66, 144]]]))
+    assert len(fin.nonmanifold_edges) == 1
+    assert choose_laplacian(fin) == "robust"
+    assert choose_laplacian(make_mesh(vertices, faces)) == "cotangent"
+    assert orthonormality(compute_spectrum(fin, 20)) < 1e-9
+    cotangent = compute_spectrum(fin, 20, laplacian="cotangent").eigenvalues
+    robust = compute_spectrum(fin, 20).eigenvalues
+    assert not np.allclose(cotangent, robust, rtol=1e-6)
+    np.testing.assert_allclose(cotangent, robust, rtol=0.2, atol=1e-8)
+
+
+def test_zero_area_faces():
+    vertices, faces = grid_mesh(12, 12)
+    # A sliver along an edge of the border, its third corner on that edge.
+    sliver = make_mesh(
+        np.concatenate([vertices, [(vertices[0] + vertices[1]) / 2]]), np.concatenate([faces, [[0, 1, 144]]])
+    )
+    assert orthonormality(compute_spectrum(sliver, 20)) < 1e-9
+    with pytest.raises(InputError, match="zero-area faces"):
+        compute_spectrum(sliver, 20, laplacian="cotangent")
+
+
+def test_robust_laplacian_with_unused_vertices():
+    vertices, faces = sphere_mesh(2)
+    plain = compute_spectrum(make_mesh(vertices, faces), 10, laplacian="robust")
+    gap = make_mesh(np.insert(vertices, 3, 9.0, axis=0), faces + (faces >= 3))
+    spectrum = compute_spectrum(gap, 10, laplacian="robust")
+    np.testing.assert_allclose(spectrum.eigenvalues, plain.eigenvalues, atol=1e-8)
+    assert not spectrum.mask[3]
+
+
+def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
+    mesh = make_mesh(*sphere_mesh(3))
+    calls, lanczos = [], eigenbasis._lanczos
+
+    def sloppy(*arguments, tolerance, subspace):
+        calls.append(tolerance)
+        values, vectors = lanczos(*arguments, tolerance=tolerance, subspace=subspace)
+        return (values, vectors + 1e-3) if len(calls) == 1 else (values, vectors)
+
+    monkeypatch.setattr(eigenbasis, "_lanczos", sloppy)
+    assert orthonormality(compute_spectrum(mesh, 20)) < 1e-9
+    assert calls == [1e-8, 0]
+    monkeypatch.setattr(eigenbasis, "_lanczos", lambda *a, **k: (np.ones(20), np.ones((642, 20))))
+    with pytest.raises(InputError, match="could not be computed accurately"):
+        compute_spectrum(mesh, 20)
+
+
+def test_equals_the_reference_program(shared):
+    reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
+    mesh = read_mesh(shared / "data" / "faust_r" / "off" / "tr_reg_002.off")
+    eigenvalues, eigenvectors, areas = eigenpairs(mesh, 128)
+    scale = float(reference["x_area"])
+    np.testing.assert_allclose(eigenvalues / scale, reference["x_eigenvalues"], rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(areas * scale, reference["x_vertex_areas"], rtol=1e-9)
+    overlap = np.sum(eigenvectors * areas[:, None] * reference["x_eigenvectors"], axis=0) * np.sqrt(scale)
+    np.testing.assert_allclose(np.abs(overlap), 1, atol=1e-6)

@@ -1,0 +1,290 @@
+"""The loop: what it must not depend on, what it reports, and how often it compiles."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import random_spectrum
+
+from jaxsmw.core.filters import Meyer
+from jaxsmw.core.functional_map import encode, multiscale_kernel, wavelet_energy
+from jaxsmw.core.pointwise_map import decode, matching_objective
+from jaxsmw.core.refinement import RESULTS, Refiner, WaveletPreservation, refine
+from jaxsmw.core.spectrum import Spectrum
+
+M, K = 300, 15
+
+
+def permuted(spectrum: Spectrum, order: np.ndarray) -> Spectrum:
+    return Spectrum(
+        spectrum.eigenvalues, spectrum.eigenvectors[order], spectrum.vertex_areas[order], spectrum.mask[order]
+    )
+
+
+@pytest.fixture
+def pair():
+    """A shape, a shuffled and slightly disturbed copy, the true map and a start with a third of it wrong."""
+    generator = np.random.default_rng(0)
+    x = random_spectrum(M, K)
+    order = generator.permutation(M)
+    y = permuted(x, order)
+    y = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors + 0.02 * generator.normal(size=(M, K)))
+    truth = np.argsort(order)
+    start = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
+    return x, y, jnp.asarray(start, jnp.int32), truth
+
+
+REFINERS = {
+    "default": WaveletPreservation(),
+    "least squares": WaveletPreservation(pseudo_inverse="least_squares"),
+    "pushforward": WaveletPreservation(convention="pushforward"),
+    "common": WaveletPreservation(lambda_max="common"),
+    "three filters": WaveletPreservation(bank=Meyer(3)),
+}
+
+
+def test_recovers_a_disturbed_copy(pair):
+    x, y, start, truth = pair
+    refined = refine(x, y, start, iterations=5)
+    assert refined.result == RESULTS.successful
+    assert np.mean(np.asarray(start) == truth) < 0.75
+    assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
+
+
+@pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
+def test_is_the_plain_loop(pair, refiner):
+    x, y, start, _ = pair
+    t = start
+    for _ in range(3):
+        g_x, g_y = refiner.responses(x, y)
+        kernel = (
+            multiscale_kernel(g_x, g_y) if refiner.convention == "pullback" else multiscale_kernel(g_y, g_x)
+        )
+        c = kernel * encode(t, x, y, convention=refiner.convention, pseudo_inverse=refiner.pseudo_inverse)
+        t = decode(c, x, y, convention=refiner.convention)
+    refined = refine(x, y, start, refiner=refiner)
+    np.testing.assert_array_equal(refined.pointwise_map, t)
+    np.testing.assert_allclose(refined.functional_map, c, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in REFINERS if name != "default"])
+def test_every_option_changes_the_result(name):
+    x, y = random_spectrum(M, K, seed=1), random_spectrum(M, K, seed=2)
+    y = eqx.tree_at(lambda s: s.eigenvalues, y, y.eigenvalues * 1.5)
+    start = jnp.asarray(np.random.default_rng(0).integers(0, M, M))
+    default = refine(x, y, start, iterations=1).functional_map
+    other = refine(x, y, start, iterations=1, refiner=REFINERS[name]).functional_map
+    assert jnp.max(jnp.abs(default - other)) > 1e-3
+
+
+@pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
+def test_signs_of_eigenvectors_do_not_matter(pair, refiner):
+    x, y, start, _ = pair
+    generator = np.random.default_rng(4)
+    flipped = [
+        eqx.tree_at(lambda s: s.eigenvectors, s, s.eigenvectors * generator.choice([-1.0, 1.0], (1, K)))
+        for s in (x, y)
+    ]
+    np.testing.assert_array_equal(
+        refine(*flipped, start, refiner=refiner).pointwise_map,
+        refine(x, y, start, refiner=refiner).pointwise_map,
+    )
+
+
+def test_basis_within_an_eigenspace_does_not_matter(pair):
+    """A double eigenvalue leaves its two eigenvectors free up to a rotation."""
+    x, y, start, _ = pair
+    x, y = (
+        eqx.tree_at(lambda s: s.eigenvalues, s, s.eigenvalues.at[5].set(s.eigenvalues[4])) for s in (x, y)
+    )
+    rotation = jnp.asarray([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    turned = eqx.tree_at(
+        lambda s: s.eigenvectors, x, x.eigenvectors.at[:, 4:6].set(x.eigenvectors[:, 4:6] @ rotation)
+    )
+    np.testing.assert_array_equal(refine(turned, y, start).pointwise_map, refine(x, y, start).pointwise_map)
+
+
+def test_renumbering_vertices_renumbers_the_map(pair):
+    x, y, start, _ = pair
+    generator = np.random.default_rng(4)
+    order_x, order_y = generator.permutation(M), generator.permutation(M)
+    renumbered_start = jnp.argsort(jnp.asarray(order_y))[start[order_x]]
+    renumbered = refine(permuted(x, order_x), permuted(y, order_y), renumbered_start)
+    np.testing.assert_array_equal(
+        order_y[renumbered.pointwise_map], np.asarray(refine(x, y, start).pointwise_map)[order_x]
+    )
+
+
+@pytest.mark.parametrize("factor", [1e-2, 1e3])
+def test_common_scale_does_not_matter(pair, factor):
+    x, y, start, _ = pair
+    scaled = [
+        Spectrum(s.eigenvalues / factor**2, s.eigenvectors / factor, s.vertex_areas * factor**2, s.mask)
+        for s in (x, y)
+    ]
+    np.testing.assert_array_equal(refine(*scaled, start).pointwise_map, refine(x, y, start).pointwise_map)
+
+
+@pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
+def test_padding_changes_nothing(pair, refiner):
+    x, y, start, _ = pair
+
+    def padded(spectrum: Spectrum, rows: int) -> Spectrum:
+        return Spectrum(
+            spectrum.eigenvalues,
+            jnp.pad(spectrum.eigenvectors, ((0, rows), (0, 0))),
+            jnp.pad(spectrum.vertex_areas, (0, rows)),
+            jnp.pad(spectrum.mask, (0, rows)),
+        )
+
+    plain = refine(x, y, start, refiner=refiner, history=True)
+    wide = refine(padded(x, 70), padded(y, 33), jnp.pad(start, (0, 70)), refiner=refiner, history=True)
+    np.testing.assert_array_equal(wide.pointwise_map[:M], plain.pointwise_map)
+    np.testing.assert_allclose(wide.functional_map, plain.functional_map, atol=1e-12)
+    for series in ("changed", "energy", "objective"):
+        np.testing.assert_allclose(
+            getattr(wide.history, series), getattr(plain.history, series), rtol=1e-9, atol=1e-12
+        )
+
+
+def test_different_numbers_of_vertices_and_eigenvectors():
+    x, y = random_spectrum(80, 12, seed=1), random_spectrum(90, 10, seed=2)
+    start = jnp.asarray(np.random.default_rng(0).integers(0, 90, 80))
+    refined = refine(x, y, start)
+    assert refined.functional_map.shape == (12, 10)
+    assert refined.pointwise_map.shape == (80,)
+    assert refine(x, y, start, refiner=REFINERS["pushforward"]).functional_map.shape == (10, 12)
+
+
+def test_history_is_what_it_says(pair):
+    x, y, start, _ = pair
+    refiner = WaveletPreservation()
+    maps = [start, *(refine(x, y, start, iterations=i).pointwise_map for i in range(1, 5))]
+    history = refine(x, y, start, iterations=4, history=True).history
+    for i in range(4):
+        assert history.changed[i] == np.mean(np.asarray(maps[i]) != np.asarray(maps[i + 1]))
+        c = refine(x, y, start, iterations=i + 1).functional_map
+        energy = wavelet_energy(c, maps[i], x, y, *refiner.responses(x, y))
+        np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
+        np.testing.assert_allclose(history.objective[i], matching_objective(c, maps[i + 1], x, y), rtol=1e-9)
+    assert refine(x, y, start).history is None
+
+
+def test_stops_when_the_map_no_longer_changes(pair):
+    x, y, start, _ = pair
+    patient = refine(x, y, start, iterations=40)
+    stopped = refine(x, y, start, iterations=40, stop_when_unchanged=True, history=True)
+    assert patient.iterations == 40
+    assert stopped.iterations < 40
+    np.testing.assert_array_equal(patient.pointwise_map, stopped.pointwise_map)
+    np.testing.assert_allclose(patient.functional_map, stopped.functional_map, atol=1e-12)
+    done = int(stopped.iterations)
+    assert np.isfinite(stopped.history.energy[: done - 1]).all()
+    assert np.isnan(stopped.history.energy[done:-1]).all()
+
+
+def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
+    x, y, start, truth = pair
+    generator = np.random.default_rng(1)
+    samples_x, samples_y = (jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
+    refiner = WaveletPreservation()
+    kernel = multiscale_kernel(*refiner.responses(x, y))
+    c = kernel * encode(start, x, y)
+    for _ in range(3):
+        t = decode(c, x.sample(samples_x), y.sample(samples_y))
+        c = kernel * np.linalg.lstsq(x.eigenvectors[samples_x], y.eigenvectors[samples_y][t])[0]
+    refined = refine(x, y, start, iterations=4, samples_x=samples_x, samples_y=samples_y, history=True)
+    np.testing.assert_allclose(refined.functional_map, c, atol=1e-10)
+    np.testing.assert_array_equal(refined.pointwise_map, decode(jnp.asarray(c), x, y))
+    assert np.isnan(refined.history.changed[jnp.asarray([0, 3])]).all()
+    assert np.isfinite(refined.history.changed[1:3]).all()
+    with pytest.raises(ValueError, match="both shapes"):
+        refine(x, y, start, samples_x=samples_x)
+
+
+def test_vmap_over_pairs_equals_a_loop():
+    pairs = [(random_spectrum(M, K, seed=s), random_spectrum(M, K, seed=s + 10)) for s in range(3)]
+    starts = jnp.asarray(np.random.default_rng(0).integers(0, M, (3, M)))
+    stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
+    xs, ys = (jax.tree.map(stack, *side) for side in zip(*pairs, strict=True))
+    for options in ({}, {"stop_when_unchanged": True}, {"history": True}):
+        batched = jax.vmap(lambda x, y, t, o=options: refine(x, y, t, **o))(xs, ys, starts)
+        for index, (x, y) in enumerate(pairs):
+            alone = refine(x, y, starts[index], **options)
+            np.testing.assert_array_equal(batched.pointwise_map[index], alone.pointwise_map)
+            np.testing.assert_allclose(batched.functional_map[index], alone.functional_map, atol=1e-12)
+            assert batched.iterations[index] == alone.iterations
+
+
+def test_compiles_once_per_size_and_setting():
+    class Counting(WaveletPreservation):
+        traces = []
+
+        def update(self, problem, pointwise_map):
+            self.traces.append(1)
+            return super().update(problem, pointwise_map)
+
+    refiner = Counting()
+    start = jnp.zeros(50, jnp.int32)
+    refine(random_spectrum(50, 5, seed=0), random_spectrum(40, 5, seed=1), start, refiner=refiner)
+    traced = len(refiner.traces)
+    for seed in range(3):
+        pair = random_spectrum(50, 5, seed=seed), random_spectrum(40, 5, seed=seed + 5)
+        refine(*pair, start + seed, refiner=refiner)
+    assert len(refiner.traces) == traced
+    refine(random_spectrum(50, 6), random_spectrum(40, 6), start, refiner=refiner)
+    assert len(refiner.traces) > traced
+
+
+def test_float32_in_float32_out():
+    x, y = (random_spectrum(M, K, seed=s, dtype=np.float32) for s in (0, 1))
+    refined = refine(x, y, jnp.zeros(M, jnp.int32), history=True)
+    assert refined.functional_map.dtype == jnp.float32
+    assert refined.history.energy.dtype == jnp.float32
+
+
+@pytest.mark.parametrize(
+    ("damage", "result"),
+    [
+        (lambda x, y, t: (eqx.tree_at(lambda s: s.eigenvectors, x, x.eigenvectors.at[0, 3].set(jnp.nan)), y, t), RESULTS.nonfinite_spectrum),
+        (lambda x, y, t: (x, eqx.tree_at(lambda s: s.eigenvalues, y, y.eigenvalues.at[2].set(jnp.inf)), t), RESULTS.nonfinite_spectrum),
+        (lambda x, y, t: (x, y, t.at[3].set(M)), RESULTS.invalid_initial_map),
+        (lambda x, y, t: (x, y, t.at[3].set(-1)), RESULTS.invalid_initial_map),
+        (lambda x, y, t: (x, eqx.tree_at(lambda s: s.mask, y, y.mask.at[t[0]].set(False)), t), RESULTS.invalid_initial_map),
+        (lambda x, y, t: (eqx.tree_at(lambda s: s.vertex_areas, x, x.vertex_areas * 1e307), eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * 1e10), t), RESULTS.nonfinite_functional_map),
+    ],
+)  # fmt: skip
+def test_failures_are_named_not_returned_as_if_fine(pair, damage, result):
+    x, y, start, _ = pair
+    refined = refine(*damage(x, y, start), iterations=4)
+    assert refined.result == result
+    assert (refined.pointwise_map == -1).all()
+    assert len(RESULTS[result]) > 40
+
+
+def test_too_few_samples_are_named(pair):
+    x, y, start, _ = pair
+    few = jnp.arange(5)
+    refined = refine(x, y, start, samples_x=few, samples_y=few)
+    assert refined.result == RESULTS.nonfinite_functional_map
+
+
+def test_needs_an_iteration(pair):
+    with pytest.raises(ValueError, match="at least 1 iteration"):
+        refine(*pair[:3], iterations=0)
+
+
+def test_a_new_refiner_plugs_in(pair):
+    """Spectral ICP's half-step in place of the filter: the loop knows nothing of wavelets."""
+
+    class Orthogonal(WaveletPreservation):
+        def update(self, problem, pointwise_map):
+            u, _, vt = jnp.linalg.svd(encode(pointwise_map, problem.spectrum_x, problem.spectrum_y))
+            return u @ vt
+
+    x, y, start, truth = pair
+    assert issubclass(Orthogonal, Refiner)
+    refined = refine(x, y, start, refiner=Orthogonal(), iterations=5)
+    np.testing.assert_allclose(refined.functional_map @ refined.functional_map.T, np.eye(K), atol=1e-10)
+    assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
