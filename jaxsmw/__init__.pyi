@@ -6,7 +6,8 @@ from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavel
 from .core.spectrum import Spectrum
 from .errors import InputError
 from .geometry.eigenbasis import compute_spectrum
-from .geometry.mesh import Mesh, make_mesh, read_mesh, write_mesh
+from .geometry.mesh import Mesh, diagnose, make_mesh
+from .geometry.mesh_files import read_mesh, write_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
 from .matching import Correspondence, initial_map, match
@@ -26,6 +27,7 @@ __all__ = [
     "WaveletPreservation",
     "compute_spectrum",
     "decode",
+    "diagnose",
     "encode",
     "farthest_point_samples",
     "frame_function",

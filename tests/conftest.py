@@ -1,6 +1,7 @@
 """What every test shares: double precision and strict promotion on, and where the real shapes lie."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -31,3 +32,11 @@ def shared() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return directory
+
+
+@pytest.fixture(autouse=True, scope="session")
+def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests neither read nor fill the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXSMW_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield

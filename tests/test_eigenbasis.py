@@ -10,7 +10,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
-from jaxsmw.geometry.mesh import Mesh, make_mesh, read_mesh
+from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.geometry.mesh_files import read_mesh
 
 
 @pytest.fixture(autouse=True)
@@ -88,7 +89,10 @@ def test_components_keep_every_multiplicity():
         eigenpairs(part, k)[0] * mesh.area / part.area for part, k in ((sphere, 30), (triangle, 2))
     )
     np.testing.assert_allclose(
-        spectrum.eigenvalues, np.sort(np.concatenate([single, single, flat, flat[1:]]))[:50], rtol=1e-6, atol=1e-9
+        spectrum.eigenvalues,
+        np.sort(np.concatenate([single, single, flat, flat[1:]]))[:50],
+        rtol=1e-6,
+        atol=1e-9,
     )
     assert (spectrum.eigenvalues[:3] < 1e-9).all() and spectrum.eigenvalues[3] > 1
     assert orthonormality(spectrum) < 1e-10
@@ -107,6 +111,21 @@ def test_unused_vertices_are_masked():
 def test_few_and_nearly_all_eigenvectors(k):
     mesh = make_mesh(*sphere_mesh(2))
     assert orthonormality(compute_spectrum(mesh, k)) < 1e-9
+
+
+def test_spectra_are_cached_by_content(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
+    vertices, faces = sphere_mesh(2)
+    first = eigenpairs(make_mesh(vertices, faces), 12)
+    monkeypatch.setattr(eigenbasis, "_solve", None)
+    for a, b in zip(first, eigenpairs(make_mesh(vertices, faces, name="other"), 12), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(TypeError):
+        eigenpairs(make_mesh(vertices, faces), 13)
+    with pytest.raises(TypeError):
+        eigenpairs(make_mesh(vertices, faces), 12, laplacian="robust")
+    with pytest.raises(TypeError):
+        eigenpairs(make_mesh(vertices * 1.01, faces), 12)
 
 
 def test_tiny_mesh():

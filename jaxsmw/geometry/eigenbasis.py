@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
 
@@ -68,16 +69,18 @@ def eigenpairs(
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
 
-    stiffness, areas = assemble_laplacian(mesh, laplacian=laplacian)
-    areas = areas / areas.sum()
-    stiffness = stiffness[used][:, used]
-    with threadpool_limits(1, "blas"):
-        eigenvalues, local_eigenvectors = _solve(stiffness, areas[used], number_of_eigenvectors, mesh.name)
-    largest = np.argmax(np.abs(local_eigenvectors), axis=0)
-    local_eigenvectors *= np.sign(local_eigenvectors[largest, np.arange(number_of_eigenvectors)])
-    eigenvectors = np.zeros((len(mesh.vertices), number_of_eigenvectors))
-    eigenvectors[used] = local_eigenvectors
-    return eigenvalues, eigenvectors, areas
+    def compute() -> dict[str, np.ndarray]:
+        stiffness, areas = assemble_laplacian(mesh, laplacian=laplacian)
+        areas = areas / areas.sum()
+        with threadpool_limits(1, "blas"):
+            values, vectors = _solve(stiffness[used][:, used], areas[used], number_of_eigenvectors, mesh.name)
+        largest = np.argmax(np.abs(vectors), axis=0)
+        eigenvectors = np.zeros((len(mesh.vertices), number_of_eigenvectors))
+        eigenvectors[used] = vectors * np.sign(vectors[largest, np.arange(number_of_eigenvectors)])
+        return {"eigenvalues": values, "eigenvectors": eigenvectors, "vertex_areas": areas}
+
+    result = cached("spectrum", (mesh.vertices, mesh.faces, number_of_eigenvectors, laplacian), compute)
+    return result["eigenvalues"], result["eigenvectors"], result["vertex_areas"]
 
 
 def _solve(stiffness: sp.csc_matrix, areas: np.ndarray, k: int, name: str) -> tuple[np.ndarray, np.ndarray]:

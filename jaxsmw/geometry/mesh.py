@@ -1,12 +1,27 @@
-"""Triangle meshes on the host: what they are, what is wrong with them, reading and writing."""
+"""Triangle meshes on the host: what they are, and what is wrong with them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
+import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxsmw.errors import InputError
+
+# A triangle lower than this fraction of its longest edge counts as degenerate: well above the rounding error
+# of coordinates that lie a few sizes of the body away from the origin, well below any triangle on purpose.
+DEGENERATE_HEIGHT = 1e-10
+
+# Between these sizes squares of areas, which come up in descriptors, neither overflow nor vanish.
+SMALLEST_SIZE, LARGEST_SIZE = 1e-60, 1e60
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,6 +30,8 @@ class Mesh:
 
     Nothing ever renumbers vertices: cleaning changes faces only, and a vertex that no face uses stays
     where it is (`used_vertices` tells). So vertex i here is vertex i of the user's file, always.
+
+    Made by `read_mesh` and `make_mesh`, which check everything; the class itself checks nothing.
 
     **Attributes:**
 
@@ -30,11 +47,15 @@ class Mesh:
     notes: tuple[str, ...] = ()
 
     @cached_property
+    def _area_vectors(self) -> Float64[np.ndarray, "f 3"]:
+        """Normals as long as twice the area."""
+        corners = self.vertices[self.faces]
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    @cached_property
     def face_areas(self) -> Float64[np.ndarray, " f"]:
         """Triangle areas, in the squared unit of the vertices."""
-        corners = self.vertices[self.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return 0.5 * np.linalg.norm(normals, axis=1)
+        return 0.5 * np.linalg.norm(self._area_vectors, axis=1)
 
     @cached_property
     def area(self) -> float:
@@ -42,8 +63,310 @@ class Mesh:
         return float(self.face_areas.sum())
 
     @cached_property
+    def vertex_areas(self) -> Float64[np.ndarray, " n"]:
+        """Lumped barycentric areas: a third of every face at the vertex; 0 for unused vertices."""
+        return self._sum_at_vertices(self.face_areas / 3)
+
+    @cached_property
+    def vertex_normals(self) -> Float64[np.ndarray, "n 3"]:
+        """Unit normals, the faces' normals weighted by area; 0 where they cancel or no face is."""
+        total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        # Without cancellation the length is near twice the area of the faces around: six vertex areas.
+        defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
+        return np.divide(total, length, out=np.zeros_like(total), where=defined)
+
+    @cached_property
     def used_vertices(self) -> Bool[np.ndarray, " n"]:
         """True for vertices that at least one face uses."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         return used
+
+    @cached_property
+    def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
+        """True for triangles without area: lower than 1e-10 of their longest edge."""
+        longest = igl.squared_edge_lengths(self.vertices, self.faces).max(axis=1)
+        return 2 * self.face_areas <= DEGENERATE_HEIGHT * longest
+
+    @cached_property
+    def edges(self) -> Int64[np.ndarray, "e 2"]:
+        """Undirected edges, each once, smaller vertex first, in lexicographic order."""
+        return self._edge_table.edges
+
+    @cached_property
+    def boundary_edges(self) -> Int64[np.ndarray, "b 2"]:
+        """The edges with exactly one face."""
+        return self.edges[self._edge_table.faces == 1]
+
+    @cached_property
+    def nonmanifold_edges(self) -> Int64[np.ndarray, "b 2"]:
+        """The edges with more than two faces."""
+        return self.edges[self._edge_table.faces > 2]
+
+    @cached_property
+    def misoriented_edges(self) -> Int64[np.ndarray, "b 2"]:
+        """The edges whose two faces run the same way along them: one of the faces is inside out."""
+        return self.edges[(self._edge_table.faces == 2) & (self._edge_table.balance != 0)]
+
+    @cached_property
+    def nonmanifold_vertices(self) -> Bool[np.ndarray, " n"]:
+        """True where the faces around a vertex fall apart into fans that share no edge."""
+        one_fan = igl.is_vertex_manifold(self.faces)
+        pinched = self.used_vertices.copy()
+        pinched[: len(one_fan)] &= ~one_fan
+        return pinched
+
+    @cached_property
+    def _edge_table(self) -> _EdgeTable:
+        """`edges`, the number of faces at each, and how often these run up less how often down."""
+        n = len(self.vertices)
+        tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        key = np.minimum(tail, head) * n + np.maximum(tail, head)
+        key, edge_of_side, faces = np.unique(key, return_inverse=True, return_counts=True)
+        balance = np.bincount(edge_of_side, weights=np.sign(head - tail))
+        return _EdgeTable(np.stack(np.divmod(key, n), axis=1), faces, balance)
+
+    def _sum_at_vertices(self, per_face: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " n"]:
+        return np.bincount(self.faces.ravel(), weights=np.repeat(per_face, 3), minlength=len(self.vertices))
+
+
+class _EdgeTable(NamedTuple):
+    edges: Int64[np.ndarray, "e 2"]
+    faces: Int64[np.ndarray, " e"]
+    balance: Float64[np.ndarray, " e"]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is unusual about a mesh, in numbers. All of it is legal; `str` says what it means.
+
+    **Attributes:**
+
+    - `vertices`, `faces`: how many there are.
+    - `components`: connected components, not counting unused vertices.
+    - `unused_vertices`: vertices of no face.
+    - `boundary_edges`, `boundary_loops`: edges with one face, and the connected chains they form.
+    - `nonmanifold_edges`: edges with more than two faces.
+    - `nonmanifold_vertices`: vertices whose faces fall apart into fans that share no edge.
+    - `misoriented_edges`: edges whose two faces disagree about the outside; 0 means consistently oriented.
+    - `degenerate_faces`: triangles without area.
+    """
+
+    vertices: int
+    faces: int
+    components: int
+    unused_vertices: int
+    boundary_edges: int
+    boundary_loops: int
+    nonmanifold_edges: int
+    nonmanifold_vertices: int
+    misoriented_edges: int
+    degenerate_faces: int
+
+    def sentences(self) -> tuple[str, ...]:
+        """One sentence on the mesh as a whole, then one for each thing that is there."""
+        shape = "open" if self.boundary_edges else "closed"
+        found = [
+            f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
+            f"{count_of(self.components, 'connected component')}, {shape}."
+        ]
+        if self.unused_vertices:
+            found.append(f"{count_of(self.unused_vertices, 'vertex')} in no face: left out of all maps.")
+        if self.boundary_edges:
+            found.append(
+                f"{count_of(self.boundary_edges, 'boundary edge')} in "
+                f"{count_of(self.boundary_loops, 'loop')}: the surface ends there."
+            )
+        if self.nonmanifold_edges:
+            found.append(
+                f"{count_of(self.nonmanifold_edges, 'non-manifold edge')} (more than two faces): "
+                "sheets of surface meet there."
+            )
+        if self.nonmanifold_vertices:
+            found.append(
+                f"{count_of(self.nonmanifold_vertices, 'non-manifold vertex')}: "
+                "parts of the surface touch in a single point there."
+            )
+        if self.misoriented_edges:
+            found.append(
+                f"{count_of(self.misoriented_edges, 'edge')} between faces of opposite orientation: "
+                "normals are unreliable there."
+            )
+        if self.degenerate_faces:
+            found.append(
+                f"{count_of(self.degenerate_faces, 'face')} without area: corners coincide or lie on a line."
+            )
+        return tuple(found)
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences())
+
+
+def diagnose(mesh: Mesh) -> Diagnosis:
+    """Count what is unusual about a mesh.
+
+    **Arguments:**
+
+    - `mesh`: any mesh from `read_mesh` or `make_mesh`.
+
+    **Returns:**
+
+    A `Diagnosis`.
+    """
+    unused = int((~mesh.used_vertices).sum())
+    boundary_chain = _connected(mesh.boundary_edges, len(mesh.vertices))[1]
+    return Diagnosis(
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        components=_connected(mesh.edges, len(mesh.vertices))[0] - unused,
+        unused_vertices=unused,
+        boundary_edges=len(mesh.boundary_edges),
+        boundary_loops=len(np.unique(boundary_chain[mesh.boundary_edges])),
+        nonmanifold_edges=len(mesh.nonmanifold_edges),
+        nonmanifold_vertices=int(mesh.nonmanifold_vertices.sum()),
+        misoriented_edges=len(mesh.misoriented_edges),
+        degenerate_faces=int(mesh.degenerate_faces.sum()),
+    )
+
+
+def _connected(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, np.ndarray]:
+    graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    return connected_components(graph, directed=False)
+
+
+def count_of(number: int, noun: str) -> str:
+    if number != 1:
+        noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"
+    return f"{number} {noun}"
+
+
+def make_mesh(
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    *,
+    name: str = "mesh",
+    weld: bool = False,
+    notes: Sequence[str] = (),
+) -> Mesh:
+    """Check and clean vertices and faces: the one door through which every mesh comes.
+
+    Faces that repeat a vertex and faces with the same three vertices as an earlier one are dropped. Vertices
+    are never dropped or renumbered.
+
+    **Arguments:**
+
+    - `vertices`: positions (n, 3), any integer or float type, in any unit; copied.
+    - `faces`: vertex indices (f, 3), 0-based, any integer type (or whole floats); copied.
+    - `name`: how messages call this mesh.
+    - `weld`: let faces use the lowest-numbered of all vertices at exactly the same position. The others stay
+        as unused vertices. Closes the seams along which some programs double their vertices.
+    - `notes`: sentences to put before this function's own.
+
+    **Returns:**
+
+    A `Mesh`; its `notes` tell what was dropped, welded or looks like a seam.
+
+    **Raises:**
+
+    `InputError` for arrays of another shape or type, coordinates that are not finite, a size beyond
+    1e-60 … 1e60, indices out of range, no faces, or no area.
+    """
+    position = _numeric(vertices, "vertices", name)
+    with np.errstate(over="ignore"):  # from a wider float type; the infinity is reported
+        position = np.array(position, dtype=np.float64, order="C")
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if len(lost):
+        raise InputError(
+            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
+            "with a coordinate that is not a finite number: repair the positions."
+        )
+    with np.errstate(over="ignore"):
+        size = float(np.ptp(position, axis=0).max())
+    if size > LARGEST_SIZE or 0 < size < SMALLEST_SIZE:
+        raise InputError(
+            f"{name}: the mesh measures {size:.0e} across, which is beyond what can be computed with: "
+            "choose another unit."
+        )
+    triangles = _indices(_numeric(faces, "faces", name), len(position), name)
+    notes = list(notes)
+
+    if weld:
+        twin = lowest_twins(position)
+        welded = int((twin[triangles] != triangles).any(axis=1).sum())
+        triangles = twin[triangles]
+        notes.append(f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one.")
+    ordered = np.sort(triangles, axis=1)
+    repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    if repeating.any():
+        notes.append(f"{count_of(int(repeating.sum()), 'face')} with a repeated vertex dropped.")
+        triangles, ordered = triangles[~repeating], ordered[~repeating]
+    first = lowest_twins(ordered) == np.arange(len(ordered))
+    if not first.all():
+        notes.append(f"{count_of(int((~first).sum()), 'face')} with the vertices of an earlier face dropped.")
+        triangles = triangles[first]
+
+    mesh = Mesh(position, triangles, name)
+    if mesh.degenerate_faces.all():
+        raise InputError(
+            f"{name}: no triangle has an area, their corners coincide or lie on a line: "
+            "check the positions and the faces."
+        )
+    rim = np.unique(mesh.boundary_edges)
+    twin = lowest_twins(position[rim])
+    seam = int((np.bincount(twin, minlength=len(rim))[twin] > 1).sum())
+    if seam:
+        notes.append(
+            f"{count_of(seam, 'boundary vertex')} with another at the same position: if the surface should "
+            "be closed there, weld it (`weld=True`, on the command line `--weld`)."
+        )
+    unused = int((~mesh.used_vertices).sum())
+    if unused:
+        notes.append(f"{count_of(unused, 'vertex')} of {len(position)} in no face.")
+    return replace(mesh, notes=tuple(notes))
+
+
+def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
+    """The values as a non-empty array (…, 3) of integers or floats."""
+    expected = f"{name}: {what} must be a numeric array of shape (number of {what}, 3)"
+    try:
+        array = np.asarray(values)
+        if array.dtype == object:  # integers too large for any integer type end here
+            array = array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{expected}, and these cannot be made into one.") from None
+    if array.size == 0:
+        raise InputError(f"{name}: there are no {what}: a triangle mesh is needed.")
+    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{expected}, but these are {array.dtype.name} of shape {array.shape}.")
+    return array
+
+
+def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
+    """The faces as valid indices of n vertices."""
+    # Compared before they are cast: a cast would wrap what int64 cannot hold.
+    outside = ~((faces >= 0) & (faces < n))
+    if outside.any():
+        at = int(outside.any(axis=1).argmax())
+        cure = "correct the index or restore the missing vertices"
+        if faces.min() == 1 and faces.max() == n:
+            cure = "the faces seem to count from 1, so subtract 1"
+        raise InputError(
+            f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but counted from 0 the "
+            f"vertices are 0 to {n - 1}: {cure}."
+        )
+    triangles = np.array(faces, dtype=np.int64, order="C")
+    if (triangles != faces).any():
+        raise InputError(f"{name}: a face has an index that is not a whole number: correct the faces.")
+    return triangles
+
+
+def lowest_twins(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """For each row of (n, 3) numbers the index of the first row that equals it."""
+    order = np.lexsort(rows.T)  # stable: among equals the first row comes first
+    sorted_rows = rows[order]
+    starts = np.ones(len(rows), dtype=bool)
+    starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)
+    twins = np.empty(len(rows), dtype=np.int64)
+    twins[order] = order[starts][np.cumsum(starts) - 1]
+    return twins

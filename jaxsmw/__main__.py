@@ -1,0 +1,5 @@
+"""`python -m jaxsmw`."""
+
+from jaxsmw.cli import main
+
+main()

@@ -1,0 +1,452 @@
+"""The command line. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from jaxsmw.errors import InputError
+from jaxsmw.files import atomic_write, check_writable
+
+if TYPE_CHECKING:
+    from jaxsmw.core.refinement import WaveletPreservation
+    from jaxsmw.evaluation.ground_truth import GroundTruth
+    from jaxsmw.evaluation.metrics import GeodesicError
+    from jaxsmw.geometry.mesh import Mesh
+    from jaxsmw.matching import Correspondence
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run `jaxsmw`. Exits with 0 if all went well, 2 for bad input, 1 for anything else."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s ..."))
+    logger = logging.getLogger("jaxsmw")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(logging.WARNING if options.quiet else logging.INFO)
+    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+    try:
+        options.run(options)
+    except InputError as error:
+        _say(f"jaxsmw: {error}")
+        sys.exit(2)
+    except ArithmeticError as error:
+        _say(f"jaxsmw: {error}")
+        sys.exit(1)
+    except KeyboardInterrupt:
+        _say("jaxsmw: interrupted; files are written whole or not at all.")
+        sys.exit(1)
+    except BrokenPipeError:
+        # Whoever read our output has gone; Python would complain again when it flushes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    sys.exit(0)
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        _say(f"{self.prog}: {message} (see {self.prog} --help)")
+        sys.exit(2)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="jaxsmw",
+        description="Which vertex of one shape is which vertex of the other? Give two triangle meshes (OFF, "
+        "OBJ, PLY or STL) of the same kind of body in different poses.",
+    )
+    parser.add_argument("--version", action="version", version=f"jaxsmw {metadata.version('jaxsmw')}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    demo = commands.add_parser("demo", help="match two poses of a built-in creature and show the result")
+    demo.add_argument(
+        "--output", metavar="DIR", default="jaxsmw-demo", help="where to (default: %(default)s)"
+    )
+    demo.add_argument("--kind", default="quadruped", help="kind of creature (default: %(default)s)")
+    demo.add_argument(
+        "--vertices", type=_integer(1), default=5000, help="size of the meshes (default: %(default)s)"
+    )
+    demo.add_argument("--seed", type=_integer(0), default=0, help="another creature (default: %(default)s)")
+    _add_method(demo)
+    _add_common(demo, _demo)
+
+    match = commands.add_parser("match", help="match two meshes")
+    match.add_argument("source", metavar="SOURCE", help="the mesh whose vertices ask")
+    match.add_argument("target", metavar="TARGET", help="the mesh whose vertices answer")
+    match.add_argument(
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="gets one target vertex per source vertex, one per line, counted from 0",
+    )
+    match.add_argument("--report", metavar="DIR", help="write pictures, a 3D page and a summary there")
+    match.add_argument(
+        "--ground-truth",
+        metavar="FILE",
+        nargs="+",
+        help="the true map; the error is printed before and after",
+    )
+    _add_method(match)
+    _add_reading(match)
+    _add_evaluation(match)
+    _add_common(match, _match)
+
+    evaluate = commands.add_parser("evaluate", help="measure a map against the truth")
+    evaluate.add_argument("source", metavar="SOURCE", help="the source mesh")
+    evaluate.add_argument("target", metavar="TARGET", help="the target mesh")
+    evaluate.add_argument("map", metavar="MAP", nargs="+", help="maps, one target vertex per line")
+    evaluate.add_argument(
+        "--ground-truth",
+        metavar="FILE",
+        nargs="+",
+        required=True,
+        help="target vertices, one per line; or two .vts files; or a .baryc_gt file; or a two-column file",
+    )
+    evaluate.add_argument("--output", metavar="FILE", help="write the figures as JSON, curves included")
+    evaluate.add_argument("--figure", metavar="FILE", help="draw the correspondence quality curves")
+    _add_reading(evaluate)
+    _add_evaluation(evaluate)
+    _add_common(evaluate, _evaluate)
+
+    spectrum = commands.add_parser("spectrum", help="inspect a mesh and its eigenbasis")
+    spectrum.add_argument("mesh", metavar="MESH")
+    spectrum.add_argument(
+        "--eigenvectors", type=_integer(1), default=100, help="how many (default: %(default)s)"
+    )
+    spectrum.add_argument(
+        "--output", metavar="FILE.npz", help="write eigenvalues, eigenvectors and vertex_areas (area 1)"
+    )
+    spectrum.add_argument(
+        "--filters", type=_integer(2), default=6, help="for --figure (default: %(default)s)"
+    )
+    spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
+    _add_laplacian(spectrum)
+    _add_reading(spectrum, indices=False)
+    _add_common(spectrum, _spectrum)
+
+    render = commands.add_parser("render", help="draw a mesh, or a correspondence by its colours")
+    render.add_argument("source", metavar="SOURCE", help="the mesh, or the source mesh")
+    render.add_argument("target", metavar="TARGET", nargs="?", help="the target mesh")
+    render.add_argument("map", metavar="MAP", nargs="?", help="the map, one target vertex per line")
+    render.add_argument(
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="a picture (.png, .pdf, .svg); of a correspondence also an interactive page (.html)",
+    )
+    _add_reading(render)
+    _add_common(render, _render)
+    return parser
+
+
+def _integer(lowest: int) -> Any:
+    def convert(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        if value < lowest:
+            raise argparse.ArgumentTypeError(f"{value} is too small: at least {lowest} is needed")
+        return value
+
+    return convert
+
+
+def _add_method(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("method")
+    group.add_argument(
+        "--init",
+        metavar="START",
+        default="shot",
+        help="initial map: shot, wks, hks or wavelet descriptors, landmarks:FILE (source and target vertex per "
+        "line) or map:FILE (default: %(default)s; of the descriptors only shot tells left from right)",
+    )
+    group.add_argument(
+        "--eigenvectors", type=_integer(1), default=100, help="per shape (default: %(default)s)"
+    )
+    group.add_argument("--filters", type=_integer(2), default=6, help="of the frame (default: %(default)s)")
+    group.add_argument("--iterations", type=_integer(1), default=3, help="(default: %(default)s)")
+    group.add_argument(
+        "--samples",
+        metavar="N",
+        type=_integer(1),
+        help="iterate on N samples per shape; all in the last step",
+    )
+    group.add_argument(
+        "--stop-when-unchanged", action="store_true", help="end early when no match changes any more"
+    )
+    group.add_argument(
+        "--precision", choices=("float32", "float64"), default="float32", help="(default: %(default)s)"
+    )
+    _add_laplacian(group)
+
+
+def _add_laplacian(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--laplacian",
+        choices=("auto", "cotangent", "robust"),
+        default="auto",
+        help="robust takes bad triangles; auto uses it where needed (default: %(default)s)",
+    )
+
+
+def _add_reading(parser: argparse.ArgumentParser, *, indices: bool = True) -> None:
+    parser.add_argument("--weld", action="store_true", help="join vertices at exactly the same position")
+    if indices:
+        parser.add_argument(
+            "--index-base",
+            type=int,
+            choices=(0, 1),
+            help="what the first vertex is called in map, landmark and ground-truth files (default: 0, and 1 in "
+            ".vts, .baryc_gt and two-column ground-truth files)",
+        )
+
+
+def _add_evaluation(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--evaluation-samples", metavar="N", type=_integer(1), help="measure at N random vertices only"
+    )
+    parser.add_argument(
+        "--seed", type=_integer(0), default=0, help="of --evaluation-samples (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--geodesics",
+        choices=("strips", "exact"),
+        default="strips",
+        help="strips is within 0.5 %% of exact, and much faster (default: %(default)s)",
+    )
+
+
+def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
+    parser.add_argument("--quiet", action="store_true", help="no progress messages")
+    parser.set_defaults(run=run)
+
+
+def _demo(options: argparse.Namespace) -> None:
+    _choose_precision(options)
+    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
+    from jaxsmw.geometry.creature import creature_pair
+    from jaxsmw.geometry.mesh_files import write_mesh
+    from jaxsmw.report.summary import make_directory
+
+    directory = make_directory(options.output)
+    logging.getLogger("jaxsmw").info("making the creature")
+    pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
+    truth = GroundTruth.of_all_vertices(pair.truth)
+    write_mesh(directory / "source.off", pair.source)
+    write_mesh(directory / "target.off", pair.target)
+    write_ground_truth(directory / "truth.baryc_gt", truth)
+    options.evaluation_samples, options.seed, options.geodesics = None, 0, "strips"
+    correspondence = _run_match(options, pair.source, pair.target)
+    write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
+    _conclude(options, correspondence, truth, directory)
+    print(
+        f"Look at {directory / 'report.html'} (turn the bodies, point at one) and {directory / 'correspondence.png'}."
+    )
+
+
+def _match(options: argparse.Namespace) -> None:
+    # What would fail after minutes of work should fail now.
+    check_writable(options.output)
+    _choose_precision(options)
+    from jaxsmw.evaluation.ground_truth import read_ground_truth, write_pointwise_map
+    from jaxsmw.report.summary import make_directory
+
+    mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
+    truth = None
+    if options.ground_truth:
+        truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+    directory = make_directory(options.report) if options.report else None
+    correspondence = _run_match(options, mesh_x, mesh_y)
+    write_pointwise_map(options.output, correspondence.pointwise_map)
+    _conclude(options, correspondence, truth, directory)
+
+
+def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Correspondence:
+    from jaxsmw.matching import match
+
+    return match(
+        mesh_x,
+        mesh_y,
+        init=_read_init(options, mesh_x, mesh_y),
+        number_of_eigenvectors=options.eigenvectors,
+        refiner=_refiner(options),
+        iterations=options.iterations,
+        number_of_samples=options.samples,
+        laplacian=options.laplacian,
+        stop_when_unchanged=options.stop_when_unchanged,
+    )
+
+
+def _conclude(
+    options: argparse.Namespace,
+    correspondence: Correspondence,
+    truth: GroundTruth | None,
+    directory: Path | None,
+) -> None:
+    """Evaluate, print, and write the report, as far as each is wanted."""
+    errors: dict[str, GeodesicError] = {}
+    if truth is not None:
+        maps = {"initial": correspondence.initial_map, "refined": correspondence.pointwise_map}
+        errors = _errors(options, correspondence.mesh_y, maps, truth)
+    if directory is not None:
+        from jaxsmw.report.summary import write_report
+
+        logging.getLogger("jaxsmw").info("report")
+        settings = {name: value for name, value in vars(options).items() if name != "run"}
+        write_report(directory, correspondence, refiner=_refiner(options), errors=errors, settings=settings)
+    for name, error in errors.items():
+        print(f"{name + ' map:':13} {error}")
+    times = ", ".join(f"{stage} {time:.2f} s" for stage, time in correspondence.seconds.items())
+    print(f"time:         {times}")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    for path in filter(None, (options.output, options.figure)):
+        check_writable(path)
+    from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
+
+    mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
+    truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+    maps = {
+        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+        for path in options.map
+    }
+    errors = _errors(options, mesh_y, maps, truth)
+    for name, error in errors.items():
+        print(f"{name}: {error}")
+    if options.figure:
+        from jaxsmw.report.figures import save_figure
+        from jaxsmw.report.summary import draw_errors
+
+        save_figure(options.figure, draw_errors(errors))
+    if options.output:
+        results = {name: error.as_dictionary() for name, error in errors.items()}
+        with atomic_write(options.output) as temporary:
+            temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
+
+
+def _errors(
+    options: argparse.Namespace, mesh_y: Mesh, maps: Mapping[str, Any], truth: GroundTruth
+) -> dict[str, GeodesicError]:
+    from jaxsmw.evaluation.metrics import geodesic_error
+
+    logging.getLogger("jaxsmw").info("geodesic errors")
+    return {
+        name: geodesic_error(
+            mesh_y,
+            pointwise_map,
+            truth,
+            method=options.geodesics,
+            number_of_samples=options.evaluation_samples,
+            seed=options.seed,
+        )
+        for name, pointwise_map in maps.items()
+    }
+
+
+def _spectrum(options: argparse.Namespace) -> None:
+    for path in filter(None, (options.output, options.figure)):
+        check_writable(path)
+    if options.output and Path(options.output).suffix != ".npz":
+        raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
+    import numpy as np
+
+    from jaxsmw.geometry.eigenbasis import eigenpairs
+    from jaxsmw.geometry.laplacian import choose_laplacian
+    from jaxsmw.geometry.mesh import diagnose
+
+    mesh = _read(options.mesh, options)
+    laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
+    eigenvalues, eigenvectors, vertex_areas = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian)
+    print(diagnose(mesh))
+    print(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
+    for start in range(0, len(eigenvalues), 10):
+        row = " ".join(f"{value:9.2f}" for value in eigenvalues[start : start + 10])
+        print(f"{start:5}  {row}")
+    if options.output:
+        with atomic_write(options.output) as temporary:
+            np.savez(temporary, eigenvalues=eigenvalues, eigenvectors=eigenvectors, vertex_areas=vertex_areas)
+    if options.figure:
+        from jaxsmw.core.filters import Meyer
+        from jaxsmw.report.figures import save_figure
+        from jaxsmw.report.summary import draw_bank
+
+        save_figure(options.figure, draw_bank(Meyer(options.filters), eigenvalues))
+
+
+def _render(options: argparse.Namespace) -> None:
+    check_writable(options.output)
+    from jaxsmw.evaluation.ground_truth import read_pointwise_map
+    from jaxsmw.report.figures import draw_correspondence, draw_mesh, save_figure
+    from jaxsmw.report.page import write_page
+
+    page = Path(options.output).suffix.lower() in (".html", ".htm")
+    if options.target and not options.map:
+        raise InputError(f"{options.target}: to draw two meshes give the map between them as a third file.")
+    if page and not options.map:
+        raise InputError(
+            f"{options.output}: a page shows a correspondence; give a target mesh and a map too."
+        )
+    mesh_x = _read(options.source, options)
+    if not options.map:
+        save_figure(options.output, draw_mesh(mesh_x))
+        return
+    mesh_y = _read(options.target, options)
+    pointwise_map = read_pointwise_map(options.map, mesh_x, mesh_y, index_base=options.index_base or 0)
+    if page:
+        title = f"{Path(options.source).name} to {Path(options.target).name}"
+        write_page(options.output, mesh_x, mesh_y, pointwise_map, title=title)
+    else:
+        save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map))
+
+
+def _read(path: str, options: argparse.Namespace) -> Mesh:
+    from jaxsmw.geometry.mesh import diagnose
+    from jaxsmw.geometry.mesh_files import read_mesh
+
+    mesh = read_mesh(path, weld=options.weld)
+    if not options.quiet:
+        for sentence in (*mesh.notes, *diagnose(mesh).sentences()):
+            _say(f"{path}: {sentence}")
+    return mesh
+
+
+def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
+    from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
+
+    kind, _, path = options.init.partition(":")
+    if not path and kind in ("shot", "wks", "hks", "wavelet"):
+        return kind
+    if path and kind in ("landmarks", "map"):
+        read = read_landmarks if kind == "landmarks" else read_pointwise_map
+        return read(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+    raise InputError(
+        f"--init {options.init}: is no initial map; choose shot, wks, hks, wavelet, landmarks:FILE or map:FILE."
+    )
+
+
+def _refiner(options: argparse.Namespace) -> WaveletPreservation:
+    from jaxsmw.core.filters import Meyer
+    from jaxsmw.core.refinement import WaveletPreservation
+
+    return WaveletPreservation(bank=Meyer(options.filters))
+
+
+def _choose_precision(options: argparse.Namespace) -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", options.precision == "float64")

@@ -1,0 +1,72 @@
+"""Writing files so that a reader never meets half of one."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from jaxsmw.errors import InputError
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to; it becomes `path` when the block ends well, and is gone otherwise.
+
+    The temporary file lies in the target's directory (so that the move is one atomic step) and has the
+    target's suffix (because writers such as `numpy.savez` and `savefig` look at it). Where `path` is a link,
+    the file it points to is replaced.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace.
+
+    **Returns:**
+
+    A context manager that yields the temporary `Path`, which exists and is empty.
+
+    **Raises:**
+
+    `InputError` when the target cannot be written, be it before the block (no such directory, no permission,
+    not a regular file) or by an `OSError` in it (disk full).
+    """
+    target = Path(os.path.realpath(path))
+    temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+    try:
+        check_writable(path)
+        temporary.touch(exist_ok=False)
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}): choose a place with free space "
+            "where you may create files."
+        ) from error
+    finally:
+        # Nothing is left to remove after success, nor where the directory itself was the trouble.
+        if os.path.lexists(temporary):
+            temporary.unlink()
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Tell now what would make `atomic_write` fail later.
+
+    **Raises:**
+
+    `InputError` if there is no such directory, or it or the file in it may not be written to.
+    """
+    target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise InputError(
+            f"{path}: cannot be written because {target.parent} is not a directory: "
+            "create it first or choose another place."
+        )
+    if target.exists() and not target.is_file():
+        raise InputError(f"{path}: cannot be written because it is not a file: choose another name.")
+    for place in (target, target.parent):
+        if place.exists() and not os.access(place, os.W_OK):
+            raise InputError(
+                f"{path}: {place} is write-protected: choose another name or change permissions."
+            )

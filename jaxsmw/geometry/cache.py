@@ -1,0 +1,123 @@
+"""Results on disk that are expensive to compute and depend on nothing but numbers: spectra, geodesic graphs.
+
+An entry is found by a hash of everything it depends on, so it never goes stale; it is written in one step, so
+any number of processes share the directory without locks; and nothing in it is believed that its checksums
+do not confirm. Losing the directory costs time and nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from jaxsmw.errors import InputError
+from jaxsmw.files import atomic_write
+
+# Part of every key: count it up when what is stored under the same inputs changes.
+_FORMAT = 1
+
+# The entries, and what a killed process may have left of one.
+_OWN_FILES = re.compile(r"([a-z-]+-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
+
+
+def cached(
+    kind: str,
+    inputs: Sequence[np.ndarray | str | int | float],
+    compute: Callable[[], dict[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """What `compute` returns, from the disk if it was computed before.
+
+    `JAXSMW_CACHE` names the directory, by default the user's cache directory; empty or `off` means none.
+    `JAXSMW_CACHE_LIMIT` is its size in GiB, by default 4: what was used least recently is removed first. A
+    damaged entry is computed again. Where nothing can be written, a warning says so and work goes on.
+
+    **Arguments:**
+
+    - `kind`: what is computed, in lower-case words joined by hyphens; begins the entry's name.
+    - `inputs`: all that the result depends on.
+    - `compute`: computes the arrays, by name.
+
+    **Returns:** The arrays, bit for bit as computed.
+
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number.
+    """
+    place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
+    limit = _limit()
+    if place in ("", "off"):
+        return compute()
+    key = _key(kind, inputs)
+    path = Path(place) / f"{kind}-{key}.npz"
+    arrays = _load(path, key)
+    if arrays is None:
+        arrays = compute()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as temporary:
+                np.savez(temporary, key=np.array(key), **arrays)  # type: ignore[arg-type]
+            _remove_oldest(path.parent, limit)
+        except (OSError, InputError):
+            # The text is the same for every entry, so that Python shows it once.
+            warnings.warn(
+                f"results cannot be kept in {place} and will be computed again next time: make room there, "
+                "or name another directory in JAXSMW_CACHE ('off' for none).",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+    return arrays
+
+
+def _limit() -> float:
+    """The size limit in bytes."""
+    text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
+    try:
+        return float(text) * 2**30
+    except ValueError:
+        raise InputError(
+            f"JAXSMW_CACHE_LIMIT is {text!r}: give the size of the cache in GiB as a number."
+        ) from None
+
+
+def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
+    digest = hashlib.sha256()
+    for value in (_FORMAT, kind, *inputs):
+        array = np.asarray(value)
+        # The header tells how many bytes follow, so that no two lists of inputs read the same.
+        digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
+    """The arrays of an entry, or None if it is missing, damaged or not what its name says."""
+    # Whatever goes wrong while reading bytes of unknown origin, there is one remedy: compute.
+    with suppress(Exception), np.load(path, allow_pickle=False) as entry:
+        arrays = {name: entry[name] for name in entry.files}
+        if arrays.pop("key") == key:
+            with suppress(OSError):
+                os.utime(path)  # used now: `_remove_oldest` goes by this
+            return arrays
+    return None
+
+
+def _remove_oldest(directory: Path, limit: float) -> None:
+    """Bring our files in the directory below the limit."""
+    files = []
+    for entry in os.scandir(directory):
+        with suppress(FileNotFoundError):  # another process removes, too
+            if _OWN_FILES.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                files.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
+    excess = sum(size for _, size, _ in files) - limit
+    for _, size, path in sorted(files):
+        if excess <= 0:
+            break
+        with suppress(FileNotFoundError):
+            os.unlink(path)
+        excess -= size

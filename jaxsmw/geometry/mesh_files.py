@@ -1,0 +1,485 @@
+"""Meshes in and out of files.
+
+Files are read by code of our own because vertex i must stay vertex i and a lying file must end in one
+sentence: libigl's reader lets indices out of range through and aborts the process on some bad headers;
+trimesh splits and drops vertices of OBJ files and cannot read polygons of mixed size from binary PLY files.
+"""
+
+from __future__ import annotations
+
+import codecs
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+from numpy.typing import ArrayLike
+
+from jaxsmw.errors import InputError
+from jaxsmw.files import atomic_write
+from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
+
+# Reading takes up to fifteen times a file's size in memory; text of this size has ten million vertices.
+LARGEST_FILE = 2**30
+
+
+def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
+    """Read a triangle mesh from an OFF, OBJ, PLY or STL file.
+
+    Vertex i is the i-th vertex of the file. STL files know no vertices, only corners: those at exactly the
+    same position become one vertex, numbered by first appearance. Faces with more than three corners are
+    split into fans of triangles. Colours, normals and texture coordinates are passed over.
+
+    **Arguments:**
+
+    - `path`: the file; its suffix, in either case, tells the format. OFF: text, also with colours or normals
+        (COFF, NOFF). OBJ: `v` and `f` lines. PLY: text and binary, either byte order. STL: text and binary.
+    - `weld`: as in `make_mesh`.
+
+    **Returns:**
+
+    A `Mesh` called by its path; `notes` tell what was mended and noticed.
+
+    **Raises:**
+
+    `InputError` when the file cannot be read, is not what its suffix says, ends early or goes on after its
+    end, or when `make_mesh` refuses what is in it.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            fault = "is not a regular file" if path.exists() else "does not exist"
+            raise InputError(f"{path}: {fault}: give the path of a mesh file.")
+        parse = _PARSERS.get(path.suffix.lower())
+        if parse is None:
+            raise InputError(
+                f"{path}: the suffix {path.suffix!r} is not that of a known mesh format: convert the mesh to "
+                f"one of {', '.join(_PARSERS)}."
+            )
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{path}: is larger than {LARGEST_FILE >> 30} GiB: decimate the mesh first.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or error}): check the path and its permissions."
+        ) from error
+    try:
+        polygons = parse(data)
+        faces = _fans(polygons.corners, polygons.sizes)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    notes = list(polygons.notes)
+    large = int((polygons.sizes > 3).sum())
+    if large:
+        notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
+    return make_mesh(polygons.vertices, faces, name=str(path), weld=weld, notes=notes)
+
+
+class _Polygons(NamedTuple):
+    """What a parser finds: positions, all faces' corners in a row, and how many belong to each face."""
+
+    vertices: Float64[np.ndarray, "n 3"]
+    corners: np.ndarray
+    sizes: Int64[np.ndarray, " f"]
+    notes: tuple[str, ...] = ()
+
+
+def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
+    """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1); (t, 3)."""
+    if (sizes < 3).any():
+        at = int((sizes < 3).argmax())
+        raise InputError(f"face {at} has {count_of(int(sizes[at]), 'corner')}, three are needed: remove it.")
+    per_face = sizes - 2
+    apex = np.repeat(np.cumsum(sizes) - sizes, per_face)
+    step = np.arange(len(apex)) - np.repeat(np.cumsum(per_face) - per_face, per_face)
+    return np.stack([corners[apex], corners[apex + step + 1], corners[apex + step + 2]], axis=1)
+
+
+def _text(data: bytes) -> str:
+    """Text without comments whose lines end in a newline, whatever they ended in."""
+    # Latin-1 never fails; only ASCII means anything to a parser.
+    text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
+    return re.sub("#[^\n]*", "", text) if "#" in text else text
+
+
+def _numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines columns"]:
+    """The first so many numbers of each line."""
+    if not lines:
+        return np.empty((0, columns))
+    try:
+        if "" in lines:  # which loadtxt would skip
+            raise ValueError
+        return np.loadtxt(lines, usecols=range(columns), comments=None, ndmin=2)
+    except ValueError:
+        culprit = next((line for line in lines if not _starts_with_numbers(line, columns)), lines[0])
+        raise InputError(
+            f"{_excerpt(culprit)} stands where {count_of(columns, 'number')} should be: "
+            "the file is damaged or its header is wrong, export it again."
+        ) from None
+
+
+def _starts_with_numbers(line: str, columns: int) -> bool:
+    try:
+        return len([float(word) for word in line.split()[:columns]]) == columns
+    except ValueError:
+        return False
+
+
+def _excerpt(line: str) -> str:
+    """A piece of a file as a message may quote it."""
+    return ascii(" ".join(line.split())[:40])
+
+
+def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], Int64[np.ndarray, " f"]]:
+    """Corners and sizes of faces written `size corner corner …`, one per line."""
+    sizes = _numbers(lines, 1)[:, 0]
+    longest = max(map(len, lines), default=0)
+    possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
+    if not possible.all():
+        raise InputError(
+            f"{_excerpt(lines[int(possible.argmin())])} stands where a face should be, its number of corners "
+            "first: the file is damaged or its header is wrong, export it again."
+        )
+    sizes = sizes.astype(np.int64)
+    starts = np.cumsum(sizes) - sizes
+    rows_of_size = {size: np.flatnonzero(sizes == size) for size in np.unique(sizes).tolist()}
+    tables = {size: _numbers([lines[i] for i in rows], size + 1) for size, rows in rows_of_size.items()}
+    corners = np.empty(sizes.sum())
+    for size, rows in rows_of_size.items():
+        corners[starts[rows][:, None] + np.arange(size)] = tables[size][:, 1:]
+    return corners, sizes
+
+
+def _parse_off(data: bytes) -> _Polygons:
+    """Object File Format: http://www.geomview.org/docs/html/OFF.html, of which text in three dimensions."""
+    lines = [line for line in _text(data).split("\n") if line and not line.isspace()]
+    # Some programs write the counts right behind the keyword, even without a space.
+    keyword = re.match(r"\s*(?:ST)?C?N?OFF\s*(.*)", lines[0]) if lines else None
+    if keyword is None:
+        raise InputError("does not begin with OFF, COFF or NOFF: this is no OFF file, export it again.")
+    if keyword[1].startswith("BINARY"):
+        raise InputError("is a binary OFF file: save it as text, or as binary PLY.")
+    lines = ([keyword[1]] if keyword[1] else []) + lines[1:]
+    counts = re.match(r"\s*(\d{1,18})\s+(\d{1,18})(\s|$)", lines[0]) if lines else None
+    if counts is None:
+        raise InputError("OFF is not followed by the numbers of vertices and faces: export it again.")
+    n, f = int(counts[1]), int(counts[2])
+    lines = lines[1:]
+    if len(lines) != n + f:
+        raise InputError(
+            f"the header promises {n} vertices and {f} faces, but {count_of(len(lines), 'line')} follow: "
+            "the file is truncated or its header is wrong, export it again."
+        )
+    return _Polygons(_numbers(lines[:n], 3), *_polygon_lines(lines[n:]))
+
+
+def _parse_obj(data: bytes) -> _Polygons:
+    """Wavefront OBJ: the `v` and `f` statements; all groups and objects are one mesh."""
+    text = re.sub(r"\\\n+", " ", _text(data)) if b"\\" in data else _text(data)
+    vertex, face = (re.compile(rf"^[^\S\n]*{keyword}(?!\S)[^\S\n]*(.*)$", re.MULTILINE) for keyword in "vf")
+    vertices = _numbers(vertex.findall(text), 3)
+    if not len(vertices):
+        raise InputError("has no line that begins with v: this is no OBJ file, export it again.")
+    lines = face.findall(text)
+    if any("/" in line for line in lines):  # texture and normal indices: corner/texture/normal
+        lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
+    corners, sizes = _polygon_lines([f"{len(line.split())} {line}" for line in lines])
+    if (corners == 0).any():
+        raise InputError("a face uses vertex 0, but OBJ files count from 1: export it again.")
+    if (corners < 0).any():  # counted back from the vertices above the face
+        vertex_at = [match.start() for match in vertex.finditer(text)]
+        face_at = [match.start() for match in face.finditer(text)]
+        above = np.repeat(np.searchsorted(vertex_at, face_at), sizes)
+        corners = np.where(corners < 0, corners + above + 1, corners)
+    return _Polygons(vertices, corners - 1, sizes)
+
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def _parse_stl(data: bytes) -> _Polygons:
+    """Stereolithography: triangles without vertices, https://www.fabbers.com/tech/STL_Format."""
+    header = 84
+    count = int.from_bytes(data[80:header], "little")
+    # Binary files may begin with "solid" too, so their length decides.
+    if len(data) >= header and len(data) == header + count * _FACET.itemsize:
+        corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
+    elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
+        text = _text(data).lower()
+        corners = _numbers(
+            [" ".join(words) for words in re.findall(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", text)], 3
+        )
+        facets = len(re.findall(r"\bendfacet\b", text))
+        if len(corners) != 3 * facets or "endsolid" not in text:
+            raise InputError(
+                f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in all "
+                "are not triangles: the file is truncated or damaged, export it again."
+            )
+    elif len(data) >= header:
+        raise InputError(
+            f"the header promises {count} triangles, which does not fit the file's {len(data)} bytes: "
+            "it is truncated or no STL file, export it again."
+        )
+    else:
+        raise InputError("is neither a text nor a binary STL file: export it again.")
+    appearance, faces = np.unique(lowest_twins(corners), return_inverse=True)
+    note = (
+        "STL files do not number vertices: corners at the same position were merged into "
+        f"{count_of(len(appearance), 'vertex')}, numbered by first appearance."
+    )
+    return _Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), (note,))
+
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class _Property(NamedTuple):
+    """A number in every row of a PLY table or, where `length` is the type of one, a list of so many."""
+
+    type: np.dtype
+    length: np.dtype | None
+
+
+class _Column(NamedTuple):
+    """All numbers of one property, and how many belong to each row."""
+
+    values: np.ndarray
+    sizes: np.ndarray
+
+
+def _parse_ply(data: bytes) -> _Polygons:
+    """Polygon File Format, text and binary: https://paulbourke.net/dataformats/ply/."""
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    if first is None:
+        raise InputError("does not begin with ply: this is no PLY file, export it again.")
+    newline = first[1]
+    last = re.search(newline + rb"end_header[ \t]*" + newline, data)
+    if last is None:
+        raise InputError("the header has no end: the file is truncated or damaged, export it again.")
+    header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
+    encoding, elements = _ply_header(header)
+    body = data[last.end() :]
+    if encoding == "ascii":
+        # Text becomes a binary body in which every number is a float64.
+        try:
+            body = np.array(body.split(), dtype=np.float64).tobytes()
+        except ValueError:
+            raise InputError("has a word where a number should be: export it again.") from None
+
+    tables, offset = {}, 0
+    for name, (count, properties) in elements.items():
+        try:
+            tables[name], offset = _ply_table(body, offset, count, properties)
+        except EOFError:
+            raise InputError(
+                f"the header promises {count} rows of {_excerpt(name)}, but the file ends within them: "
+                "it is truncated or its header is wrong, export it again."
+            ) from None
+    if body[offset:].strip():
+        raise InputError("goes on after what its header promises: the header is wrong, export it again.")
+
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
+    if len(position) < 3:
+        raise InputError("has no x, y and z for its vertices: export it again.")
+    corners = face.get("vertex_indices", face.get("vertex_index"))
+    if corners is None:
+        raise InputError("has no faces with vertex_indices: a triangle mesh is needed.")
+    return _Polygons(np.stack(position, axis=1, dtype=np.float64), *corners)
+
+
+def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
+    """The encoding, and for each element the number of rows and the properties."""
+    formats = [line.split()[1] for line in lines if re.match(r"format\s+\S", line)]
+    if len(formats) != 1 or formats[0] not in _PLY_BYTE_ORDERS:
+        raise InputError(
+            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)}: export it again."
+        )
+    encoding = formats[0]
+
+    def number(name: str) -> np.dtype:
+        return np.dtype(np.float64 if encoding == "ascii" else _PLY_BYTE_ORDERS[encoding] + _PLY_TYPES[name])
+
+    elements: dict[str, tuple[int, dict[str, _Property]]] = {}
+    properties: dict[str, _Property] | None = None
+    for line in lines:
+        match line.split():
+            case [] | ["comment" | "obj_info" | "format", *_]:
+                pass
+            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count) and name not in elements:
+                properties = {}
+                elements[name] = int(count), properties
+            case ["property", "list", length, kind, name] if (
+                _PLY_TYPES.get(length, "f")[0] in "iu"
+                and kind in _PLY_TYPES
+                and properties is not None
+                and name not in properties
+            ):
+                properties[name] = _Property(number(kind), number(length))
+            case ["property", kind, name] if (
+                kind in _PLY_TYPES and properties is not None and name not in properties
+            ):
+                properties[name] = _Property(number(kind), None)
+            case _:
+                raise InputError(
+                    f"the header has a line {_excerpt(line)} that makes no sense: export it again."
+                )
+    return encoding, elements
+
+
+def _ply_table(
+    body: bytes, offset: int, count: int, properties: dict[str, _Property]
+) -> tuple[dict[str, _Column], int]:
+    """The columns of the table that begins at `offset`, and where it ends; `EOFError` when the body does."""
+    shortest = sum((p.length or p.type).itemsize for p in properties.values())
+    if count * shortest > len(body) - offset:
+        raise EOFError
+    if not count or not properties:
+        return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
+
+    # Nearly always all lists of a property have the same length: then the table is one array of records.
+    spans, _ = _ply_row(body, offset, properties)
+    sizes = {name: size for name, (_, size) in zip(properties, spans, strict=True)}
+    lengths = {name: f"length of {name}" for name, (_, length) in properties.items() if length}
+    fields: list[tuple] = []
+    for name, (kind, length) in properties.items():
+        fields += [(lengths[name], length)] if length else []
+        fields += [(name, kind, (sizes[name],))]
+    record = np.dtype(fields)
+    end = offset + count * record.itemsize
+    if end <= len(body):
+        table = np.frombuffer(body, record, count, offset)
+        if all((table[key] == sizes[name]).all() for name, key in lengths.items()):
+            return {
+                name: _Column(table[name].ravel(), np.full(count, sizes[name])) for name in properties
+            }, end
+
+    rows = []
+    for _ in range(count):
+        spans, offset = _ply_row(body, offset, properties)
+        rows.append(spans)
+    columns = {}
+    for (name, (kind, _)), column in zip(properties.items(), zip(*rows, strict=True), strict=True):
+        values = b"".join([body[start : start + size * kind.itemsize] for start, size in column])
+        columns[name] = _Column(np.frombuffer(values, kind), np.array([size for _, size in column]))
+    return columns, offset
+
+
+def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
+    """Where the numbers of each property of a row start and how many they are; where the row ends."""
+    spans = []
+    for kind, length in properties.values():
+        size = 1
+        if length:
+            start, offset = offset, offset + length.itemsize
+            if offset > len(body):
+                raise EOFError
+            written = np.frombuffer(body, length, 1, start)[0]
+            if not 0 <= written <= len(body) or written % 1:
+                raise InputError(
+                    f"a list claims to have {written:.15g} numbers: the file is damaged, export it again."
+                )
+            size = int(written)
+        spans.append((offset, size))
+        offset += size * kind.itemsize
+    if offset > len(body):
+        raise EOFError
+    return spans, offset
+
+
+_PARSERS: dict[str, Callable[[bytes], _Polygons]] = {
+    ".off": _parse_off,
+    ".obj": _parse_obj,
+    ".ply": _parse_ply,
+    ".stl": _parse_stl,
+}
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None) -> None:
+    """Write a mesh to an OFF (text) or PLY (binary, little endian) file.
+
+    What `read_mesh` reads back has the same vertices, bit for bit, and the same faces. The file appears whole
+    or not at all.
+
+    **Arguments:**
+
+    - `path`: the file to create or replace; its suffix, `.off` or `.ply`, tells the format.
+    - `mesh`: the mesh.
+    - `colors`: red, green and blue of each vertex (n, 3), floats from 0 to 1 or uint8 (as OFF: COFF).
+
+    **Raises:**
+
+    `InputError` for another suffix, colors of another shape or range, or a place that cannot be written to.
+    """
+    path = Path(path)
+    form = _FORMATTERS.get(path.suffix.lower())
+    if form is None:
+        raise InputError(
+            f"{path}: meshes are not written as {path.suffix!r}: choose a name that ends in "
+            f"{' or '.join(_FORMATTERS)}."
+        )
+    content = form(mesh, None if colors is None else _bytes_of_colors(colors, len(mesh.vertices)))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _bytes_of_colors(colors: ArrayLike, n: int) -> UInt8[np.ndarray, "n 3"]:
+    array = np.asarray(colors)
+    if array.shape != (n, 3):
+        raise InputError(
+            f"colors have shape {array.shape}, but {n} vertices need ({n}, 3): give one row for each."
+        )
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
+        raise InputError("colors are neither uint8 nor floats from 0 to 1: convert them.")
+    return np.rint(255 * array.astype(np.float64)).astype(np.uint8)
+
+
+def _format_off(mesh: Mesh, colors: UInt8[np.ndarray, "n 3"] | None) -> bytes:
+    # repr of a float is the shortest text that reads back as the same float.
+    vertices = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+    if colors is not None:
+        vertices = [f"{v} {r} {g} {b} 255" for v, (r, g, b) in zip(vertices, colors.tolist(), strict=True)]
+    faces = [f"3 {i} {j} {k}" for i, j, k in mesh.faces.tolist()]
+    header = ["OFF" if colors is None else "COFF", f"{len(vertices)} {len(faces)} 0"]
+    return "\n".join([*header, *vertices, *faces, ""]).encode()
+
+
+def _format_ply(mesh: Mesh, colors: UInt8[np.ndarray, "n 3"] | None) -> bytes:
+    fields: list[tuple] = [(axis, "<f8") for axis in "xyz"]
+    if colors is not None:
+        fields += [(channel, "u1") for channel in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), fields)
+    for axis, values in zip("xyz", mesh.vertices.T, strict=True):
+        vertices[axis] = values
+    if colors is not None:
+        for channel, values in zip(("red", "green", "blue"), colors.T, strict=True):
+            vertices[channel] = values
+    faces = np.empty(len(mesh.faces), [("size", "u1"), ("corners", "<i4", 3)])
+    faces["size"], faces["corners"] = 3, mesh.faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property {'double' if kind == '<f8' else 'uchar'} {name}" for name, kind in fields),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+_FORMATTERS: dict[str, Callable[[Mesh, np.ndarray | None], bytes]] = {
+    ".off": _format_off,
+    ".ply": _format_ply,
+}

@@ -1,0 +1,160 @@
+"""Everything about one match in one directory."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Float64
+
+from jaxsmw.core.filters import FilterBank
+from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.metrics import GeodesicError
+from jaxsmw.files import atomic_write
+from jaxsmw.matching import Correspondence
+from jaxsmw.report.figures import draw_correspondence, draw_filters, draw_functional_map, draw_quality_curves
+from jaxsmw.report.page import write_page
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_CURVE_END = 0.25
+
+
+def write_report(
+    directory: str | os.PathLike[str],
+    correspondence: Correspondence,
+    *,
+    refiner: WaveletPreservation,
+    errors: Mapping[str, GeodesicError] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the pictures of a match, an interactive page and a summary to a directory.
+
+    **Arguments:**
+
+    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the figures),
+      `correspondence.png`, `functional_map.png`, `filters.png`, `quality.png` (with errors only) and
+      `summary.json`.
+    - `correspondence`: the match.
+    - `refiner`: what refined it.
+    - `errors`: geodesic errors by name, the last of them that of `correspondence.pointwise_map`.
+    - `settings`: what else to note in the summary.
+
+    **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
+    """
+    directory = make_directory(directory)
+    errors = errors or {}
+    final = list(errors.values())[-1] if errors else None
+    per_vertex = None if final is None else _per_vertex(final, len(correspondence.pointwise_map))
+
+    figures = {
+        "correspondence": draw_correspondence(
+            correspondence.mesh_x, correspondence.mesh_y, correspondence.pointwise_map, errors=per_vertex
+        ),
+        "functional_map": draw_functional_map(correspondence.functional_map, convention=refiner.convention),
+        "filters": draw_bank(refiner.bank, np.asarray(correspondence.spectrum_x.eigenvalues)),
+    }
+    captions = {
+        "functional_map": "The functional map C.",
+        "filters": "The filters over the eigenvalues of the source (area 1).",
+    }
+    if errors:
+        figures["quality"] = draw_errors(errors)
+        captions["quality"] = "The share of vertices within a geodesic error."
+    pictures = {name: _png(figure) for name, figure in figures.items()}
+    for name, picture in pictures.items():
+        with atomic_write(directory / f"{name}.png") as temporary:
+            temporary.write_bytes(picture)
+
+    facts = summarize(correspondence, errors)
+    write_page(
+        directory / "report.html",
+        correspondence.mesh_x,
+        correspondence.mesh_y,
+        correspondence.pointwise_map,
+        title=f"{Path(correspondence.mesh_x.name).name} to {Path(correspondence.mesh_y.name).name}",
+        statistics=facts,
+        errors=per_vertex,
+        figures=[(caption, pictures[name]) for name, caption in captions.items()],
+    )
+    summary = {"settings": dict(settings or {}), "result": facts, "provenance": provenance()}
+    with atomic_write(directory / "summary.json") as temporary:
+        temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+
+
+def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
+    """The filters of a bank over the eigenvalues of a shape, with their frame function."""
+    lambda_max = jnp.asarray(eigenvalues[-1])
+    grid = jnp.linspace(0, lambda_max, 1000)
+    return draw_filters(np.asarray(grid), np.asarray(bank(grid, lambda_max)), eigenvalues)
+
+
+def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
+    """The correspondence quality curves of some maps, with their mean errors."""
+    thresholds = np.linspace(0, _CURVE_END, 251)
+    return draw_quality_curves(
+        {
+            name: (thresholds, error.correspondence_quality_curve(thresholds))
+            for name, error in errors.items()
+        },
+        mean_errors={name: error.mean for name, error in errors.items()},
+    )
+
+
+def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, str]:
+    """The facts of a match, labelled and ready to print."""
+    facts = {
+        "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
+        "functional map": "{} x {}".format(*correspondence.functional_map.shape),
+        "iterations": str(correspondence.iterations),
+    }
+    facts |= {f"mean error, {name}": str(error) for name, error in errors.items()}
+    return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
+
+
+def provenance() -> dict[str, str]:
+    """What a figure depends on besides its input: versions and machine."""
+    packages = ("jaxsmw", "jax", "jaxlib", "numpy", "scipy", "libigl")
+    return {
+        **{package: metadata.version(package) for package in packages},
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def make_directory(path: str | os.PathLike[str]) -> Path:
+    """The directory, made if it is not there yet."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be made a directory ({error.strerror}); choose another place."
+        ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written to; choose another place or change its permissions.")
+    return Path(path)
+
+
+def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
+    """The errors spread over the source's vertices, NaN where none is known, the mean where several are."""
+    total = np.bincount(error.source_vertices, error.errors, minlength=m)
+    count = np.bincount(error.source_vertices, minlength=m)
+    return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
