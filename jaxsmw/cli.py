@@ -28,14 +28,15 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run `jaxsmw`. Exits with 0 if all went well, 2 for bad input, 1 for anything else."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    logger = logging.getLogger("jaxsmw")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s ..."))
-    logger = logging.getLogger("jaxsmw")
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(logging.WARNING if options.quiet else logging.INFO)
-    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
     try:
-        options.run(options)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+            options.run(options)
     except InputError as error:
         _say(f"jaxsmw: {error}")
         sys.exit(2)
@@ -171,8 +172,9 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "--init",
         metavar="START",
         default="shot",
-        help="initial map: shot, wks, hks or wavelet descriptors, landmarks:FILE (source and target vertex per "
-        "line) or map:FILE (default: %(default)s; of the descriptors only shot tells left from right)",
+        help="initial map: shot, wks, hks or wavelet descriptors, landmarks:FILE (a source and a target "
+        "vertex per line) or map:FILE (default: %(default)s, of the descriptors the only one that tells left "
+        "from right)",
     )
     group.add_argument(
         "--eigenvectors", type=_integer(1), default=100, help="per shape (default: %(default)s)"
@@ -210,7 +212,7 @@ def _add_reading(parser: argparse.ArgumentParser, *, indices: bool = True) -> No
             "--index-base",
             type=int,
             choices=(0, 1),
-            help="what the first vertex is called in map, landmark and ground-truth files (default: 0, and 1 in "
+            help="number of the first vertex in map, landmark and ground-truth files (default: 0, and 1 in "
             ".vts, .baryc_gt and two-column ground-truth files)",
         )
 
@@ -236,7 +238,6 @@ def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    _choose_precision(options)
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
     from jaxsmw.geometry.creature import creature_pair
     from jaxsmw.geometry.mesh_files import write_mesh
@@ -253,15 +254,12 @@ def _demo(options: argparse.Namespace) -> None:
     correspondence = _run_match(options, pair.source, pair.target)
     write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
     _conclude(options, correspondence, truth, directory)
-    print(
-        f"Look at {directory / 'report.html'} (turn the bodies, point at one) and {directory / 'correspondence.png'}."
-    )
+    print(f"Look at {directory / 'report.html'} and {directory / 'correspondence.png'}.")
 
 
 def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     check_writable(options.output)
-    _choose_precision(options)
     from jaxsmw.evaluation.ground_truth import read_ground_truth, write_pointwise_map
     from jaxsmw.report.summary import make_directory
 
@@ -276,19 +274,22 @@ def _match(options: argparse.Namespace) -> None:
 
 
 def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Correspondence:
+    import jax
+
     from jaxsmw.matching import match
 
-    return match(
-        mesh_x,
-        mesh_y,
-        init=_read_init(options, mesh_x, mesh_y),
-        number_of_eigenvectors=options.eigenvectors,
-        refiner=_refiner(options),
-        iterations=options.iterations,
-        number_of_samples=options.samples,
-        laplacian=options.laplacian,
-        stop_when_unchanged=options.stop_when_unchanged,
-    )
+    with jax.enable_x64(options.precision == "float64"):
+        return match(
+            mesh_x,
+            mesh_y,
+            init=_read_init(options, mesh_x, mesh_y),
+            number_of_eigenvectors=options.eigenvectors,
+            refiner=_refiner(options),
+            iterations=options.iterations,
+            number_of_samples=options.samples,
+            laplacian=options.laplacian,
+            stop_when_unchanged=options.stop_when_unchanged,
+        )
 
 
 def _conclude(
@@ -435,7 +436,8 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
         read = read_landmarks if kind == "landmarks" else read_pointwise_map
         return read(path, mesh_x, mesh_y, index_base=options.index_base or 0)
     raise InputError(
-        f"--init {options.init}: is no initial map; choose shot, wks, hks, wavelet, landmarks:FILE or map:FILE."
+        f"--init {options.init}: is no initial map: choose shot, wks, hks, wavelet, landmarks:FILE or "
+        "map:FILE."
     )
 
 
@@ -444,9 +446,3 @@ def _refiner(options: argparse.Namespace) -> WaveletPreservation:
     from jaxsmw.core.refinement import WaveletPreservation
 
     return WaveletPreservation(bank=Meyer(options.filters))
-
-
-def _choose_precision(options: argparse.Namespace) -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", options.precision == "float64")

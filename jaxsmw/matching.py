@@ -140,7 +140,8 @@ def match(
             )
         )
     if refinement.result != RESULTS.successful:
-        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {RESULTS[refinement.result]}")
+        sentence = RESULTS[refinement.result]  # type: ignore[type-arg]
+        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence}")
     pointwise_map = np.asarray(refinement.pointwise_map).astype(np.int64)
     return Correspondence(
         mesh_x=mesh_x,
@@ -175,7 +176,7 @@ def initial_map(
             features_x, features_y = (np.asarray(_SIGNATURES[init](s)) for s in (spectrum_x, spectrum_y))
         else:
             raise InputError(
-                f"{init!r} is no initial map; choose among shot, {', '.join(_SIGNATURES)}, landmarks or a map."
+                f"{init!r} is no initial map: choose shot, {', '.join(_SIGNATURES)}, landmarks or a map."
             )
     else:
         given = np.asarray(init)
@@ -197,8 +198,8 @@ def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndar
         raise InputError(f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices.")
     if given.min() < 0 or given.max() >= n:
         raise InputError(
-            f"the initial map runs from {given.min()} to {given.max()}, but the vertices of {mesh_y.name} are "
-            f"0 to {n - 1}; count from 0."
+            f"the initial map runs from {given.min()} to {given.max()}, but the vertices of {mesh_y.name} "
+            f"are 0 to {n - 1}; count from 0."
         )
     unused = ~mesh_y.used_vertices[given] & mesh_x.used_vertices
     if unused.any():
@@ -215,8 +216,8 @@ def _landmark_features(
     """Geodesic distances to each landmark, in units of the square root of the area."""
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
-            f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) for "
-            "landmarks."
+            f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) "
+            "for landmarks."
         )
     features = []
     for mesh, vertices in ((mesh_x, landmarks[:, 0]), (mesh_y, landmarks[:, 1])):

@@ -61,7 +61,9 @@ def medians(candidates: dict[str, Callable[[], object]], repeats: int) -> dict[s
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--vertices", type=int, nargs=2, default=(6890, 7000))
     parser.add_argument("--eigenvectors", type=int, default=100)

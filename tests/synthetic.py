@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.mesh import Mesh, make_mesh
 
 
 def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) -> Spectrum:
@@ -60,3 +61,10 @@ def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
             [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
         )
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+
+
+def bumpy_mesh(subdivisions: int = 4) -> Mesh:
+    """A sphere with waves of no symmetry at all."""
+    vertices, faces = sphere_mesh(subdivisions)
+    waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
+    return make_mesh(vertices * (1 + waves)[:, None], faces)

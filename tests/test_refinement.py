@@ -1,5 +1,9 @@
 """The loop: what it must not depend on, what it reports, and how often it compiles."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -185,7 +189,7 @@ def test_stops_when_the_map_no_longer_changes(pair):
 
 
 def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
-    x, y, start, truth = pair
+    x, y, start, _ = pair
     generator = np.random.default_rng(1)
     samples_x, samples_y = (jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
     refiner = WaveletPreservation()
@@ -217,24 +221,47 @@ def test_vmap_over_pairs_equals_a_loop():
             assert batched.iterations[index] == alone.iterations
 
 
-def test_compiles_once_per_size_and_setting():
-    class Counting(WaveletPreservation):
-        traces = []
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to tell the peak memory")
+def test_memory_stays_far_below_all_distances():
+    """50 000 x 50 000 distances would take 10 GB; the process as a whole has to do with a tenth of it."""
+    program = """
+import re
+import jax.numpy as jnp
+import numpy as np
+from jaxsmw import Spectrum, refine
+generator = np.random.default_rng(0)
+n, k = 50_000, 20
+def spectrum():
+    vectors = jnp.asarray(generator.normal(size=(n, k)), jnp.float32)
+    return Spectrum(jnp.arange(k, dtype=jnp.float32), vectors, jnp.full(n, 1 / n, jnp.float32), jnp.ones(n, bool))
+t = refine(spectrum(), spectrum(), jnp.zeros(n, jnp.int32), iterations=2).pointwise_map
+assert len(np.unique(t)) > 1
+# Not getrusage: its peak counts what the parent process had before this one began.
+print(re.search(r"VmHWM:\\s*(\\d+) kB", open("/proc/self/status").read())[1])
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) * 1024 < 1e9
 
+
+def test_compiles_once_per_size_and_setting():
+    traces = []
+
+    class Counting(WaveletPreservation):
         def update(self, problem, pointwise_map):
-            self.traces.append(1)
+            traces.append(1)
             return super().update(problem, pointwise_map)
 
     refiner = Counting()
     start = jnp.zeros(50, jnp.int32)
     refine(random_spectrum(50, 5, seed=0), random_spectrum(40, 5, seed=1), start, refiner=refiner)
-    traced = len(refiner.traces)
+    traced = len(traces)
     for seed in range(3):
         pair = random_spectrum(50, 5, seed=seed), random_spectrum(40, 5, seed=seed + 5)
         refine(*pair, start + seed, refiner=refiner)
-    assert len(refiner.traces) == traced
+    assert len(traces) == traced
     refine(random_spectrum(50, 6), random_spectrum(40, 6), start, refiner=refiner)
-    assert len(refiner.traces) > traced
+    assert len(traces) > traced
 
 
 def test_float32_in_float32_out():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import grid_mesh, sphere_mesh
+from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import shot
@@ -13,10 +13,7 @@ from jaxsmw.geometry.shot import shot_descriptors
 
 @pytest.fixture(scope="module")
 def bumpy():
-    """A sphere with waves of no symmetry at all."""
-    vertices, faces = sphere_mesh(4)
-    waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
-    return make_mesh(vertices * (1 + waves)[:, None], faces)
+    return bumpy_mesh()
 
 
 @pytest.fixture(scope="module")

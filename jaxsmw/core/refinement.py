@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -253,44 +253,62 @@ def refine(
     def energy(problem: Problem, functional_map: Array, pointwise_map: Array) -> Array:
         return refiner.energy(problem, functional_map, pointwise_map) if history else undefined
 
-    def turn(carry: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        before, functional_map, its_energy, finite, count, _ = carry
-        after, changed, objective = search(working, functional_map, before)
-        following = refiner.update(working, after)
-        finite &= jnp.all(jnp.isfinite(following))
-        carry = (after, following, energy(working, following, after), finite, count + 1, changed == 0)
-        nothing_to_compare = (before[0] < 0) if samples_x is not None else jnp.asarray(False)
-        return carry, (jnp.where(nothing_to_compare, jnp.nan, changed), its_energy, objective)
+    def turn(state: _State) -> tuple[_State, tuple[Array, Array, Array]]:
+        after, changed, objective = search(working, state.functional_map, state.pointwise_map)
+        functional_map = refiner.update(working, after)
+        following = _State(
+            after,
+            functional_map,
+            energy(working, functional_map, after),
+            finite=state.finite & jnp.all(jnp.isfinite(functional_map)),
+            iterations=state.iterations + 1,
+            unchanged=changed == 0,
+        )
+        if samples_x is not None:
+            changed = jnp.where(state.iterations == 1, undefined, changed)
+        return following, (changed, state.energy, objective)
 
-    def step(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    def step(state: _State, _: None) -> tuple[_State, tuple[Array, Array, Array]]:
         if not stop_when_unchanged:
-            return turn(carry)
-        return lax.cond(carry[-1], lambda carry: (carry, (undefined,) * 3), turn, carry)
+            return turn(state)
+        return lax.cond(state.unchanged, lambda state: (state, (undefined,) * 3), turn, state)
 
     functional_map = refiner.update(whole, pointwise_map)
-    carry = (
+    state = _State(
         working_map,
         functional_map,
         energy(whole, functional_map, pointwise_map),
-        jnp.all(jnp.isfinite(functional_map)),
-        jnp.asarray(1, jnp.int32),
-        jnp.asarray(False),
+        finite=jnp.all(jnp.isfinite(functional_map)),
+        iterations=jnp.asarray(1, jnp.int32),
+        unchanged=jnp.asarray(False),
     )
-    carry, records = lax.scan(step, carry, None, length=iterations - 1)
-    before, functional_map, its_energy, finite, count, _ = carry
-    if samples_x is None:
-        refined, changed, objective = search(whole, functional_map, before)
-    else:
-        refined, _, objective = search(whole, functional_map, pointwise_map)
-        changed = undefined
+    state, records = lax.scan(step, state, None, length=iterations - 1)
+    before = state.pointwise_map if samples_x is None else pointwise_map
+    refined, changed, objective = search(whole, state.functional_map, before)
 
-    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, finite)
-    refined = jnp.where(result == RESULTS.successful, refined, -1)
+    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, state.finite)
     recorded = None
     if history:
-        last = (changed, its_energy, objective)
+        last = (changed if samples_x is None else undefined, state.energy, objective)
         recorded = History(*(jnp.append(series, value) for series, value in zip(records, last, strict=True)))
-    return Refinement(refined, functional_map, result, count, recorded)
+    return Refinement(
+        jnp.where(result == RESULTS.successful, refined, -1),
+        state.functional_map,
+        result,
+        state.iterations,
+        recorded,
+    )
+
+
+class _State(NamedTuple):
+    """What one turn of the loop hands to the next."""
+
+    pointwise_map: Int32[Array, " s"]
+    functional_map: Float[Array, "k_out k_in"]
+    energy: Float[Array, ""]
+    finite: Bool[Array, ""]
+    iterations: Int32[Array, ""]
+    unchanged: Bool[Array, ""]
 
 
 def _diagnose(
@@ -304,6 +322,7 @@ def _diagnose(
     for spectrum in (spectrum_x, spectrum_y):
         for leaf in (spectrum.eigenvalues, spectrum.eigenvectors, spectrum.vertex_areas):
             finite_spectra &= jnp.all(jnp.isfinite(leaf))
-    result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
-    result = RESULTS.where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
-    return RESULTS.where(finite_spectra, result, RESULTS.nonfinite_spectrum)
+    # Type checkers take an Enumeration's members for the strings they are declared with.
+    result: Any = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)  # type: ignore[arg-type]
+    result = RESULTS.where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)  # type: ignore[arg-type]
+    return RESULTS.where(finite_spectra, result, RESULTS.nonfinite_spectrum)  # type: ignore[arg-type]

@@ -1,0 +1,436 @@
+"""The command line as a user meets it."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import bumpy_mesh, grid_mesh
+
+from jaxsmw.cli import main
+from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+
+SMALL = ["--eigenvectors", "20", "--filters", "4"]
+
+
+class Outcome:
+    def __init__(self, code: int, output: str, errors: str) -> None:
+        self.code, self.output, self.errors = code, output, errors
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command line in this process."""
+
+    def run(*arguments: object) -> Outcome:
+        with pytest.raises(SystemExit) as exit_of:
+            main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(exit_of.value.code, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> Path:
+    """A directory with two poses' stand-ins: a body, a renumbered copy, and the truth in four formats."""
+    directory = tmp_path_factory.mktemp("pair")
+    mesh = bumpy_mesh(3)
+    order = np.random.default_rng(0).permutation(len(mesh.vertices))
+    truth = np.argsort(order)
+    write_mesh(directory / "x.off", mesh)
+    write_mesh(directory / "y.ply", make_mesh(mesh.vertices[order] * 3, truth[mesh.faces]))
+    np.savetxt(directory / "truth.txt", truth, fmt="%d")
+    np.savetxt(directory / "truth1.txt", truth + 1, fmt="%d")
+    np.savetxt(directory / "x.vts", np.arange(len(truth)) + 1, fmt="%d")
+    np.savetxt(directory / "y.vts", truth + 1, fmt="%d")
+    np.savetxt(
+        directory / "landmarks.txt", np.stack([np.arange(5) * 50, truth[np.arange(5) * 50]], 1), fmt="%d"
+    )
+    return directory
+
+
+def mean_error(line: str) -> float:
+    return float(re.search(r"mean ([\d.]+)", line)[1])
+
+
+def test_help_of_every_command_without_loading_jax():
+    code = (
+        "import sys, jaxsmw.cli\n"
+        "try: jaxsmw.cli.main(['--help'])\n"
+        "finally: assert 'jax' not in sys.modules and 'scipy' not in sys.modules"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for command in ("demo", "match", "evaluate", "spectrum", "render"):
+        assert command in result.stdout
+
+
+@pytest.mark.parametrize("command", ["demo", "match", "evaluate", "spectrum", "render"])
+def test_help_of_a_command(run, command):
+    outcome = run(command, "--help")
+    assert outcome.code == 0 and outcome.output.startswith(f"usage: jaxsmw {command}")
+
+
+def test_version(run):
+    assert re.fullmatch(r"jaxsmw \d+\.\d+\.\d+\S*\n", run("--version").output)
+
+
+def test_runs_as_a_module():
+    result = subprocess.run([sys.executable, "-m", "jaxsmw", "--version"], capture_output=True, check=True)
+    assert result.stdout.startswith(b"jaxsmw ")
+
+
+def test_match_and_evaluate(run, pair, tmp_path):
+    output = tmp_path / "map.txt"
+    outcome = run(
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        output,
+        *SMALL,
+        "--ground-truth",
+        pair / "truth.txt",
+    )
+    assert outcome.code == 0, outcome.errors
+    lines = output.read_text().splitlines()
+    assert len(lines) == 642 and all(line.isdigit() for line in lines)
+    before, after = (line for line in outcome.output.splitlines() if "map:" in line)
+    assert mean_error(after) < 0.02 < mean_error(before)
+    assert "refinement" in outcome.errors and "642 vertices" in outcome.errors
+
+    for truth in (
+        [pair / "truth.txt"],
+        [pair / "x.vts", pair / "y.vts"],
+        [pair / "truth1.txt", "--index-base", "1"],
+    ):
+        if "--index-base" in truth:  # the base is that of all files of the call
+            np.savetxt(tmp_path / "map1.txt", np.loadtxt(output, int) + 1, fmt="%d")
+            maps = [tmp_path / "map1.txt"]
+        else:
+            maps = [output]
+        evaluated = run("evaluate", pair / "x.off", pair / "y.ply", *maps, "--ground-truth", *truth)
+        assert evaluated.code == 0, evaluated.errors
+        assert mean_error(evaluated.output) == mean_error(after)
+        assert "strips" in evaluated.output
+
+
+def test_quiet_is_quiet(run, pair, tmp_path):
+    outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet", *SMALL)
+    assert outcome.code == 0 and outcome.errors == ""
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--init", "wks"],
+        ["--init", "landmarks:{pair}/landmarks.txt"],
+        ["--init", "map:{pair}/truth.txt"],
+        ["--iterations", "1"],
+        ["--samples", "40"],
+        ["--eigenvectors", "15"],
+        ["--filters", "2"],
+        ["--laplacian", "robust"],
+        ["--precision", "float64"],
+        ["--stop-when-unchanged", "--iterations", "20"],
+    ],
+    ids=" ".join,
+)
+def test_options_reach_the_method(run, pair, tmp_path, options, monkeypatch):
+    """Each option changes what the method is called with, and the call succeeds."""
+    import jaxsmw.matching
+
+    results = []
+    match = jaxsmw.matching.match
+    monkeypatch.setattr(
+        jaxsmw.matching, "match", lambda *a, **k: results.append(match(*a, **k)) or results[-1]
+    )
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
+    assert run(*call).code == 0
+    assert run(*call, *(option.format(pair=pair) for option in options)).code == 0
+    plain, changed = results
+    if "--stop-when-unchanged" in options:
+        assert changed.iterations < 20
+        return
+    same = plain.functional_map.shape == changed.functional_map.shape and np.array_equal(
+        plain.functional_map, changed.functional_map
+    )
+    assert not same
+    assert changed.functional_map.dtype == (np.float64 if "float64" in options else np.float32)
+
+
+def test_report(run, pair, tmp_path):
+    report = tmp_path / "deep" / "report"
+    outcome = run(
+        "match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", "--report", report, *SMALL,
+        "--ground-truth", pair / "truth.txt", "--evaluation-samples", "100", "--seed", "3",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    assert sorted(path.name for path in report.iterdir()) == [
+        "correspondence.png", "filters.png", "functional_map.png", "quality.png", "report.html", "summary.json",
+    ]  # fmt: skip
+    summary = json.loads((report / "summary.json").read_text())
+    assert summary["settings"]["eigenvectors"] == 20
+    assert summary["result"]["vertices"] == "642 to 642"
+    assert summary["provenance"]["jax"]
+    assert "x.off to y.ply" in (report / "report.html").read_text()
+
+
+def test_evaluate_writes_figures_and_numbers(run, pair, tmp_path):
+    np.savetxt(tmp_path / "zero.txt", np.zeros(642), fmt="%d")
+    outcome = run(
+        "evaluate", pair / "x.off", pair / "y.ply", pair / "truth.txt", tmp_path / "zero.txt",
+        "--ground-truth", pair / "truth.txt", "--output", tmp_path / "e.json", "--figure", tmp_path / "e.png",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    perfect, zero = json.loads((tmp_path / "e.json").read_text()).values()
+    assert perfect["mean"] == 0 and zero["mean"] > 0.1
+    assert (tmp_path / "e.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_spectrum(run, pair, tmp_path):
+    outcome = run(
+        "spectrum", pair / "x.off", "--eigenvectors", 12, "--output", tmp_path / "s.npz", "--figure", tmp_path / "s.png"
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    assert "642 vertices" in outcome.output and "cotangent" in outcome.output
+    saved = np.load(tmp_path / "s.npz")
+    gram = saved["eigenvectors"].T @ (saved["vertex_areas"][:, None] * saved["eigenvectors"])
+    np.testing.assert_allclose(gram, np.eye(12), atol=1e-8)
+    assert (tmp_path / "s.png").stat().st_size > 1000
+
+
+def test_render(run, pair, tmp_path):
+    for name, inputs in {
+        "one.png": ["x.off"],
+        "two.png": ["x.off", "y.ply", "truth.txt"],
+        "two.html": ["x.off", "y.ply", "truth.txt"],
+    }.items():
+        outcome = run("render", *(pair / path for path in inputs), "--output", tmp_path / name)
+        assert outcome.code == 0, outcome.errors
+        assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_seams_are_named_and_welded(run, tmp_path):
+    vertices, faces = grid_mesh(12, 12)
+    soup = make_mesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
+    write_mesh(tmp_path / "soup.off", soup)
+    plain = run("spectrum", tmp_path / "soup.off", "--eigenvectors", "5")
+    assert "--weld" in plain.errors and "242 connected components" in plain.output
+    assert (
+        "1 connected component"
+        in run("spectrum", tmp_path / "soup.off", "--eigenvectors", "5", "--weld").output
+    )
+
+
+def test_demo(run, tmp_path):
+    outcome = run("demo", "--output", tmp_path / "demo", "--vertices", "1000", "--eigenvectors", "40")
+    assert outcome.code == 0, outcome.errors
+    names = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert {
+        "source.off",
+        "target.off",
+        "truth.baryc_gt",
+        "map.txt",
+        "report.html",
+        "correspondence.png",
+    } <= names
+    before, after = (mean_error(line) for line in outcome.output.splitlines() if "map:" in line)
+    assert after < before / 2
+    again = run(
+        "evaluate", *(tmp_path / "demo" / name for name in ("source.off", "target.off", "map.txt")),
+        "--ground-truth", tmp_path / "demo" / "truth.baryc_gt",
+    )  # fmt: skip
+    assert mean_error(again.output) == pytest.approx(after, abs=2e-4)
+
+
+OFF = "OFF\n{} {} 0\n{}\n{}\n"
+TRIANGLES = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
+FACES = "3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
+HOSTILE_MESHES = {
+    "empty.off": b"",
+    "blank.off": b"\n\n\n",
+    "junk.off": bytes(range(256)) * 20,
+    "junk.ply": bytes(range(256)) * 20,
+    "junk.stl": bytes(range(256)) * 20,
+    "junk.obj": bytes(range(256)) * 20,
+    "header_only.off": b"OFF\n",
+    "promises_more.off": OFF.format(400, 4, TRIANGLES, FACES).encode(),
+    "promises_fewer.off": OFF.format(2, 1, TRIANGLES, FACES).encode(),
+    "promises_a_trillion.off": OFF.format(10**12, 10**12, TRIANGLES, FACES).encode(),
+    "negative_counts.off": OFF.format(-4, -4, TRIANGLES, FACES).encode(),
+    "words.off": OFF.format(4, 4, TRIANGLES.replace("1", "one"), FACES).encode(),
+    "truncated.off": OFF.format(4, 4, TRIANGLES, FACES).encode()[:40],
+    "nan.off": OFF.format(4, 4, TRIANGLES.replace("1 0 0", "nan 0 0"), FACES).encode(),
+    "infinite.off": OFF.format(4, 4, TRIANGLES.replace("1 0 0", "inf 0 0"), FACES).encode(),
+    "overflow.off": OFF.format(4, 4, TRIANGLES.replace("1 0 0", "1e999 0 0"), FACES).encode(),
+    "out_of_range.off": OFF.format(4, 4, TRIANGLES, FACES.replace("3 2\n", "3 4\n")).encode(),
+    "negative_index.off": OFF.format(4, 4, TRIANGLES, FACES.replace("3 2\n", "3 -2\n")).encode(),
+    "huge_index.off": OFF.format(
+        4, 4, TRIANGLES, FACES.replace("3 2\n", "3 99999999999999999999\n")
+    ).encode(),
+    "two_corners.off": OFF.format(4, 4, TRIANGLES, FACES.replace("3 0 3 2", "2 0 3")).encode(),
+    "no_faces.off": OFF.format(4, 0, TRIANGLES, "").encode(),
+    "no_area.off": OFF.format(4, 4, TRIANGLES.replace("1", "0"), FACES).encode(),
+    "no_end.ply": b"ply\nformat ascii 1.0\nelement vertex 3\n",
+    "short.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n1234",
+    "no_z.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+    "lying.stl": b"\0" * 80 + (10**9).to_bytes(4, "little") + b"\0" * 50,
+    "points.obj": b"v 0 0 0\nv 1 0 0\n",
+    "zero.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n",
+    "mesh.xyz": b"0 0 0\n",
+    "mesh": b"OFF\n",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_MESHES)
+def test_hostile_meshes(run, pair, tmp_path, name):
+    (tmp_path / name).write_bytes(HOSTILE_MESHES[name])
+    for meshes in ([tmp_path / name, pair / "y.ply"], [pair / "x.off", tmp_path / name]):
+        outcome = run("match", *meshes, "--output", tmp_path / "map.txt", "--quiet", *SMALL)
+        assert_refused(outcome, naming=name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
+
+
+HOSTILE_MAPS = {
+    "empty": "",
+    "too short": "0\n" * 641,
+    "too long": "0\n" * 643,
+    "out of range": "0\n" * 641 + "642\n",
+    "negative": "0\n" * 641 + "-1\n",
+    "huge": "0\n" * 641 + "9" * 40 + "\n",
+    "fractions": "0.5\n" * 642,
+    "words": "zero\n" * 642,
+    "nan": "nan\n" * 642,
+    "two columns": "0 0\n" * 642,
+    "binary": "\0\1\2" * 300,
+    "one-based": "\n".join(str(i) for i in range(1, 643)),
+}
+
+
+@pytest.mark.parametrize("use", ["init", "truth", "evaluate", "render"])
+@pytest.mark.parametrize("name", HOSTILE_MAPS)
+def test_hostile_maps(run, pair, tmp_path, name, use):
+    if (name, use) == ("two columns", "truth"):
+        pytest.skip("two columns are a legal form of ground truth")
+    path = tmp_path / "hostile.txt"
+    path.write_text(HOSTILE_MAPS[name])
+    meshes, output = (pair / "x.off", pair / "y.ply"), tmp_path / "out.png"
+    truth = ["--ground-truth", pair / "truth.txt"]
+    outcome = {
+        "init": lambda: run("match", *meshes, "--init", f"map:{path}", "--output", output, "--quiet"),
+        "truth": lambda: run("match", *meshes, "--ground-truth", path, "--output", output, "--quiet"),
+        "evaluate": lambda: run("evaluate", *meshes, path, *truth, "--figure", output, "--quiet"),
+        "render": lambda: run("render", *meshes, path, "--output", output, "--quiet"),
+    }[use]()
+    assert_refused(outcome, naming="hostile.txt")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hostile.txt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        ("match {x} {y}", "--output"),
+        ("match {x} {y} --output {t}/no/such/map.txt", "no/such"),
+        ("match {x} {y} --output {t}", "is not a file"),
+        ("match {x} {y} --output /proc/map.txt", "/proc/map.txt"),
+        ("match {x} {t}/missing.off --output {t}/m", "missing.off"),
+        ("match {x} {t} --output {t}/m", "not a regular file"),
+        ("match {x} {y} --output {t}/m --eigenvectors 642", "641"),
+        ("match {x} {y} --output {t}/m --eigenvectors 99999999999999999999", "99999999999999999999"),
+        ("match {x} {y} --output {t}/m --eigenvectors 0", "at least 1"),
+        ("match {x} {y} --output {t}/m --eigenvectors many", "no whole number"),
+        ("match {x} {y} --output {t}/m --filters 1", "at least 2"),
+        ("match {x} {y} --output {t}/m --iterations 0", "at least 1"),
+        ("match {x} {y} --output {t}/m --samples 5", "cannot tell"),
+        ("match {x} {y} --output {t}/m --samples 5000 --eigenvectors 20", "642 used vertices"),
+        ("match {x} {y} --output {t}/m --init shout", "shout"),
+        ("match {x} {y} --output {t}/m --init map:", "map:"),
+        ("match {x} {y} --output {t}/m --init map:{t}/missing.txt", "missing.txt"),
+        ("match {x} {y} --output {t}/m --init landmarks:{x}", "x.off"),
+        ("match {x} {y} --output {t}/m --report {x}", "cannot be made a directory"),
+        ("match {x} {y} --output {t}/m --ground-truth {t}/missing.vts {p}/y.vts", "missing.vts"),
+        ("match {x} {y} --output {t}/m --ground-truth {p}/x.vts", "half of a pair"),
+        ("match {x} {y} --output {t}/m --precision float16", "float16"),
+        ("match {x} {y} --output {t}/m --evaluation-samples -3", "at least 1"),
+        ("evaluate {x} {y} {p}/truth.txt", "--ground-truth"),
+        ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/no/e.json", "no/e.json"),
+        ("spectrum {x} --eigenvectors 642", "641"),
+        ("spectrum {x} --output {t}/s.txt", ".npz"),
+        ("spectrum {x} --figure {t}/s.nonsense", "s.nonsense"),
+        ("render {x} {y} --output {t}/a.png", "give the map"),
+        ("render {x} --output {t}/a.html", "page"),
+        ("render {x} --output {t}/a.nonsense", "a.nonsense"),
+        ("demo --output {x}", "cannot be made a directory"),
+        ("demo --kind unicorn --output {t}/d", "unicorn"),
+        ("demo --vertices 3 --output {t}/d", "3"),
+        ("demo --vertices -5 --output {t}/d", "at least 1"),
+        ("dance", "dance"),
+        ("", "COMMAND"),
+    ],
+)
+def test_hostile_arguments(run, pair, tmp_path, arguments, fault):
+    words = arguments.format(x=pair / "x.off", y=pair / "y.ply", p=pair, t=tmp_path).split()
+    outcome = run(*words, *(["--quiet"] if len(words) > 1 else []))
+    assert_refused(outcome, naming=fault)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def assert_refused(outcome: Outcome, *, naming: str) -> None:
+    assert outcome.code == 2, outcome.errors
+    assert outcome.output == ""
+    assert outcome.errors.count("\n") == 1 and len(outcome.errors) > 40
+    assert naming in outcome.errors
+
+
+def test_numbers_that_went_wrong_exit_with_1(run, pair, tmp_path, monkeypatch):
+    import jaxsmw.matching
+
+    def fail(*_, **__):
+        raise ArithmeticError("x to y: the functional map became NaN.")
+
+    monkeypatch.setattr(jaxsmw.matching, "match", fail)
+    outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
+    assert outcome.code == 1 and outcome.errors == "jaxsmw: x to y: the functional map became NaN.\n"
+
+
+def test_an_interrupted_run_leaves_nothing_behind(pair, tmp_path):
+    environment = dict(os.environ, JAXSMW_CACHE="off")
+    for delay in (0.5, 2.5):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "jaxsmw", "match", pair / "x.off", pair / "y.ply",
+             "--output", tmp_path / "map.txt", "--iterations", "1000000"],
+            stderr=subprocess.PIPE, env=environment,
+        )  # fmt: skip
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode != 0
+        assert list(tmp_path.iterdir()) == []
+    assert b"interrupted" in errors and b"Traceback" not in errors
+
+
+def test_the_readme_names_existing_options(run):
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    helps = "".join(
+        run(command, "--help").output for command in ("demo", "match", "evaluate", "spectrum", "render")
+    )
+    for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", readme)) - {"--quiet", "--help"}:
+        assert option in helps, option
+
+
+def test_read_mesh_is_exported():
+    import jaxsmw
+
+    assert jaxsmw.read_mesh is read_mesh
+    assert set(jaxsmw.__all__) <= set(dir(jaxsmw))
+    for name in jaxsmw.__all__:
+        assert getattr(jaxsmw, name) is not None

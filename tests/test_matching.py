@@ -1,0 +1,186 @@
+"""One pair from meshes to correspondence."""
+
+import logging
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from synthetic import bumpy_mesh
+
+from jaxsmw.core.filters import Meyer
+from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.matching import initial_map, match
+
+OPTIONS = {"number_of_eigenvectors": 30, "refiner": WaveletPreservation(bank=Meyer(4))}
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A bumpy body, and a turned, rescaled, renumbered and slightly noisy copy, with the true map."""
+    mesh_x = bumpy_mesh(4)
+    generator = np.random.default_rng(1)
+    order = generator.permutation(len(mesh_x.vertices))
+    turn, _ = np.linalg.qr(generator.normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    vertices = 7 * (mesh_x.vertices + 0.001 * generator.normal(size=mesh_x.vertices.shape)) @ turn.T
+    mesh_y = make_mesh(vertices[order], np.argsort(order)[mesh_x.faces], name="copy")
+    return mesh_x, mesh_y, np.argsort(order)
+
+
+def mean_error(mesh_y: Mesh, t: np.ndarray, truth: np.ndarray) -> float:
+    return float(
+        np.linalg.norm(mesh_y.vertices[t] - mesh_y.vertices[truth], axis=1).mean() / np.sqrt(mesh_y.area)
+    )
+
+
+def test_finds_the_copy(pair):
+    mesh_x, mesh_y, truth = pair
+    result = match(mesh_x, mesh_y, **OPTIONS)
+    before = mean_error(mesh_y, result.initial_map, truth)
+    after = mean_error(mesh_y, result.pointwise_map, truth)
+    assert after < 0.02 < before
+    assert result.pointwise_map.dtype == np.int64 and result.pointwise_map.shape == (len(mesh_x.vertices),)
+    assert result.functional_map.shape == (30, 30)
+    assert result.iterations == 3
+    assert list(result.seconds) == ["eigenbases", "initial map", "refinement"]
+
+
+def test_repeats_bit_for_bit(pair):
+    first, second = (match(*pair[:2], **OPTIONS) for _ in range(2))
+    np.testing.assert_array_equal(first.pointwise_map, second.pointwise_map)
+    np.testing.assert_array_equal(first.functional_map, second.functional_map)
+
+
+def test_scale_and_rotation_do_not_matter(pair):
+    mesh_x, mesh_y, _ = pair
+    moved = make_mesh(1e3 * mesh_x.vertices[:, [2, 0, 1]] + 5, mesh_x.faces)
+    plain, other = match(mesh_x, mesh_y, **OPTIONS), match(moved, mesh_y, **OPTIONS)
+    assert np.mean(plain.pointwise_map == other.pointwise_map) > 0.99
+
+
+@pytest.mark.parametrize("init", ["shot", "wks", "hks", "wavelet", "landmarks", "map"])
+def test_every_start_is_better_than_chance_and_differs(pair, init):
+    mesh_x, mesh_y, truth = pair
+    given = init
+    if init == "landmarks":
+        given = np.stack([np.arange(6) * 100, truth[np.arange(6) * 100]], axis=1)
+    if init == "map":
+        given = np.where(np.arange(len(truth)) % 2, truth, 0)
+    spectra = [compute_spectrum(mesh, 60) for mesh in (mesh_x, mesh_y)]
+    start = initial_map(mesh_x, mesh_y, *spectra, init=given)
+    chance = np.random.default_rng(0).permutation(truth)
+    assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, chance, truth)
+    if init != "shot":
+        assert np.mean(start != initial_map(mesh_x, mesh_y, *spectra)) > 0.1
+
+
+def test_landmarks_are_matched_to_each_other(pair):
+    mesh_x, mesh_y, truth = pair
+    landmarks = np.stack([np.arange(6) * 100, truth[np.arange(6) * 100]], axis=1)
+    spectra = [compute_spectrum(mesh, 30) for mesh in (mesh_x, mesh_y)]
+    start = initial_map(mesh_x, mesh_y, *spectra, init=landmarks)
+    np.testing.assert_array_equal(start[landmarks[:, 0]], landmarks[:, 1])
+    assert mean_error(mesh_y, start, truth) < 0.05
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"iterations": 1},
+        {"number_of_eigenvectors": 25},
+        {"refiner": WaveletPreservation(bank=Meyer(6))},
+        {"refiner": WaveletPreservation(bank=Meyer(4), pseudo_inverse="least_squares")},
+        {"number_of_samples": 150},
+        {"laplacian": "robust"},
+    ],
+    ids=str,
+)
+def test_every_option_changes_the_result(pair, options):
+    mesh_x, mesh_y, _ = pair
+    default = match(mesh_x, mesh_y, **OPTIONS)
+    other = match(mesh_x, mesh_y, **(OPTIONS | options))
+    assert default.functional_map.shape != other.functional_map.shape or not np.array_equal(
+        default.functional_map, other.functional_map
+    )
+
+
+def test_history_and_early_stop(pair):
+    result = match(*pair[:2], **OPTIONS, iterations=30, stop_when_unchanged=True, history=True)
+    assert result.iterations < 30
+    assert result.history.changed.shape == (30,)
+    assert result.history.changed[0] > 0.1 and result.history.changed[-1] == 0
+    assert match(*pair[:2], **OPTIONS).history is None
+
+
+def test_unused_vertices_on_either_side(pair):
+    mesh_x, mesh_y, _ = pair
+    plain = match(mesh_x, mesh_y, **OPTIONS).pointwise_map
+    stray_x = make_mesh(
+        np.insert(mesh_x.vertices, 5, mesh_x.vertices[9] * 1.01, axis=0), mesh_x.faces + (mesh_x.faces >= 5)
+    )
+    stray_y = make_mesh(np.insert(mesh_y.vertices, 0, 0.0, axis=0), mesh_y.faces + 1)
+    result = match(stray_x, stray_y, **OPTIONS).pointwise_map
+    assert np.mean(np.delete(result, 5) == plain + 1) > 0.99
+    assert result[5] == result[10]
+
+
+def test_stages_are_logged(pair, caplog):
+    with caplog.at_level(logging.INFO, "jaxsmw"):
+        match(*pair[:2], **OPTIONS, number_of_samples=100)
+    assert caplog.messages == ["eigenbases", "initial map", "samples", "refinement"]
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"iterations": 0}, "at least 1"),
+        ({"number_of_eigenvectors": 0}, "eigenvectors were asked for"),
+        ({"number_of_eigenvectors": 10**6}, "eigenvectors were asked for"),
+        ({"number_of_samples": 10}, "cannot tell 30 eigenvectors apart"),
+        ({"number_of_samples": 10**6}, "samples were asked for"),
+        ({"init": "shoot"}, "choose shot"),
+        ({"init": [0, 1]}, "has 2 entries"),
+        ({"init": np.zeros(2562)}, "must be integer"),
+        ({"init": np.full(2562, -1)}, "count from 0"),
+        ({"init": np.full(2562, 2562)}, "count from 0"),
+        ({"init": np.zeros((3, 3), int)}, "shape"),
+        ({"init": np.zeros((0, 2), int)}, "shape"),
+        ({"init": np.array([[0, 2562]])}, "landmark 2562"),
+        ({"init": np.array([[-1, 0]])}, "landmark -1"),
+    ],
+    ids=str,
+)
+def test_bad_arguments(pair, options, fault):
+    with pytest.raises(InputError, match=fault):
+        match(*pair[:2], **(OPTIONS | options))
+
+
+def test_maps_and_landmarks_must_lie_on_the_surface(pair):
+    mesh_x, mesh_y, _ = pair
+    stray = make_mesh(np.insert(mesh_y.vertices, 0, 0.0, axis=0), mesh_y.faces + 1)
+    with pytest.raises(InputError, match="no face uses"):
+        match(mesh_x, stray, **OPTIONS, init=np.zeros(len(mesh_x.vertices), int))
+    with pytest.raises(InputError, match="landmark 0"):
+        match(mesh_x, stray, **OPTIONS, init=np.array([[0, 0]]))
+
+
+def test_numbers_that_went_wrong_are_not_returned(pair):
+    class Broken(WaveletPreservation):
+        def update(self, problem, pointwise_map):
+            return super().update(problem, pointwise_map) * jnp.nan
+
+    with pytest.raises(ArithmeticError, match="NaN or infinite"):
+        match(*pair[:2], number_of_eigenvectors=20, refiner=Broken())
+
+
+def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
+    from jaxsmw.geometry.shot import shot_descriptors
+
+    mesh_x, mesh_y, _ = pair
+    spectra = [compute_spectrum(mesh, 10) for mesh in (mesh_x, mesh_y)]
+    distances = cdist(shot_descriptors(mesh_x), shot_descriptors(mesh_y))
+    np.testing.assert_array_equal(initial_map(mesh_x, mesh_y, *spectra), distances.argmin(axis=1))
