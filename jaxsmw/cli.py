@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         help="gets one target vertex per source vertex, one per line, counted from 0",
     )
     match.add_argument("--report", metavar="DIR", help="write pictures, a 3D page and a summary there")
+    _add_up(match)
     match.add_argument(
         "--ground-truth",
         metavar="FILE",
@@ -148,6 +149,7 @@ def _parser() -> argparse.ArgumentParser:
         required=True,
         help="a picture (.png, .pdf, .svg); of a correspondence also an interactive page (.html)",
     )
+    _add_up(render)
     _add_reading(render)
     _add_common(render, _render)
     return parser
@@ -232,6 +234,14 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_up(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--up",
+        choices=("x", "y", "z", "-x", "-y", "-z"),
+        help="the axis that points up in pictures (default: a guess); write --up=-z for -z",
+    )
+
+
 def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress messages")
     parser.set_defaults(run=run)
@@ -250,7 +260,7 @@ def _demo(options: argparse.Namespace) -> None:
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
     write_ground_truth(directory / "truth.baryc_gt", truth)
-    options.evaluation_samples, options.seed, options.geodesics = None, 0, "strips"
+    options.evaluation_samples, options.geodesics, options.up = None, "strips", "y"
     correspondence = _run_match(options, pair.source, pair.target)
     write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
     _conclude(options, correspondence, truth, directory)
@@ -308,7 +318,14 @@ def _conclude(
 
         logging.getLogger("jaxsmw").info("report")
         settings = {name: value for name, value in vars(options).items() if name != "run"}
-        write_report(directory, correspondence, refiner=_refiner(options), errors=errors, settings=settings)
+        write_report(
+            directory,
+            correspondence,
+            refiner=_refiner(options),
+            errors=errors,
+            settings=settings,
+            up=options.up,
+        )
     for name, error in errors.items():
         print(f"{name + ' map:':13} {error}")
     times = ", ".join(f"{stage} {time:.2f} s" for stage, time in correspondence.seconds.items())
@@ -404,15 +421,15 @@ def _render(options: argparse.Namespace) -> None:
         )
     mesh_x = _read(options.source, options)
     if not options.map:
-        save_figure(options.output, draw_mesh(mesh_x))
+        save_figure(options.output, draw_mesh(mesh_x, up=options.up))
         return
     mesh_y = _read(options.target, options)
     pointwise_map = read_pointwise_map(options.map, mesh_x, mesh_y, index_base=options.index_base or 0)
     if page:
         title = f"{Path(options.source).name} to {Path(options.target).name}"
-        write_page(options.output, mesh_x, mesh_y, pointwise_map, title=title)
+        write_page(options.output, mesh_x, mesh_y, pointwise_map, title=title, up=options.up)
     else:
-        save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map))
+        save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map, up=options.up))
 
 
 def _read(path: str, options: argparse.Namespace) -> Mesh:

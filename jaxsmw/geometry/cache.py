@@ -61,7 +61,8 @@ def cached(
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(path) as temporary:
-                np.savez(temporary, key=np.array(key), **arrays)  # type: ignore[arg-type]
+                contents = np.array([key, *arrays])
+                np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
             _remove_oldest(path.parent, limit)
         except (OSError, InputError):
             # The text is the same for every entry, so that Python shows it once.
@@ -98,9 +99,10 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
 def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
     """The arrays of an entry, or None if it is missing, damaged or not what its name says."""
     # Whatever goes wrong while reading bytes of unknown origin, there is one remedy: compute.
-    with suppress(Exception), np.load(path, allow_pickle=False) as entry:
+    with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
-        if arrays.pop("key") == key:
+        # Zip files have checksums for their members, but none for the list of them.
+        if arrays.pop("contents").tolist() == [key, *arrays]:
             with suppress(OSError):
                 os.utime(path)  # used now: `_remove_oldest` goes by this
             return arrays

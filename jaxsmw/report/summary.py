@@ -24,6 +24,7 @@ from jaxsmw.files import atomic_write
 from jaxsmw.matching import Correspondence
 from jaxsmw.report.figures import draw_correspondence, draw_filters, draw_functional_map, draw_quality_curves
 from jaxsmw.report.page import write_page
+from jaxsmw.report.rendering import Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +39,7 @@ def write_report(
     refiner: WaveletPreservation,
     errors: Mapping[str, GeodesicError] | None = None,
     settings: Mapping[str, Any] | None = None,
+    up: Axis | None = None,
 ) -> None:
     """Write the pictures of a match, an interactive page and a summary to a directory.
 
@@ -50,6 +52,7 @@ def write_report(
     - `refiner`: what refined it.
     - `errors`: geodesic errors by name, the last of them that of `correspondence.pointwise_map`.
     - `settings`: what else to note in the summary.
+    - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
 
     **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
     """
@@ -60,7 +63,11 @@ def write_report(
 
     figures = {
         "correspondence": draw_correspondence(
-            correspondence.mesh_x, correspondence.mesh_y, correspondence.pointwise_map, errors=per_vertex
+            correspondence.mesh_x,
+            correspondence.mesh_y,
+            correspondence.pointwise_map,
+            errors=per_vertex,
+            up=up,
         ),
         "functional_map": draw_functional_map(correspondence.functional_map, convention=refiner.convention),
         "filters": draw_bank(refiner.bank, np.asarray(correspondence.spectrum_x.eigenvalues)),
@@ -87,6 +94,7 @@ def write_report(
         statistics=facts,
         errors=per_vertex,
         figures=[(caption, pictures[name]) for name, caption in captions.items()],
+        up=up,
     )
     summary = {"settings": dict(settings or {}), "result": facts, "provenance": provenance()}
     with atomic_write(directory / "summary.json") as temporary:

@@ -1,0 +1,108 @@
+"""Colours that carry meaning: a place on a body, an error. Mixed in OKLab, where equal steps look equal."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from jaxsmw.geometry.mesh import Mesh
+
+# Björn Ottosson, "A perceptual color space for image processing", 2020: from OKLab to the cube roots of the
+# cone responses, and from cone responses to linear sRGB.
+_LAB_TO_ROOTS = np.array(
+    [
+        [1, 0.3963377774, 0.2158037573],
+        [1, -0.1055613458, -0.0638541728],
+        [1, -0.0894841775, -1.2914855480],
+    ]
+)
+_CONES_TO_RGB = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+
+# From none (paper white) to large (dark plum) in OKLab: lightness falls all the way, so that the order is
+# plain to colour-blind eyes and on a black-and-white print.
+_ERROR_SCALE = np.array(
+    [
+        [0.95, 0.00, 0.015],
+        [0.88, 0.02, 0.110],
+        [0.74, 0.11, 0.120],
+        [0.56, 0.20, 0.060],
+        [0.32, 0.11, -0.050],
+    ]
+)
+
+PLAIN = np.array([0.76, 0.77, 0.79])
+"""What a surface without a message wears, and a vertex whose error nobody knows."""
+
+
+def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Light intensities to screen colours in [0, 1], clipped to what a screen can show (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Screen colours in [0, 1] to light intensities, which can be added and averaged."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
+    """A smooth colour for every vertex that tells where on the body it is.
+
+    The body's right and left differ in hue (green against red), the two ends of its height or length, of
+    which the longer counts, in the other opponent pair (blue against yellow), and the direction that is left
+    in lightness, which shading disturbs. So the limbs of people and of animals get hues of their own, and a
+    map that swaps left and right shows at a glance. Each coordinate is half the position between the extremes
+    and half its rank among the vertices: the rank keeps a slender body's trunk from being all grey.
+
+    **Arguments:**
+
+    - `mesh`: standing upright (`jaxsmw.report.rendering.stand`): x is lateral, y up, z forward.
+
+    **Returns:** sRGB colours (n, 3) in [0, 1].
+    """
+    used = mesh.vertices[mesh.used_vertices]
+    low, high = used.min(axis=0), used.max(axis=0)
+    # Ranks of what is equal up to rounding must be equal too, or a flat mesh would show the noise.
+    grid = 1e-6 * np.max(high - low)
+    coordinates = np.empty_like(mesh.vertices)
+    for axis in range(3):
+        values = np.round(mesh.vertices[:, axis] / grid)
+        sorted_values = np.sort(values[mesh.used_vertices])
+        below = np.searchsorted(sorted_values, values, "left") + np.searchsorted(
+            sorted_values, values, "right"
+        )
+        position = (mesh.vertices[:, axis] - low[axis]) / max(high[axis] - low[axis], grid)
+        coordinates[:, axis] = np.clip(position, 0, 1) + below / (2 * len(used)) - 1
+    lateral, up, forward = coordinates.T
+    longer, shorter = (up, forward) if high[1] - low[1] >= high[2] - low[2] else (forward, up)
+    return _oklab_to_srgb(
+        np.stack([0.71 + 0.09 * shorter, 0.02 + 0.16 * lateral, 0.03 - 0.16 * longer], axis=1)
+    )
+
+
+def error_colors(errors: Float[np.ndarray, " m"], limit: float) -> Float64[np.ndarray, "m 3"]:
+    """The colour of each error on a scale from 0 to `limit`; what lies beyond takes the last colour.
+
+    **Arguments:**
+
+    - `errors`: non-negative; NaN where the error is not known, which is drawn as plain surface.
+    - `limit`: the end of the scale, positive, in the unit of the errors.
+
+    **Returns:** sRGB colours (m, 3) in [0, 1].
+    """
+    known = ~np.isnan(errors)
+    stops = np.linspace(0, limit, len(_ERROR_SCALE))
+    lab = np.stack(
+        [np.interp(np.where(known, errors, 0), stops, channel) for channel in _ERROR_SCALE.T], axis=1
+    )
+    return np.where(known[:, None], _oklab_to_srgb(lab), PLAIN)
+
+
+def _oklab_to_srgb(lab: np.ndarray) -> np.ndarray:
+    return linear_to_srgb((lab @ _LAB_TO_ROOTS.T) ** 3 @ _CONES_TO_RGB.T)

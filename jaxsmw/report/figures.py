@@ -1,0 +1,371 @@
+"""Figures for papers and talks, drawn by matplotlib without a display. Needs the extra `jaxsmw[report]`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int
+
+from jaxsmw.core.functional_map import Convention
+from jaxsmw.errors import InputError
+from jaxsmw.files import atomic_write
+from jaxsmw.geometry.mesh import Mesh
+
+from .colors import PLAIN, error_colors, position_colors
+from .inputs import check_errors, check_map, describe
+from .rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Pixels per inch: bodies are drawn pixel by pixel and shown at exactly this resolution.
+_DPI = 200
+# The largest height and width of a body, in pixels.
+_BODY_SIZE = (800, 800)
+_LONGEST_NAME = 36
+_INK, _FAINT = "#1d2430", "#79818c"
+# Okabe and Ito's colours, told apart by colour-blind eyes; lines differ in style as well, for print.
+_LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
+
+
+def draw_correspondence(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_map: Int[np.ndarray | Array, " m"],
+    *,
+    errors: Float[np.ndarray | Array, " m"] | None = None,
+    error_limit: float | None = None,
+    up: Axis | None = None,
+    azimuth: float | None = None,
+) -> Figure:
+    """Colour transfer: Y is coloured by position, and every vertex of X takes the colour of its match.
+
+    Both bodies are shown at the same scale and from the same side. A good map gives X the smooth colours of
+    Y, limb by limb.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
+    - `pointwise_map`: for every vertex of X a vertex of Y.
+    - `errors`: for every vertex of X the geodesic error of its match, as a fraction of sqrt(area of Y); NaN
+      where it is not known. Adds a panel that shows them on X.
+    - `error_limit`: where the scale of errors ends; by default at their 98th percentile.
+    - `up`: the axis of the files that points up; see `jaxsmw.report.rendering.stand` for the default.
+    - `azimuth`: where the viewer stands, in degrees from the front of the body towards its left; by default
+      where both bodies show well.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if the map or the errors do not fit the meshes, or matplotlib is missing.
+    """
+    indices = check_map(mesh_x, mesh_y, pointwise_map)
+    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
+    colors_y = position_colors(shown_y)
+    panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
+    if errors is None:
+        return _draw_panels(panels, azimuth)
+    values, limit = check_errors(mesh_x, errors, error_limit)
+    panels.append(_Panel("Error on the source", shown_x, error_colors(values, limit)))
+    figure = _draw_panels(panels, azimuth, right_margin=150)
+    _draw_error_scale(figure, limit, bool(np.any(values > limit)))
+    return figure
+
+
+def draw_mesh(
+    mesh: Mesh,
+    colors: Float64[np.ndarray, "n 3"] | None = None,
+    *,
+    up: Axis | None = None,
+    azimuth: float | None = None,
+) -> Figure:
+    """One shaded mesh.
+
+    **Arguments:**
+
+    - `mesh`: n vertices.
+    - `colors`: one sRGB colour in [0, 1] per vertex; by default a plain grey.
+    - `up`, `azimuth`: as in `draw_correspondence`.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if the colours do not fit the mesh, or matplotlib is missing.
+    """
+    n = len(mesh.vertices)
+    if colors is None:
+        colors = np.tile(PLAIN, (n, 1))
+    elif np.shape(colors) != (n, 3) or not (np.min(colors) >= 0 and np.max(colors) <= 1):
+        raise InputError(
+            f"the colours of {mesh.name} must be {n} rows of red, green and blue between 0 and 1, but have "
+            f"shape {np.shape(colors)} and values from {np.min(colors)} to {np.max(colors)}."
+        )
+    return _draw_panels([_Panel("", stand(mesh, up), np.asarray(colors, dtype=float))], azimuth)
+
+
+def draw_functional_map(
+    functional_map: Float[np.ndarray | Array, "k_out k_in"], *, convention: Convention = "pullback"
+) -> Figure:
+    """The matrix C, red above and blue below zero.
+
+    **Arguments:**
+
+    - `functional_map`: C; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward.
+    - `convention`: which of the two, so that the axes are labelled right.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if C is not a finite matrix, or matplotlib is missing.
+    """
+    matrix = np.asarray(functional_map, dtype=float)
+    if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
+        raise InputError(
+            f"a functional map is a matrix of finite numbers, but this one has shape {matrix.shape}."
+        )
+    figure = _new_figure(5.0, 4.3, plot=True)
+    axes = figure.add_subplot()
+    limit = np.abs(matrix).max() or 1.0
+    image = axes.imshow(matrix, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    rows, columns = ("X", "Y") if convention == "pullback" else ("Y", "X")
+    axes.set_ylabel(f"eigenfunction of {rows}")
+    axes.set_xlabel(f"eigenfunction of {columns}")
+    axes.xaxis.set_label_position("top")
+    axes.xaxis.tick_top()
+    scale = figure.colorbar(image, ax=axes, shrink=0.9)
+    scale.outline.set_visible(False)
+    _style(axes)
+    _style(scale.ax)
+    return figure
+
+
+def draw_filters(
+    eigenvalue_grid: Float[np.ndarray | Array, " p"],
+    responses: Float[np.ndarray | Array, "filters p"],
+    eigenvalues: Float[np.ndarray | Array, " k"],
+) -> Figure:
+    """Filter responses g_l(lambda), their frame function G (the sum of squares), and where eigenvalues lie.
+
+    **Arguments:**
+
+    - `eigenvalue_grid`: where the responses are given, ascending.
+    - `responses`: scaling function first, then wavelets from the coarsest to the finest.
+    - `eigenvalues`: of a shape, marked on the axis.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if the shapes do not fit, or matplotlib is missing.
+    """
+    grid, curves = np.asarray(eigenvalue_grid, dtype=float), np.asarray(responses, dtype=float)
+    if grid.ndim != 1 or curves.ndim != 2 or curves.shape[1:] != grid.shape:
+        raise InputError(
+            f"filter responses come as (filters, p) for a grid of p values, but have shape {curves.shape} "
+            f"for a grid of shape {grid.shape}."
+        )
+    figure = _new_figure(6.4, 3.4, plot=True)
+    import matplotlib
+
+    axes = figure.add_subplot()
+    colors = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, len(curves)))
+    for index, (curve, color) in enumerate(zip(curves, colors, strict=True)):
+        name = "wavelet" if index else "scaling function"
+        axes.plot(grid, curve, color=color, linewidth=1.8, label=rf"$g_{{{index}}}$ {name}")
+    axes.plot(
+        grid,
+        np.sum(curves**2, axis=0),
+        color=_INK,
+        linewidth=1.2,
+        linestyle=(0, (5, 2)),
+        label=r"$G=\sum g_l^2$",
+    )
+    axes.plot(
+        np.asarray(eigenvalues),
+        np.zeros(np.size(eigenvalues)),
+        linestyle="none",
+        marker=2,  # a tick below the line
+        markersize=4,
+        markeredgewidth=0.5,
+        color=_FAINT,
+        clip_on=False,
+        label="eigenvalues",
+    )
+    axes.set_xlim(grid[0], grid[-1])
+    axes.set_ylim(bottom=min(0.0, curves.min()))
+    axes.set_xlabel("λ")
+    axes.set_ylabel("response")
+    figure.legend(loc="outside right center", frameon=False, fontsize=8, labelcolor=_INK)
+    _style(axes, grid=True)
+    return figure
+
+
+def draw_quality_curves(
+    curves: Mapping[str, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]],
+    *,
+    mean_errors: Mapping[str, float] = MappingProxyType({}),
+) -> Figure:
+    """Correspondence quality: the share of correspondences whose geodesic error is at most a threshold.
+
+    **Arguments:**
+
+    - `curves`: by the method's name, thresholds (fractions of sqrt(area), ascending) and shares in [0, 1].
+    - `mean_errors`: by the same names, shown in the legend; not every curve needs one.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if there is no curve, the parts do not fit, or matplotlib is missing.
+    """
+    if not curves:
+        raise InputError("there is no quality curve to draw; give at least one.")
+    if strangers := mean_errors.keys() - curves.keys():
+        raise InputError(f"there are mean errors but no quality curves for {', '.join(sorted(strangers))}.")
+    figure = _new_figure(6.8, 3.8, plot=True)
+    axes = figure.add_subplot()
+    lines, labels = [], []
+    for index, (name, (thresholds, shares)) in enumerate(curves.items()):
+        if np.ndim(thresholds) != 1 or np.shape(thresholds) != np.shape(shares):
+            raise InputError(
+                f"the quality curve {name!r} must have as many shares as thresholds, but has shapes "
+                f"{np.shape(shares)} and {np.shape(thresholds)}."
+            )
+        lines += axes.plot(
+            thresholds,
+            100 * np.asarray(shares),
+            color=_LINE_COLORS[index % len(_LINE_COLORS)],
+            linestyle=_LINE_STYLES[index % len(_LINE_STYLES)],
+            linewidth=2,
+        )
+        labels.append(f"{name}\nmean {mean_errors[name]:.4f}" if name in mean_errors else name)
+    axes.set_xlim(min(t[0] for t, _ in curves.values()), max(t[-1] for t, _ in curves.values()))
+    axes.set_ylim(0, 101)
+    axes.set_xlabel("geodesic error / √area")
+    axes.set_ylabel("correspondences within the error (%)")
+    legend = figure.legend(
+        lines,
+        labels,
+        loc="outside right center",
+        frameon=False,
+        fontsize=8,
+        labelcolor=_INK,
+        labelspacing=1,
+        handlelength=3.5,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+    _style(axes, grid=True)
+    return figure
+
+
+def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
+    """Write a figure as PNG, PDF or SVG, whichever the file's suffix says; never half a file.
+
+    **Raises:** `InputError` if the suffix is another one or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    # Files say nothing of when they were made: the same figure is the same file.
+    metadata = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+    if suffix not in metadata:
+        raise InputError(f"{path}: a figure is written as .png, .pdf or .svg; choose one of these endings.")
+    import matplotlib
+
+    with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "jaxsmw"}):
+        figure.savefig(temporary, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
+
+
+class _Panel(NamedTuple):
+    """One body in a figure: what it is, standing, and its colours."""
+
+    role: str
+    mesh: Mesh
+    colors: np.ndarray
+
+
+def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
+    """The bodies side by side at one scale, each under its role and name, pixel for pixel."""
+    angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
+    axes = camera_axes(angle)[:2]
+    reach = [np.abs(panel.mesh.vertices[panel.mesh.used_vertices] @ axes.T).max(axis=0) for panel in panels]
+    scale = np.min(np.divide(_BODY_SIZE, 2 * np.max(reach, axis=0)))
+    captioned = bool(panels[0].role)
+    gap, header, narrowest = (40, 135, _LONGEST_NAME * 12) if captioned else (40, 0, 0)
+    widths = [max(int(np.ceil(2 * scale * x)) + 2 * gap, narrowest) for x, _ in reach]
+    body_height = int(np.ceil(2 * scale * max(y for _, y in reach)))
+    height, width = body_height + 2 * gap + header, sum(widths) + right_margin
+
+    figure = _new_figure(width / _DPI, height / _DPI)
+    left = 0
+    for panel, panel_width in zip(panels, widths, strict=True):
+        picture = render(
+            panel.mesh, panel.colors, azimuth=angle, scale=scale, width=panel_width, height=body_height
+        )
+        place = (left / width, gap / height, panel_width / width, body_height / height)
+        drawing = figure.add_axes(place, label=panel.role)
+        drawing.imshow(picture, aspect="auto", interpolation="nearest")
+        drawing.set_axis_off()
+        if captioned:
+            center, top = (left + panel_width / 2) / width, 1 - gap / height
+            figure.text(center, top, panel.role, ha="center", va="top", fontsize=11, color=_INK)
+            name, size = describe(panel.mesh)
+            figure.text(
+                center,
+                top - 50 / height,
+                f"{_shorten(name)}\n{size}",
+                ha="center",
+                va="top",
+                fontsize=7.5,
+                color=_FAINT,
+                parse_math=False,
+            )
+        left += panel_width
+    return figure
+
+
+def _shorten(name: str) -> str:
+    half = _LONGEST_NAME // 2
+    return name if len(name) <= _LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
+
+
+def _draw_error_scale(figure: Figure, limit: float, exceeded: bool) -> None:
+    """The colour bar of the errors, at the right edge."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+
+    colors = ListedColormap(error_colors(np.linspace(0, 1, 256), 1.0))
+    width = _DPI * figure.get_figwidth()
+    axes = figure.add_axes((1 - 150 / width, 0.2, 22 / width, 0.5), label="error scale")
+    scale = figure.colorbar(
+        ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max" if exceeded else "neither"
+    )
+    scale.set_label("geodesic error / √area", fontsize=7.5, color=_FAINT)
+    scale.outline.set_visible(False)
+    _style(axes)
+
+
+def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
+    """An empty white figure of so many inches with a canvas in memory; for a plot its parts make room."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
+    except ImportError as error:
+        raise InputError(
+            "figures are drawn by matplotlib, which is not installed: pip install 'jaxsmw[report]'"
+        ) from error
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12) if plot else None
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _style(axes: Axes, *, grid: bool = False) -> None:
+    axes.tick_params(labelsize=8, colors=_FAINT, labelcolor=_INK, width=0.6, length=3)
+    axes.xaxis.label.set(size=9, color=_INK)
+    axes.yaxis.label.set(size=9, color=_INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set(color=_FAINT, linewidth=0.6)
+    if grid:
+        axes.grid(color="#e6e8ec", linewidth=0.6)
+        axes.set_axisbelow(True)

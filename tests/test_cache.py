@@ -1,0 +1,221 @@
+"""The disk cache: what counts as the same input, damage, unwritable places, size, many processes."""
+
+import concurrent.futures
+import errno
+import multiprocessing
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.cache import cached
+
+INPUT = np.arange(6.0).reshape(2, 3)
+RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}
+
+
+class Computation:
+    """Counts how often it had to be done."""
+
+    def __init__(self, result=RESULT):
+        self.result, self.runs = result, 0
+
+    def __call__(self):
+        self.runs += 1
+        return self.result
+
+
+@pytest.fixture
+def directory(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path / "not" / "there" / "yet"))
+    return tmp_path / "not" / "there" / "yet"
+
+
+def assert_same(arrays, expected=RESULT):
+    assert arrays.keys() == expected.keys()
+    for name, array in arrays.items():
+        assert array.dtype == expected[name].dtype and array.shape == expected[name].shape
+        assert array.tobytes() == expected[name].tobytes()
+
+
+def test_computed_once_and_returned_bit_for_bit(directory):
+    compute = Computation()
+    for _ in range(3):
+        assert_same(cached("test", [INPUT, 7], compute))
+    assert compute.runs == 1
+    assert [entry.suffix for entry in directory.iterdir()] == [".npz"]
+
+
+def test_equal_inputs_are_equal_however_they_lie_in_memory(directory):
+    compute = Computation()
+    cached("test", [INPUT], compute)
+    cached("test", [np.asfortranarray(INPUT)], compute)
+    cached("test", [np.repeat(INPUT, 2, axis=0)[::2]], compute)
+    assert compute.runs == 1
+
+
+def test_everything_about_the_inputs_counts(directory):
+    inputs = [
+        [INPUT],
+        [INPUT + 1e-15],
+        [INPUT.T],
+        [INPUT.ravel()],
+        [INPUT.astype(np.float32)],
+        [INPUT.view(np.int64)],
+        [INPUT.astype(">f8")],
+        [INPUT, INPUT],
+        [INPUT, 7],
+        [7, INPUT],
+        [INPUT, 7.0],
+        [INPUT, "7"],
+        [INPUT, True],
+        [INPUT, 1],
+        [INPUT[:1], INPUT[1:]],
+        ["ab", "c"],
+        ["a", "bc"],
+        ["abc"],
+        [],
+    ]
+    computations = [Computation({"number": np.array(i)}) for i in range(len(inputs))]
+    for _ in range(2):
+        for i, (values, compute) in enumerate(zip(inputs, computations, strict=True)):
+            assert cached("test", values, compute)["number"] == i
+    assert cached("other", inputs[0], Computation({"number": np.array(-1)}))["number"] == -1
+    assert {compute.runs for compute in computations} == {1}
+
+
+@pytest.mark.parametrize("setting", ["", "off"])
+def test_switched_off(setting, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXSMW_CACHE", setting)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compute = Computation()
+    for _ in range(2):
+        assert_same(cached("test", [INPUT], compute))
+    assert compute.runs == 2 and not list(tmp_path.iterdir())
+
+
+def test_by_default_in_the_users_cache_directory(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAXSMW_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda name, **_: str(tmp_path / name))
+    cached("test", [INPUT], Computation())
+    assert len(list((tmp_path / "jaxsmw").glob("test-*.npz"))) == 1
+
+
+def test_no_single_wrong_byte_is_believed(directory):
+    cached("test", [INPUT], Computation())
+    (entry,) = directory.iterdir()
+    good = entry.read_bytes()
+    for position in range(0, len(good), 2):
+        entry.write_bytes(good[:position] + bytes([good[position] ^ 0x55]) + good[position + 1 :])
+        assert_same(cached("test", [INPUT], Computation()))
+
+
+class Bomb:
+    """Unpickled, it leaves a trace."""
+
+    def __init__(self, trace):
+        self.trace = trace
+
+    def __reduce__(self):
+        return Path.touch, (self.trace,)
+
+
+def test_damaged_and_foreign_entries_are_computed_again_and_replaced(directory, tmp_path):
+    cached("test", [INPUT], Computation())
+    cached("test", ["another"], Computation({"values": np.zeros(3)}))
+    key = next(e for e in directory.iterdir() if np.load(e)["values"].any()).name
+    entry, trace = directory / key, tmp_path / "trace"
+    good = entry.read_bytes()
+    other = next(e for e in directory.iterdir() if e.name != key).read_bytes()
+    np.savez(tmp_path / "unrelated.npz", values=np.zeros(3))
+    np.save(tmp_path / "single.npy", np.zeros(3))
+    np.savez(tmp_path / "pickle.npz", values=np.array([Bomb(trace)], dtype=object), contents=np.array(""))
+    foreign = [(tmp_path / name).read_bytes() for name in ("unrelated.npz", "single.npy", "pickle.npz")]
+    for content in [*(good[:size] for size in range(0, len(good), 101)), b"\0" * 500, other, *foreign]:
+        entry.write_bytes(content)
+        compute = Computation()
+        for _ in range(2):
+            assert_same(cached("test", [INPUT], compute))
+        assert compute.runs == 1, content[:40]
+    assert not trace.exists()
+
+
+def test_a_place_that_cannot_be_written_costs_one_warning(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path / "file"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for number in range(3):
+            assert_same(cached("test", [number], Computation()))
+    assert len(caught) == 1
+    assert str(tmp_path / "file") in str(caught[0].message) and "JAXSMW_CACHE" in str(caught[0].message)
+
+
+def test_a_full_disk_leaves_nothing_behind(directory, monkeypatch):
+    def full(path, **_):
+        path.write_bytes(b"half an ent")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.warns(RuntimeWarning, match="make room there"):
+        assert_same(cached("test", [INPUT], Computation()))
+    assert not list(directory.iterdir())
+
+
+def test_a_directory_in_place_of_an_entry(directory):
+    cached("test", [INPUT], Computation())
+    (entry,) = directory.iterdir()
+    entry.unlink()
+    entry.mkdir()
+    with pytest.warns(RuntimeWarning, match="cannot be kept"):
+        assert_same(cached("test", [INPUT], Computation()))
+
+
+def test_the_least_recently_used_go_first_and_nothing_else_goes(directory, monkeypatch):
+    def entry(number):
+        compute = Computation({"values": np.full(1000, float(number))})
+        assert cached("test", [number], compute)["values"][0] == number
+        return compute.runs
+
+    directory.mkdir(parents=True)
+    (directory / "thesis.npz").write_bytes(b"0" * 100_000)
+    (directory / f".{'0' * 32}.npz").write_bytes(b"left by a killed process")
+    os.utime(directory / f".{'0' * 32}.npz", (0, 0))
+    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", str(30_000 / 2**30))  # three entries of 8000 bytes and a little
+    now = 1_000_000
+    for number in range(3):
+        assert entry(number) == 1
+        for file in directory.glob("test-*"):
+            if file.stat().st_mtime > now + 1000:
+                os.utime(file, (now + number, now + number))
+    assert entry(0) == 0  # used: now 1 is the oldest
+    assert entry(3) == 1
+    assert not (directory / f".{'0' * 32}.npz").exists() and (directory / "thesis.npz").exists()
+    assert [entry(number) for number in (0, 2, 3, 1)] == [0, 0, 0, 1]
+
+
+def test_the_limit_must_be_a_number(directory, monkeypatch):
+    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", "4 GiB")
+    with pytest.raises(InputError, match="JAXSMW_CACHE_LIMIT is '4 GiB': give the size"):
+        cached("test", [INPUT], Computation())
+
+
+def _work(seed):
+    """Read and write a few entries in random order, as others do, in a cache that is always too small."""
+    generator = np.random.default_rng(seed)
+    for number in generator.integers(0, 4, 60).tolist():
+        result = cached("test", [number], lambda number=number: {"values": np.full(3000, float(number))})
+        assert (result["values"] == number).all()
+    return True
+
+
+def test_many_processes_share_a_directory(directory, monkeypatch):
+    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", str(60_000 / 2**30))
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(3, mp_context=context) as pool:
+        assert all(pool.map(_work, range(6)))
+    assert all(entry.name.startswith("test-") for entry in directory.iterdir())
