@@ -333,8 +333,7 @@ def _conclude(
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    for path in filter(None, (options.output, options.figure)):
-        check_writable(path)
+    _check_outputs(options)
     from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
@@ -357,6 +356,16 @@ def _evaluate(options: argparse.Namespace) -> None:
             temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
 
 
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse places that cannot be written to before there is anything to write."""
+    if options.output:
+        check_writable(options.output)
+    if options.figure:
+        from jaxsmw.report.figures import check_figure_path
+
+        check_figure_path(options.figure)
+
+
 def _errors(
     options: argparse.Namespace, mesh_y: Mesh, maps: Mapping[str, Any], truth: GroundTruth
 ) -> dict[str, GeodesicError]:
@@ -377,8 +386,7 @@ def _errors(
 
 
 def _spectrum(options: argparse.Namespace) -> None:
-    for path in filter(None, (options.output, options.figure)):
-        check_writable(path)
+    _check_outputs(options)
     if options.output and Path(options.output).suffix != ".npz":
         raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
     import numpy as np
@@ -409,7 +417,7 @@ def _spectrum(options: argparse.Namespace) -> None:
 def _render(options: argparse.Namespace) -> None:
     check_writable(options.output)
     from jaxsmw.evaluation.ground_truth import read_pointwise_map
-    from jaxsmw.report.figures import draw_correspondence, draw_mesh, save_figure
+    from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
     from jaxsmw.report.page import write_page
 
     page = Path(options.output).suffix.lower() in (".html", ".htm")
@@ -419,6 +427,8 @@ def _render(options: argparse.Namespace) -> None:
         raise InputError(
             f"{options.output}: a page shows a correspondence; give a target mesh and a map too."
         )
+    if not page:
+        check_figure_path(options.output)
     mesh_x = _read(options.source, options)
     if not options.map:
         save_figure(options.output, draw_mesh(mesh_x, up=options.up))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Float64, Int
 
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
+from jaxsmw.files import atomic_write, check_writable
 from jaxsmw.geometry.mesh import Mesh
 
 from .colors import PLAIN, error_colors, position_colors
@@ -264,15 +264,26 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
     **Raises:** `InputError` if the suffix is another one or the file cannot be written.
     """
+    check_figure_path(path)
     suffix = Path(path).suffix.lower()
-    # Files say nothing of when they were made: the same figure is the same file.
-    metadata = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-    if suffix not in metadata:
-        raise InputError(f"{path}: a figure is written as .png, .pdf or .svg; choose one of these endings.")
     import matplotlib
 
     with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "jaxsmw"}):
-        figure.savefig(temporary, format=suffix[1:], dpi=_DPI, metadata=metadata[suffix])
+        figure.savefig(temporary, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
+
+
+def check_figure_path(path: str | os.PathLike[str]) -> None:
+    """Tell now what would make `save_figure` fail later.
+
+    **Raises:** `InputError` if the suffix is none of PNG, PDF and SVG or the file cannot be written.
+    """
+    if Path(path).suffix.lower() not in _METADATA:
+        raise InputError(f"{path}: a figure is written as .png, .pdf or .svg; choose one of these endings.")
+    check_writable(path)
+
+
+# Files say nothing of when they were made: the same figure is the same file.
+_METADATA: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 class _Panel(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import platform
@@ -22,7 +21,13 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.files import atomic_write
 from jaxsmw.matching import Correspondence
-from jaxsmw.report.figures import draw_correspondence, draw_filters, draw_functional_map, draw_quality_curves
+from jaxsmw.report.figures import (
+    draw_correspondence,
+    draw_filters,
+    draw_functional_map,
+    draw_quality_curves,
+    save_figure,
+)
 from jaxsmw.report.page import write_page
 from jaxsmw.report.rendering import Axis
 
@@ -79,10 +84,8 @@ def write_report(
     if errors:
         figures["quality"] = draw_errors(errors)
         captions["quality"] = "The share of vertices within a geodesic error."
-    pictures = {name: _png(figure) for name, figure in figures.items()}
-    for name, picture in pictures.items():
-        with atomic_write(directory / f"{name}.png") as temporary:
-            temporary.write_bytes(picture)
+    for name, figure in figures.items():
+        save_figure(directory / f"{name}.png", figure)
 
     facts = summarize(correspondence, errors)
     write_page(
@@ -93,7 +96,7 @@ def write_report(
         title=f"{Path(correspondence.mesh_x.name).name} to {Path(correspondence.mesh_y.name).name}",
         statistics=facts,
         errors=per_vertex,
-        figures=[(caption, pictures[name]) for name, caption in captions.items()],
+        figures=[(caption, (directory / f"{name}.png").read_bytes()) for name, caption in captions.items()],
         up=up,
     )
     summary = {"settings": dict(settings or {}), "result": facts, "provenance": provenance()}
@@ -160,9 +163,3 @@ def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)
-
-
-def _png(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
