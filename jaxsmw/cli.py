@@ -6,7 +6,10 @@ import argparse
 import json
 import logging
 import os
+import signal
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib import metadata
@@ -28,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run `jaxsmw`. Exits with 0 if all went well, 2 for bad input, 1 for anything else."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    _make_interruptible()
     logger = logging.getLogger("jaxsmw")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s ..."))
@@ -44,13 +48,33 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _say(f"jaxsmw: {error}")
         sys.exit(1)
     except KeyboardInterrupt:
-        _say("jaxsmw: interrupted; files are written whole or not at all.")
-        sys.exit(1)
+        _leave_at_once()
     except BrokenPipeError:
         # Whoever read our output has gone; Python would complain again when it flushes.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     sys.exit(0)
+
+
+def _leave_at_once() -> NoReturn:
+    """End the process without waiting, as `sys.exit` would, for computations still under way."""
+    print("jaxsmw: interrupted; files are written whole or not at all.", file=sys.stderr, flush=True)
+    os._exit(1)
+
+
+def _make_interruptible() -> None:
+    """Let Ctrl-C end the process also while it is inside compiled code, where Python cannot raise."""
+
+    def wait_for_signal() -> None:
+        os.read(waiting, 1)
+        # Time enough for Python to raise KeyboardInterrupt and clean up, if it can.
+        time.sleep(2)
+        _leave_at_once()
+
+    waiting, waking = os.pipe()
+    os.set_blocking(waking, False)
+    signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
+    threading.Thread(target=wait_for_signal, daemon=True).start()
 
 
 def _say(message: str) -> None:
@@ -250,13 +274,14 @@ def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
 def _demo(options: argparse.Namespace) -> None:
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
     from jaxsmw.geometry.creature import creature_pair
+    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.geometry.mesh_files import write_mesh
     from jaxsmw.report.summary import make_directory
 
     directory = make_directory(options.output)
     logging.getLogger("jaxsmw").info("making the creature")
     pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
-    truth = GroundTruth.of_all_vertices(pair.truth)
+    truth = GroundTruth.of_all_vertices(SurfacePoints(pair.target_faces, pair.target_weights))
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
     write_ground_truth(directory / "truth.baryc_gt", truth)
