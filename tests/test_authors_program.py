@@ -6,13 +6,24 @@ import pytest
 
 from jaxsmw.core.refinement import RESULTS, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.evaluation.ground_truth import read_ground_truth
+from jaxsmw.evaluation.metrics import geodesic_error
+from jaxsmw.geometry.mesh_files import read_mesh
 
 SETTINGS = {"demo": 128, "paper": 100}
 
 
-@pytest.fixture(params=["faust_r_002_007", "faust_r_000_004"])
-def reference(shared, request):
-    return dict(np.load(shared / "oracle" / f"{request.param}.npz"))
+PAIRS = {"faust_r_002_007": ("tr_reg_002", "tr_reg_007"), "faust_r_000_004": ("tr_reg_000", "tr_reg_004")}
+
+
+@pytest.fixture(params=PAIRS)
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def reference(shared, name):
+    return dict(np.load(shared / "oracle" / f"{name}.npz"))
 
 
 def spectrum(reference: dict, side: str, k: int, dtype: type) -> Spectrum:
@@ -57,6 +68,19 @@ def test_sampled_variant(reference, setting):
 def test_float32_agrees_at_nearly_all_vertices(reference, setting):
     t, _ = run(reference, setting, 5, np.float32)
     assert np.mean(t == reference[f"{setting}_T"][:, 4]) >= 0.99
+
+
+def test_float32_is_as_accurate(shared, name, reference):
+    directory = shared / "data" / "faust_r"
+    mesh_x, mesh_y = (read_mesh(directory / "off" / f"{shape}.off") for shape in PAIRS[name])
+    truth = read_ground_truth(
+        [directory / "corres" / f"{shape}.vts" for shape in PAIRS[name]], mesh_x, mesh_y
+    )
+    single, double = (
+        geodesic_error(mesh_y, run(reference, "paper", 3, dtype)[0], truth, number_of_samples=1000).mean
+        for dtype in (np.float32, np.float64)
+    )
+    assert single == pytest.approx(double, rel=0.01)
 
 
 def test_area_weighted_pseudo_inverse_is_close_but_not_equal(reference):

@@ -1,0 +1,151 @@
+"""How good a pointwise map is: geodesic errors, their statistics, and coverage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy.typing import ArrayLike
+
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.ground_truth import GroundTruth
+from jaxsmw.geometry.geodesics import (
+    GeodesicMethod,
+    SurfacePoints,
+    check_indices,
+    check_points,
+    geodesic_distances_between,
+)
+from jaxsmw.geometry.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class GeodesicError:
+    """How far from the truth a map takes each evaluated point, in square roots of the target's area.
+
+    **Attributes:**
+
+    - `errors`: one for each evaluated row of the ground truth (p,); inf where the image lies on another
+      component of the target than the truth.
+    - `source_vertices`: the vertices of X they belong to (p,).
+    - `method`: how distances were computed.
+    """
+
+    errors: Float64[np.ndarray, " p"]
+    source_vertices: Int64[np.ndarray, " p"]
+    method: GeodesicMethod
+
+    @property
+    def unreachable(self) -> float:
+        """The share of points whose image lies on another component than the truth."""
+        return float(np.isinf(self.errors).mean())
+
+    @property
+    def mean(self) -> float:
+        """The mean over the points that are not `unreachable`: look at both; inf if there are none."""
+        reachable = self.errors[np.isfinite(self.errors)]
+        return float(reachable.mean()) if len(reachable) else np.inf
+
+    @property
+    def median(self) -> float:
+        """The median over all points; an unreachable one counts as farther than any other."""
+        return float(np.median(self.errors))
+
+    def __str__(self) -> str:
+        """The main figures in one line."""
+        elsewhere = f"; {self.unreachable:.2%} on another component" if self.unreachable else ""
+        return (
+            f"mean {self.mean:.5f}, median {self.median:.5f} of sqrt(area), area under the curve "
+            f"{self.area_under_curve():.4f} ({len(self.errors)} points, {self.method}{elsewhere})"
+        )
+
+    def as_dictionary(self) -> dict[str, float | int | str | None]:
+        """The main figures as JSON has them; None where one is infinite."""
+        return {
+            "mean": self.mean if np.isfinite(self.mean) else None,
+            "median": self.median if np.isfinite(self.median) else None,
+            "area_under_curve": self.area_under_curve(),
+            "unreachable": self.unreachable,
+            "points": len(self.errors),
+            "method": self.method,
+        }
+
+    def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
+        """The share of points with an error of at most each threshold (Kim, Lipman and Funkhouser 2011)."""
+        counts = np.searchsorted(np.sort(self.errors), np.asarray(thresholds), side="right")
+        return counts / len(self.errors)
+
+    def area_under_curve(self, largest: float = 0.25) -> float:
+        """The mean height of the correspondence quality curve between 0 and a largest threshold.
+
+        Exact: the curve is a step at each error e, so its mean height is the mean of `max(0, 1 - e/largest)`.
+        1 is a perfect map.
+        """
+        if not largest > 0:
+            raise InputError(f"the largest threshold is {largest}: give a positive number.")
+        return float(np.maximum(0, 1 - self.errors / largest).mean())
+
+
+def geodesic_error(
+    mesh_y: Mesh,
+    pointwise_map: ArrayLike | SurfacePoints,
+    ground_truth: GroundTruth,
+    *,
+    method: GeodesicMethod = "strips",
+    number_of_samples: int | None = None,
+    seed: int = 0,
+) -> GeodesicError:
+    """The geodesic distance on the target between where a map takes points and where they belong.
+
+    Divided by the square root of the target's area, as everyone does since Kim, Lipman and Funkhouser (2011),
+    so that neither the unit nor the size of the body matters.
+
+    **Arguments:**
+
+    - `mesh_y`: the target Y.
+    - `pointwise_map`: T: X -> Y (m,): 0-based vertices of Y, or `SurfacePoints` on it.
+    - `ground_truth`: which points of Y which vertices of X are.
+    - `method`: see `jaxsmw.geometry.geodesics.geodesic_distances`.
+    - `number_of_samples`: evaluate so many rows of the ground truth, drawn without replacement; all by
+      default, and if there are no more.
+    - `seed`: of the draw.
+
+    **Returns:** A `GeodesicError`.
+
+    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, or if `"exact"`
+    cannot be used.
+    """
+    images = check_points(pointwise_map, mesh_y, "pointwise map")
+    targets = check_points(ground_truth.targets, mesh_y, "ground truth")
+    sources = ground_truth.source_vertices
+    if len(sources) == 0:
+        raise InputError("ground truth: it has no rows, so there is nothing to evaluate.")
+    if not 0 <= sources.min() <= sources.max() < len(images):
+        raise InputError(
+            f"ground truth: its source vertices are numbered {sources.min()} to {sources.max()}, but the "
+            f"pointwise map has {len(images)} entries: give the map and the truth of the same source mesh."
+        )
+    if number_of_samples is not None:
+        if number_of_samples < 1:
+            raise InputError(f"{number_of_samples} samples cannot be evaluated: ask for at least 1.")
+        rows = np.random.default_rng(seed).permutation(len(sources))[:number_of_samples]
+        sources, targets = sources[rows], targets[rows]
+    distances = geodesic_distances_between(mesh_y, images[sources], targets, method=method)
+    return GeodesicError(distances / np.sqrt(mesh_y.area), sources, method)
+
+
+def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
+    """The share of the target's area that belongs to vertices in the image of a map; needs no ground truth.
+
+    **Arguments:**
+
+    - `mesh_y`: the target Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+
+    **Raises:** `InputError` if the map does not fit the mesh.
+    """
+    image = np.unique(
+        check_indices(pointwise_map, len(mesh_y.vertices), f"pointwise map on {mesh_y.name}: vertex")
+    )
+    return float(mesh_y.vertex_areas[image].sum() / mesh_y.vertex_areas.sum())
