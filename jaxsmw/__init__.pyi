@@ -5,7 +5,10 @@ from .core.refinement import RESULTS, History, Refinement, Refiner, WaveletPrese
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.spectrum import Spectrum
 from .errors import InputError
+from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
+from .evaluation.metrics import GeodesicError, coverage, geodesic_error
 from .geometry.eigenbasis import compute_spectrum
+from .geometry.geodesics import SurfacePoints, geodesic_distances
 from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.mesh_files import read_mesh, write_mesh
 from .geometry.sampling import farthest_point_samples
@@ -17,6 +20,8 @@ __all__ = [
     "RESULTS",
     "Correspondence",
     "FilterBank",
+    "GeodesicError",
+    "GroundTruth",
     "History",
     "InputError",
     "Mesh",
@@ -24,24 +29,31 @@ __all__ = [
     "Refinement",
     "Refiner",
     "Spectrum",
+    "SurfacePoints",
     "WaveletPreservation",
     "compute_spectrum",
+    "coverage",
     "decode",
     "diagnose",
     "encode",
     "farthest_point_samples",
     "frame_function",
+    "geodesic_distances",
+    "geodesic_error",
     "heat_kernel_signature",
     "initial_map",
     "make_mesh",
     "match",
     "multiscale_kernel",
     "nearest_neighbor",
+    "read_ground_truth",
     "read_mesh",
+    "read_pointwise_map",
     "refine",
     "shot_descriptors",
     "wave_kernel_signature",
     "wavelet_energy",
     "wavelet_signature",
     "write_mesh",
+    "write_pointwise_map",
 ]

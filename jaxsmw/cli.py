@@ -352,9 +352,9 @@ def _conclude(
             up=options.up,
         )
     for name, error in errors.items():
-        print(f"{name + ' map:':13} {error}")
+        print(f"{name + ' map:':12} {error}")
     times = ", ".join(f"{stage} {time:.2f} s" for stage, time in correspondence.seconds.items())
-    print(f"time:         {times}")
+    print(f"time:        {times}")
 
 
 def _evaluate(options: argparse.Namespace) -> None:

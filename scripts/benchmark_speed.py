@@ -3,8 +3,8 @@
     python scripts/benchmark_speed.py [--repeats N] [--vertices M N] [--eigenvectors K]
 
 Ratios of medians, all measured in turns in one process: refinement at the paper's setting (3 iterations,
-float32) against three products (M x K) (K x N) alone, as JAX and as NumPy's BLAS compute them, and against
-the same refinement with a plain argmin over a stored distance matrix. Then the host's stages.
+float32) against three products (M x K) (K x N) alone, in the fastest of several ways to have them, and
+against the same refinement with a plain argmin over a stored distance matrix. Then the host's stages.
 """
 
 from __future__ import annotations
@@ -76,7 +76,11 @@ def main() -> None:
     x, y = (random_spectrum(generator, size, options.eigenvectors) for size in (m, n))
     start = jnp.asarray(generator.integers(0, n, m), jnp.int32)
     product = jax.jit(lambda a, b: a @ b.T)
+    # In blocks that stay in the processor's cache, of which as little as possible is kept.
+    blocks = jnp.pad(x.eigenvectors, ((0, -m % 256), (0, 0))).reshape(-1, 256, options.eigenvectors)
+    blocked = jax.jit(lambda a, b: jax.lax.map(lambda block: jnp.max(block @ b.T, axis=1), a))
     a, b = np.asarray(x.eigenvectors), np.asarray(y.eigenvectors)
+    out = np.empty((m, n), np.float32)
 
     def refinement(refiner: Refiner) -> Callable[[], object]:
         return lambda: refine(x, y, start, refiner=refiner, iterations=ITERATIONS)
@@ -84,15 +88,16 @@ def main() -> None:
     seconds = medians(
         {
             "products, JAX": lambda: [product(x.eigenvectors, y.eigenvectors) for _ in range(ITERATIONS)],
-            "products, NumPy": lambda: [a @ b.T for _ in range(ITERATIONS)],
+            "products, JAX in blocks": lambda: [blocked(blocks, y.eigenvectors) for _ in range(ITERATIONS)],
+            "products, NumPy": lambda: [np.matmul(a, b.T, out=out) for _ in range(ITERATIONS)],
             "refinement": refinement(WaveletPreservation()),
             "refinement, plain argmin": refinement(PlainSearch()),
         },
         options.repeats,
     )
-    floor = min(seconds["products, JAX"], seconds["products, NumPy"])
+    floor = min(median for name, median in seconds.items() if name.startswith("products"))
     print(f"\n{m} x {n} vertices, k = {options.eigenvectors}, {ITERATIONS} iterations, float32\n")
-    print("| | seconds | of the faster products |\n|---|---|---|")
+    print("| | seconds | of the fastest products |\n|---|---|---|")
     for name, median in seconds.items():
         print(f"| {name} | {median:.3f} | {median / floor:.2f} |")
 

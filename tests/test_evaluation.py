@@ -78,6 +78,19 @@ class TestReading:
         np.testing.assert_allclose(truth.targets.weights, expected, rtol=1e-12)
         assert (truth.targets.weights >= 0).all()
 
+    def test_barycentric_where_cleaning_dropped_faces(self, write):
+        vertices, faces = grid_mesh(3, 3)
+        doubled = np.concatenate([faces[:3], faces[2:3, ::-1], faces[3:], faces[:1]])
+        mesh = make_mesh(vertices, doubled, name="doubled")
+        assert mesh.dropped_faces.tolist() == [3, 9]
+        lines = "3 1 0 0\n5 0 1 0\n9 .5 .5 0\n1 0 0 1\n"
+        truth = read_ground_truth(write("t.baryc_gt", lines), X, mesh)
+        assert (mesh.faces[truth.targets.faces] == doubled[[2, 4, 8, 0]]).all()
+        with pytest.raises(InputError, match="line 2: face 4 was dropped from doubled"):
+            read_ground_truth(write("t.baryc_gt", lines.replace("5 0", "4 0")), X, mesh)
+        with pytest.raises(InputError, match=r"line 2: 11 is not one of .* numbered 1 to 10"):
+            read_ground_truth(write("t.baryc_gt", lines.replace("5 0", "11 0")), X, mesh)
+
     def test_pointwise_map_round_trip(self, tmp_path):
         path = tmp_path / "a.map"
         for pointwise_map in (np.array([8, 0, 0, 3]), np.array([1, 2, 3, 4], dtype=np.uint16), [0, 0, 0, 0]):
@@ -374,10 +387,16 @@ class TestStatistics:
 
     def test_in_words_and_as_json(self):
         error = self.error([0.1, 0.2, np.inf, 0.0])
-        text = "mean 0.10000, median 0.15000 of sqrt(area), area under the curve 0.4500 (4 points, strips; 25.00% "
-        assert str(error) == text + "on another component)"
+        assert str(error) == (
+            "mean 0.10000, median 0.15000, 25.0% within 0.02, 25.0% within 0.05, 50.0% within 0.1, area under the "
+            "curve 0.4500 (4 points, strips; 25.00% on another component)"
+        )
         assert "component" not in str(self.error([0.1]))
-        assert json.loads(json.dumps(error.as_dictionary(), allow_nan=False)) == {
+        figures = json.loads(json.dumps(error.as_dictionary(), allow_nan=False))
+        curve = figures.pop("curve")
+        assert curve["shares"] == error.correspondence_quality_curve(np.array(curve["thresholds"])).tolist()
+        assert figures == {
+            "within": {"0.02": 0.25, "0.05": 0.25, "0.1": 0.5},
             "mean": pytest.approx(0.1),
             "median": pytest.approx(0.15),
             "area_under_curve": pytest.approx(0.45),

@@ -398,12 +398,12 @@ def test_points_on_a_curved_surface_agree_with_exact_distances():
 
 def test_a_straight_line_between_points_need_not_be_the_shortest_path():
     mesh = blob(1)
-    points = SurfacePoints(np.arange(80), random_points(mesh, 80).weights)
-    first, second = np.triu_indices(80, 1)
-    expected = exact_distances(with_points_as_vertices(mesh, points), 42 + np.arange(80))[first, 42 + second]
+    points = SurfacePoints(np.arange(60), random_points(mesh, 60).weights)
+    first, second = np.triu_indices(60, 1)
+    expected = exact_distances(with_points_as_vertices(mesh, points), 42 + np.arange(60))[first, 42 + second]
     straight = geodesics._straight_distances(mesh, points[first], points[second])
     longer = np.isfinite(straight) & (straight > expected * 1.02)
-    assert longer.sum() > 50
+    assert longer.sum() > 10
     distances = geodesic_distances_between(mesh, points[first], points[second])
     assert (distances >= expected * (1 - 1e-12)).all()
     assert (distances / expected)[longer].max() < 1.01
@@ -449,7 +449,8 @@ def test_repeatable_and_from_the_cache(tmp_path, monkeypatch):
     mesh = blob(2)
     geodesic_graph.cache_clear()
     first = geodesic_distances(mesh, [0, 1])
-    assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 1
+    assert geodesic_graph(mesh, depth=2).nnz < geodesic_graph(mesh).nnz
+    assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 2
     geodesic_graph.cache_clear()
     monkeypatch.setattr(geodesics, "_unfold", None)  # computing again would fail
     np.testing.assert_array_equal(geodesic_distances(mesh, [0, 1]), first)

@@ -113,8 +113,7 @@ def read_ground_truth(
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
         table = _Table(file, columns=4)
         table.require_rows(mesh_x)
-        faces = table.indices(0, len(mesh_y.faces), f"faces of {mesh_y.name}", base(1))
-        return GroundTruth.of_all_vertices(SurfacePoints(faces, table.weights(1)))
+        return GroundTruth.of_all_vertices(SurfacePoints(table.faces(0, mesh_y, base(1)), table.weights(1)))
     table = _Table(file)
     if table.columns == 2:
         return GroundTruth(table.vertices(0, mesh_x, base(1)), table.vertices(1, mesh_y, base(1)))
@@ -249,6 +248,21 @@ class _Table:
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
         """A column as 0-based vertices of a mesh."""
         return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
+
+    def faces(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
+        """A column as 0-based faces of a mesh, where the file counts those that cleaning dropped, too."""
+        count = len(mesh.faces) + len(mesh.dropped_faces)
+        given = self.indices(column, count, f"faces of {mesh.name}", base)
+        kept = np.delete(np.arange(count), mesh.dropped_faces)
+        faces = np.searchsorted(kept, given)
+        dropped = np.isin(given, mesh.dropped_faces)
+        if dropped.any():
+            row = int(dropped.argmax())
+            raise InputError(
+                f"{self._at(row)}: face {self.words[row][column]} was dropped from {mesh.name}, for it "
+                "repeats a vertex or another face: name a face that was kept."
+            )
+        return faces
 
     def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
         """A column as 0-based indices below a count."""

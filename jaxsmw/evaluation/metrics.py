@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -18,6 +19,10 @@ from jaxsmw.geometry.geodesics import (
     geodesic_distances_between,
 )
 from jaxsmw.geometry.mesh import Mesh
+
+# What is usually reported, in square roots of the target's area: shares within these, curves up to the last.
+THRESHOLDS = (0.02, 0.05, 0.1)
+LARGEST_THRESHOLD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +57,36 @@ class GeodesicError:
         """The median over all points; an unreachable one counts as farther than any other."""
         return float(np.median(self.errors))
 
+    @property
+    def within(self) -> dict[float, float]:
+        """The share of points with an error of at most each of the usual `THRESHOLDS`."""
+        shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
+        return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
+
     def __str__(self) -> str:
         """The main figures in one line."""
+        within = ", ".join(f"{share:.1%} within {threshold}" for threshold, share in self.within.items())
         elsewhere = f"; {self.unreachable:.2%} on another component" if self.unreachable else ""
         return (
-            f"mean {self.mean:.5f}, median {self.median:.5f} of sqrt(area), area under the curve "
+            f"mean {self.mean:.5f}, median {self.median:.5f}, {within}, area under the curve "
             f"{self.area_under_curve():.4f} ({len(self.errors)} points, {self.method}{elsewhere})"
         )
 
-    def as_dictionary(self) -> dict[str, float | int | str | None]:
-        """The main figures as JSON has them; None where one is infinite."""
+    def as_dictionary(self) -> dict[str, Any]:
+        """The main figures and the curve as JSON has them; None where one is infinite."""
+        thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
             "mean": self.mean if np.isfinite(self.mean) else None,
             "median": self.median if np.isfinite(self.median) else None,
+            "within": {str(threshold): share for threshold, share in self.within.items()},
             "area_under_curve": self.area_under_curve(),
             "unreachable": self.unreachable,
             "points": len(self.errors),
             "method": self.method,
+            "curve": {
+                "thresholds": thresholds.tolist(),
+                "shares": self.correspondence_quality_curve(thresholds).tolist(),
+            },
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
@@ -76,7 +94,7 @@ class GeodesicError:
         counts = np.searchsorted(np.sort(self.errors), np.asarray(thresholds), side="right")
         return counts / len(self.errors)
 
-    def area_under_curve(self, largest: float = 0.25) -> float:
+    def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
         """The mean height of the correspondence quality curve between 0 and a largest threshold.
 
         Exact: the curve is a step at each error e, so its mean height is the mean of `max(0, 1 - e/largest)`.

@@ -65,12 +65,12 @@ def cached(
                 np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
             _remove_oldest(path.parent, limit)
         except (OSError, InputError):
-            # The text is the same for every entry, so that Python shows it once.
+            # Text and place are the same for every entry, so that Python shows it once.
             warnings.warn(
                 f"results cannot be kept in {place} and will be computed again next time: make room there, "
                 "or name another directory in JAXSMW_CACHE ('off' for none).",
                 RuntimeWarning,
-                stacklevel=2,
+                stacklevel=1,
             )
     return arrays
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -39,12 +39,15 @@ class Mesh:
     - `faces`: vertex indices (f, 3), 0-based.
     - `name`: how messages call this mesh (for a file: its path).
     - `notes`: what was noticed and what was mended on the way in, one sentence each.
+    - `dropped_faces`: numbers (d,), 0-based and ascending, that cleaned-away faces had among the faces given;
+      all others moved up. Files that name faces by number mean those given.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
     faces: Int64[np.ndarray, "f 3"]
     name: str = "mesh"
     notes: tuple[str, ...] = ()
+    dropped_faces: Int64[np.ndarray, " d"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @cached_property
     def _area_vectors(self) -> Float64[np.ndarray, "f 3"]:
@@ -300,13 +303,13 @@ def make_mesh(
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeating.any():
         notes.append(f"{count_of(int(repeating.sum()), 'face')} with a repeated vertex dropped.")
-        triangles, ordered = triangles[~repeating], ordered[~repeating]
+    number, ordered = np.flatnonzero(~repeating), ordered[~repeating]
     first = lowest_twins(ordered) == np.arange(len(ordered))
     if not first.all():
         notes.append(f"{count_of(int((~first).sum()), 'face')} with the vertices of an earlier face dropped.")
-        triangles = triangles[first]
+    number = number[first]
 
-    mesh = Mesh(position, triangles, name)
+    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
     if mesh.degenerate_faces.all():
         raise InputError(
             f"{name}: no triangle has an area, their corners coincide or lie on a line: "

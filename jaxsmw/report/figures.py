@@ -15,10 +15,9 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write, check_writable
 from jaxsmw.geometry.mesh import Mesh
-
-from .colors import PLAIN, error_colors, position_colors
-from .inputs import check_errors, check_map, describe
-from .rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
+from jaxsmw.report.colors import PLAIN, error_colors, position_colors
+from jaxsmw.report.inputs import check_errors, check_map, describe
+from jaxsmw.report.rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,10 +17,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.mesh import Mesh
-
-from .colors import PLAIN, error_colors, position_colors
-from .inputs import check_errors, check_map, describe
-from .rendering import ELEVATION, Axis, choose_azimuth, stand_pair
+from jaxsmw.report.colors import PLAIN, error_colors, position_colors
+from jaxsmw.report.inputs import check_errors, check_map, describe
+from jaxsmw.report.rendering import ELEVATION, Axis, choose_azimuth, stand_pair
 
 
 def write_page(

@@ -13,8 +13,7 @@ from scipy.ndimage import uniform_filter
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-
-from .colors import linear_to_srgb, srgb_to_linear
+from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 

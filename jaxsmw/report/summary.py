@@ -18,7 +18,7 @@ from jaxtyping import Float, Float64
 from jaxsmw.core.filters import FilterBank
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.metrics import GeodesicError
+from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.files import atomic_write
 from jaxsmw.matching import Correspondence
 from jaxsmw.report.figures import (
@@ -33,8 +33,6 @@ from jaxsmw.report.rendering import Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_CURVE_END = 0.25
 
 
 def write_report(
@@ -99,7 +97,12 @@ def write_report(
         figures=[(caption, (directory / f"{name}.png").read_bytes()) for name, caption in captions.items()],
         up=up,
     )
-    summary = {"settings": dict(settings or {}), "result": facts, "provenance": provenance()}
+    summary = {
+        "settings": dict(settings or {}),
+        "result": facts,
+        "errors": {name: error.as_dictionary() for name, error in errors.items()},
+        "provenance": provenance(),
+    }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
 
@@ -113,7 +116,7 @@ def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
     """The correspondence quality curves of some maps, with their mean errors."""
-    thresholds = np.linspace(0, _CURVE_END, 251)
+    thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
     return draw_quality_curves(
         {
             name: (thresholds, error.correspondence_quality_curve(thresholds))
@@ -130,7 +133,9 @@ def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError
         "functional map": "{} x {}".format(*correspondence.functional_map.shape),
         "iterations": str(correspondence.iterations),
     }
-    facts |= {f"mean error, {name}": str(error) for name, error in errors.items()}
+    for name, error in errors.items():
+        facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
+        facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
 
 
