@@ -38,6 +38,10 @@ _SIGNATURES = {
     "wavelet": wavelet_signature,
 }
 
+# Distances to landmarks beside SHOT descriptors, which are unit vectors: 1/2 sqrt(area) weighs as much as a
+# SHOT descriptor's length. Between 1 and 3 the starts on real pairs hardly change.
+_LANDMARK_WEIGHT = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
@@ -91,8 +95,8 @@ def match(
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
     - `init`: where to start: `"shot"`, `"wks"`, `"hks"` or `"wavelet"` for nearest neighbours of that
       descriptor (only SHOT tells left from right); an array (m,) of vertices of Y for a map of your own;
-      an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in
-      geodesic distance to them (four or more, spread over the body and its sides).
+      an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
+      and in geodesic distance to the landmarks (a few, on both sides of the body).
     - `number_of_eigenvectors`: k of both shapes.
     - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
     - `iterations`: how many; at least 1.
@@ -189,7 +193,10 @@ def initial_map(
     nearest = nearest_neighbor(
         jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=spectrum_y.mask
     )
-    return _extend_to_unused(mesh_x, np.asarray(nearest).astype(np.int64))
+    start = np.asarray(nearest).astype(np.int64)
+    if not isinstance(init, str):
+        start[given[:, 0]] = given[:, 1]
+    return _extend_to_unused(mesh_x, start)
 
 
 def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
@@ -212,8 +219,8 @@ def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndar
 
 def _landmark_features(
     landmarks: np.ndarray, mesh_x: Mesh, mesh_y: Mesh
-) -> tuple[Float[np.ndarray, "m l"], Float[np.ndarray, "n l"]]:
-    """Geodesic distances to each landmark, in units of the square root of the area."""
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+    """SHOT, and geodesic distances to each landmark in units of the square root of the area."""
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
             f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) "
@@ -230,7 +237,8 @@ def _landmark_features(
             )
         distances = geodesic_distances(mesh, vertices.astype(np.int64)).T / np.sqrt(mesh.area)
         # Another component is farther than anything on the landmark's own.
-        features.append(np.where(np.isfinite(distances), distances, 100.0))
+        distances = np.where(np.isfinite(distances), distances, 100.0)
+        features.append(np.hstack([shot_descriptors(mesh), _LANDMARK_WEIGHT * distances]))
     return features[0], features[1]
 
 

@@ -84,7 +84,7 @@ def test_landmarks_are_matched_to_each_other(pair):
     spectra = [compute_spectrum(mesh, 30) for mesh in (mesh_x, mesh_y)]
     start = initial_map(mesh_x, mesh_y, *spectra, init=landmarks)
     np.testing.assert_array_equal(start[landmarks[:, 0]], landmarks[:, 1])
-    assert mean_error(mesh_y, start, truth) < 0.05
+    assert mean_error(mesh_y, start, truth) < 0.03
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
-from .mesh import Mesh
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
 
 _Vector = tuple[float, float, float]
 
@@ -77,7 +77,7 @@ class _Tube:
     thickness: float  # half of a plate's
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance to the nearest link of the chain."""
+        """Signed distance (p,) to the nearest link of the chain."""
         result = np.full(len(points), np.inf)
         for i, axis in enumerate(np.diff(self.centers, axis=0)):
             relative = planar = points - self.centers[i]
@@ -102,6 +102,7 @@ class _Tube:
 
 
 def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
+    """The minimum, rounded by a parabola where the two differ by less than the width."""
     overlap = np.maximum(1 - np.abs(a - b) / width, 0)
     return np.minimum(a, b) - overlap**2 * (width / 4)
 
@@ -258,15 +259,15 @@ def _hulls(chain: np.ndarray) -> np.ndarray:
 def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Marching cubes on a randomly turned and shifted grid that is refined near the skin only."""
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
-    corners = np.array(
-        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    )
-    level = int(np.log2(_REACH / spacing / 1.3))
+    square = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    corners = np.array([(*corner, top) for top in (0, 1) for corner in square])
+    # A cell may hold some of the skin if the field at its center is less than 1.3 times its width: half its
+    # diagonal is 0.87, and the field can overrate distances.
+    level = int(np.log2(_REACH / (1.3 * spacing)))
     extent = int(np.ceil(body.extent / spacing / 2**level)) + 1
     cells = np.stack(np.meshgrid(*[np.arange(-extent, extent)] * 3), axis=-1).reshape(-1, 3)
     for width in 2 ** np.arange(level, -1, -1):
         centers = ((cells + 0.5) * width + shift) * spacing @ turn
-        # Half a cell's diagonal is 0.87 of its width; the field may overrate distances by half.
         cells = cells[np.abs(body.signed_distance(centers)) < 1.3 * width * spacing]
         if width > 1:
             cells = (2 * cells[:, None] + corners).reshape(-1, 3)
@@ -290,10 +291,8 @@ def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         before, after = _unit_normals(vertices[faces[sides.T]]), _unit_normals(vertices[flipped])
         folds = np.einsum("sex,tex->ste", before, after).min(axis=(0, 1)) < 0.3
         arms = vertices[tip] - vertices[apex], vertices[tip[::-1]] - vertices[apex]
-        excess = (
-            np.arctan2(np.linalg.norm(np.cross(*arms), axis=2), (arms[0] * arms[1]).sum(axis=2)).sum(axis=0)
-            - np.pi
-        )
+        opposite = np.arctan2(np.linalg.norm(np.cross(*arms), axis=2), (arms[0] * arms[1]).sum(axis=2))
+        excess = opposite.sum(axis=0) - np.pi
         key, known = (np.sort(pairs, axis=1) @ [len(vertices), 1] for pairs in (apex.T, edges))
         candidates = np.flatnonzero((excess > 1e-6) & ~folds & ~np.isin(key, known))
         candidates = candidates[np.argsort(-excess[candidates], kind="stable")]
@@ -317,7 +316,7 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     """Well-shaped triangles with `count` vertices on the body at rest."""
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes puts 1.5 vertices on a square of the grid: aim for four times those wanted.
+    # Marching cubes puts 1.5 vertices on a grid square's area: aim for four times those wanted.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     while True:
         vertices, faces = _isosurface(body, spacing, random)
@@ -415,10 +414,10 @@ def _biped(body: _Body) -> None:
     limb("head", "neck", "0 1.47 .02 .165, 0 1.57 .01 .17", blend=0.05)
     add("0 1.405 .09 .09, 0 1.385 .135 .055", blend=0.05)  # chin
     add(".08 1.445 .1 .075, .09 1.44 .1 .06", blend=0.05)  # cheek
-    add("0 1.54 .165 .03, 0 1.49 .22 .045", blend=0.03)  # nose
-    add(".084 1.545 .15 .048, .086 1.543 .155 .048", blend=0.008)  # eye
-    add(".05 1.615 .145 .028, .125 1.615 .1 .022", blend=0.04)  # brow
-    add("0 1.4 .21 .022, .04 1.405 .195 .022, .075 1.425 .18 .018", blend=0.015, carved=True)  # mouth
+    add("0 1.555 .165 .03, 0 1.505 .212 .042", blend=0.03)  # nose
+    add(".08 1.562 .142 .046, .081 1.56 .148 .046", blend=0.008)  # eye
+    add(".05 1.628 .14 .028, .125 1.628 .095 .022", blend=0.04)  # brow
+    add("0 1.4 .202 .024, .045 1.41 .185 .022, .085 1.45 .172 .018", blend=0.015, carved=True)  # mouth
     ear = ".14 1.51 -.01 .075, .27 1.58 -.05 .065, .4 1.68 -.09 .022"
     add(ear, blend=0.04, normal=(0.35, 0, 1), thickness=0.035, joint="head")
     add(".21 1.55 .035 .045, .29 1.6 .01 .04, .35 1.645 -.02 .01", blend=0.03, carved=True)
@@ -577,7 +576,7 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
-        raise InputError(f"pose {pose!r} is unknown for a {kind}: choose one of {', '.join(CREATURES[kind])}")
+        raise InputError(f"Pose {pose!r} of a {kind} is unknown: choose one of {', '.join(CREATURES[kind])}.")
     body = _grown(kind, seed)
     rest, faces = _triangulated(body, vertices, _random(seed, "source"))
     return _posed(body, rest, faces, kind, pose, seed)
@@ -621,17 +620,14 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
 
 def _check(kind: str, vertices: int, seed: int) -> None:
     if kind not in CREATURES:
-        raise InputError(f"creature {kind!r} is unknown: choose one of {', '.join(CREATURES)}")
-    try:
-        vertices, seed = operator.index(vertices), operator.index(seed)
-    except TypeError:
-        raise InputError("vertices and seed of a creature must be integers") from None
-    if vertices < _MINIMUM_VERTICES:
-        raise InputError(
-            f"{vertices} vertices are too few for a creature: ask for {_MINIMUM_VERTICES} or more"
-        )
-    if seed < 0:
-        raise InputError(f"the seed of a creature is {seed}: choose one that is not negative")
+        raise InputError(f"Creature {kind!r} is unknown: choose one of {', '.join(CREATURES)}.")
+    for name, value, least in (("number of vertices", vertices, _MINIMUM_VERTICES), ("seed", seed, 0)):
+        try:
+            enough = operator.index(value) >= least
+        except TypeError:
+            enough = False
+        if not enough:
+            raise InputError(f"The {name} of a creature is {value!r}: give an integer of {least} or more.")
 
 
 def _random(seed: int, purpose: str) -> np.random.Generator:
