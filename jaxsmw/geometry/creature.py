@@ -8,7 +8,6 @@ poses therefore sample two smooth surfaces, and the rest position says which of 
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -143,7 +142,7 @@ class _Body:
         blend: float,
         carved: bool = False,
         normal: _Vector | None = None,
-        thickness: float = 0,
+        thickness: float = 0.0,
         joint: str = "",
     ) -> None:
         """Add or carve a tube, or a plate, through the balls; what sticks out far names its `joint`."""
@@ -318,17 +317,19 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     area = igl.doublearea(vertices, faces).sum() / 2
     # Marching cubes puts 1.5 vertices on a grid square's area: aim for four times those wanted.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
-    while True:
+    for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
         if igl.facet_components(faces)[0] == 1 and 2 * len(vertices) - len(faces) == 4:  # like a sphere
             break
         spacing *= 0.8  # a grid can tear, or bridge, what is thinner than its cells
+    else:
+        raise InputError("The creature of this seed has parts that touch each other: choose another seed.")
     # Collapse the shortest edges, in position and (a little) in normal: curved places stay denser.
     features = np.hstack([vertices, 0.07 * body.project(vertices)[1]])
     features, faces, _, _ = igl.decimate(
         np.asfortranarray(features), np.asfortranarray(faces, dtype=np.int32), 2 * count - 4
     )
-    vertices, faces = features[:, :3].copy(), faces.copy(order="C")
+    vertices, faces = features[:, :3].copy(order="C"), faces.astype(np.int64, order="C")
     for _ in range(3):
         faces = _flipped_to_delaunay(vertices, faces)
         ends = igl.edges(faces).T
@@ -361,7 +362,7 @@ def _quadruped(body: _Body) -> None:
     add(".098 1.262 .705 .054, .1 1.26 .715 .052", blend=0.006)  # eye
     add(".05 1.325 .7 .03, .12 1.318 .65 .024", blend=0.04)  # brow
     ear = ".1 1.32 .5 .095, .15 1.47 .475 .075, .175 1.6 .465 .022"
-    add(ear, blend=0.04, normal=(0.35, 0, 1), thickness=0.035, joint="head")
+    add(ear, blend=0.04, normal=(0.35, 0.0, 1.0), thickness=0.035, joint="head")
     add(".112 1.38 .56 .05, .16 1.5 .53 .045, .175 1.56 .52 .014", blend=0.03, carved=True)
     tail = "0 .86 -.52 .05, 0 .93 -.74 .09, 0 .91 -1 .135, 0 .86 -1.22 .12, 0 .9 -1.46 .025"
     limb("tail1 tail2 tail3 tail4", "hips", tail, blend=0.05)
@@ -393,7 +394,7 @@ _QUADRUPED_POSES = {
         left_shoulder -40; left_elbow -55; left_wrist 75; left_paw 25; left_hip -6; right_hip 14; chest -4 8;
         nape -8 24; neck -6 24 6; head 4 26 14; tail1 35; tail2 20 -15; tail3 12 -20; tail4 10 -25""",
     "sit": """
-        hips -42; chest -8; shoulder 32; elbow 14; wrist 4; hip 4 8 8; knee 28; hock -48; foot 62;
+        hips -42; chest -8; shoulder 24; elbow 18; wrist 6; hip 4 8 8; knee 28; hock -48; foot 62;
         nape 16 -10; neck 14 -14; head 20 -16 -10; tail1 20 20; tail2 10 26; tail3 0 26; tail4 0 26""",
     "bow": """
         hips 14; chest 14; shoulder -58; elbow -4; wrist 48; paw 10; hip -18; knee 4;
@@ -419,14 +420,14 @@ def _biped(body: _Body) -> None:
     add(".05 1.628 .14 .028, .125 1.628 .095 .022", blend=0.04)  # brow
     add("0 1.4 .202 .024, .045 1.41 .185 .022, .085 1.45 .172 .018", blend=0.015, carved=True)  # mouth
     ear = ".14 1.51 -.01 .075, .27 1.58 -.05 .065, .4 1.68 -.09 .022"
-    add(ear, blend=0.04, normal=(0.35, 0, 1), thickness=0.035, joint="head")
+    add(ear, blend=0.04, normal=(0.35, 0.0, 1.0), thickness=0.035, joint="head")
     add(".21 1.55 .035 .045, .29 1.6 .01 .04, .35 1.645 -.02 .01", blend=0.03, carved=True)
     for y, z in ((1.65, 0.1), (1.68, 0.02), (1.66, -0.07), (1.6, -0.14)):  # crest
         add(f"0 {y} {z} .05, 0 {y + 0.09} {z - 0.06} .02", blend=0.03)
     arm = ".19 1.19 -.01 .078, .4 1.02 -.02 .052, .6 .86 .02 .045, .68 .795 .03 .05, .77 .71 .04 .03"
     limb("shoulder elbow wrist fingers", "chest", arm, blend=0.06)
     add(".24 1.17 0 .05, .33 1.09 .01 .045", blend=0.04)  # biceps
-    add(".62 .845 .02 .055, .69 .785 .03 .078", blend=0.03, normal=(0.62, 0.78, 0), thickness=0.04)  # palm
+    add(".62 .845 .02 .055, .69 .785 .03 .078", blend=0.03, normal=(0.62, 0.78, 0.0), thickness=0.04)  # palm
     for base, middle, tip in ((-0.025, -0.053, -0.07), (0.03, 0.035, 0.04), (0.085, 0.123, 0.15)):  # fingers
         finger = f".69 .785 {base} .03, .75 .73 {middle} .026, .795 .67 {tip} .023"
         add(finger, blend=0.01, joint="fingers")
@@ -479,11 +480,11 @@ def _dragon(body: _Body) -> None:
     horn = ".085 1.391 .509 .061, .122 1.525 .387 .046, .159 1.598 .216 .024"
     add(horn, blend=0.025, joint="head")
     ear = ".134 1.22 .533 .073, .244 1.244 .436 .061, .329 1.293 .35 .024"
-    add(ear, blend=0.03, normal=(0.5, 0, 1), thickness=0.03, joint="head")
+    add(ear, blend=0.03, normal=(0.5, 0.0, 1.0), thickness=0.03, joint="head")
     tail = "0 .56 -.48 .15, 0 .48 -.74 .12, 0 .36 -1 .09, 0 .28 -1.26 .068, 0 .28 -1.52 .05, 0 .34 -1.76 .035"
     limb("tail1 tail2 tail3 tail4 tail5", "hips", tail, blend=0.08)
     barb = "0 .33 -1.7 .045, 0 .36 -1.85 .09, 0 .41 -2.05 .025"
-    add(barb, blend=0.02, normal=(0, 1, -0.25), thickness=0.035, joint="tail5")
+    add(barb, blend=0.02, normal=(0.0, 1.0, -0.25), thickness=0.035, joint="tail5")
     for plate in (  # from the neck to the tail
         "0 1.23 .49 .07, 0 1.28 .388 .025",
         "0 1.05 .48 .07, 0 1.11 .36 .025",
@@ -499,7 +500,7 @@ def _dragon(body: _Body) -> None:
         "0 .345 -1.17 .043, 0 .415 -1.205 .022",
         "0 .305 -1.36 .04, 0 .365 -1.39 .022",
     ):
-        add(plate, blend=0.015, normal=(1, 0, 0), thickness=0.03)
+        add(plate, blend=0.015, normal=(1.0, 0.0, 0.0), thickness=0.03)
     limb("shoulder elbow", "chest", ".16 .54 .2 .12, .22 .32 .12 .085, .22 .09 .16 .065", blend=0.06)
     limb("wrist", "elbow", ".22 .075 .17 .065, .22 .065 .26 .06", blend=0.05)
     limb("hip knee", "hips", ".15 .52 -.36 .155, .24 .32 -.26 .115, .22 .09 -.42 .065", blend=0.06)
@@ -613,7 +614,7 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     return CreaturePair(
         source=_posed(body, rest, faces, kind, source_pose, seed),
         target=_posed(body, target_rest, target_faces, kind, target_pose, seed),
-        target_faces=nearest,
+        target_faces=nearest.astype(np.int64),
         target_weights=weights / weights.sum(axis=1, keepdims=True),
     )
 
@@ -622,12 +623,8 @@ def _check(kind: str, vertices: int, seed: int) -> None:
     if kind not in CREATURES:
         raise InputError(f"Creature {kind!r} is unknown: choose one of {', '.join(CREATURES)}.")
     for name, value, least in (("number of vertices", vertices, _MINIMUM_VERTICES), ("seed", seed, 0)):
-        try:
-            enough = operator.index(value) >= least
-        except TypeError:
-            enough = False
-        if not enough:
-            raise InputError(f"The {name} of a creature is {value!r}: give an integer of {least} or more.")
+        if value < least:
+            raise InputError(f"The {name} of a creature is {value}: give {least} or more.")
 
 
 def _random(seed: int, purpose: str) -> np.random.Generator:
