@@ -10,8 +10,8 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.spectrum import Spectrum
 
 # Queries scored at once, and database rows per chunk. Measured on two CPU cores (scripts/benchmark_speed.py):
-# a block of scores has to stay in the cache, and a chunk's maximum vectorises where an argmax does not.
-_BLOCK = 256
+# a block of scores has to stay in the cache, and a maximum over a chunk vectorises where an argmax does not.
+_BLOCK = 128
 _CHUNK = 64
 
 
@@ -44,19 +44,20 @@ def nearest_neighbor(
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         # GPUs would otherwise multiply in less than float32, and the ranking with it.
-        products = jnp.matmul(block, rows.T, precision=lax.Precision.HIGHEST)
-        scores = (products - half_norms[None, :]).reshape(-1, chunks, _CHUNK)
-        chunk_scores = jnp.max(scores, axis=2)
-        first = jnp.argmax(chunk_scores, axis=1)
-        is_first = jnp.arange(chunks)[None, :] == first[:, None]
-        second = jnp.argmax(jnp.where(is_first, -jnp.inf, chunk_scores), axis=1)
-        best_chunks = jnp.stack([first, second], axis=1)
-        chunk_rows = jnp.take_along_axis(scores, best_chunks[:, :, None], axis=1)
+        products = jnp.matmul(rows, block.T, precision=lax.Precision.HIGHEST)
+        # Queries last: a maximum over chunks then runs over them side by side.
+        scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, _BLOCK)
+        chunk_scores = jnp.max(scores, axis=1)
+        first = jnp.argmax(chunk_scores, axis=0)
+        is_first = jnp.arange(chunks)[:, None] == first[None, :]
+        second = jnp.argmax(jnp.where(is_first, -jnp.inf, chunk_scores), axis=0)
+        best_chunks = jnp.stack([first, second])
+        chunk_rows = scores[best_chunks, :, jnp.arange(_BLOCK)[None, :]]
         candidates = best_chunks * _CHUNK + jnp.argmax(chunk_rows, axis=2)
-        distances = jnp.sum((block[:, None, :] - rows[candidates]) ** 2, axis=2)
+        distances = jnp.sum((block[None, :, :] - rows[candidates]) ** 2, axis=2)
         distances = jnp.where(jnp.isinf(half_norms[candidates]), jnp.inf, distances)
-        nearest = jnp.min(distances, axis=1, keepdims=True)
-        return jnp.min(jnp.where(distances == nearest, candidates, n), axis=1).astype(jnp.int32)
+        nearest = jnp.min(distances, axis=0, keepdims=True)
+        return jnp.min(jnp.where(distances == nearest, candidates, n), axis=0).astype(jnp.int32)
 
     padded = jnp.pad(queries, ((0, blocks * _BLOCK - m), (0, 0)))
     return lax.map(search, padded.reshape(blocks, _BLOCK, d)).reshape(-1)[:m]

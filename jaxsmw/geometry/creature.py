@@ -573,7 +573,8 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
     **Returns:** the mesh, exactly `vertices` vertices, about 1.5 units high; x is its left, y up, z forward.
 
-    **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed.
+    **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, and for a
+    seed whose individual grew into itself (rare: none among the first 250).
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
@@ -598,7 +599,7 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
 
     **Returns:** the `CreaturePair`.
 
-    **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed.
+    **Raises:** `InputError` as `creature`.
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")
