@@ -7,6 +7,7 @@ from .core.spectrum import Spectrum
 from .errors import InputError
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
+from .geometry.creature import CreaturePair, creature_pair
 from .geometry.eigenbasis import compute_spectrum
 from .geometry.geodesics import SurfacePoints, geodesic_distances
 from .geometry.mesh import Mesh, diagnose, make_mesh
@@ -19,6 +20,7 @@ __version__: str
 __all__ = [
     "RESULTS",
     "Correspondence",
+    "CreaturePair",
     "FilterBank",
     "GeodesicError",
     "GroundTruth",
@@ -33,6 +35,7 @@ __all__ = [
     "WaveletPreservation",
     "compute_spectrum",
     "coverage",
+    "creature_pair",
     "decode",
     "diagnose",
     "encode",

@@ -274,14 +274,13 @@ def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
 def _demo(options: argparse.Namespace) -> None:
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
     from jaxsmw.geometry.creature import creature_pair
-    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.geometry.mesh_files import write_mesh
     from jaxsmw.report.summary import make_directory
 
     directory = make_directory(options.output)
     logging.getLogger("jaxsmw").info("making the creature")
     pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
-    truth = GroundTruth.of_all_vertices(SurfacePoints(pair.target_faces, pair.target_weights))
+    truth = GroundTruth.of_all_vertices(pair.truth)
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
     write_ground_truth(directory / "truth.baryc_gt", truth)

@@ -117,8 +117,8 @@ def test_the_same_seed_gives_the_same_bits():
     for mesh, same in ((first.source, again.source), (first.target, again.target)):
         assert np.array_equal(mesh.vertices, same.vertices) and np.array_equal(mesh.faces, same.faces)
         assert mesh.name == same.name
-    assert np.array_equal(first.target_faces, again.target_faces)
-    assert np.array_equal(first.target_weights, again.target_weights)
+    assert np.array_equal(first.truth.faces, again.truth.faces)
+    assert np.array_equal(first.truth.weights, again.truth.weights)
 
 
 def test_another_seed_gives_another_individual(kind, rest):
@@ -157,30 +157,30 @@ def test_a_vertex_is_the_same_point_in_every_pose(kind, pair, rest):
 def test_the_truth_is_true(kind, pair):
     """The source vertices, bent into the target's pose, lie where the truth says."""
     m, size = len(pair.source.vertices), np.sqrt(pair.target.area)
-    assert pair.target_faces.shape == (m,) and pair.target_weights.shape == (m, 3)
-    assert pair.target_faces.min() >= 0 and pair.target_faces.max() < len(pair.target.faces)
-    assert pair.target_weights.min() >= 0
-    np.testing.assert_allclose(pair.target_weights.sum(axis=1), 1, atol=1e-12)
+    assert pair.truth.faces.shape == (m,) and pair.truth.weights.shape == (m, 3)
+    assert pair.truth.faces.min() >= 0 and pair.truth.faces.max() < len(pair.target.faces)
+    assert pair.truth.weights.min() >= 0
+    np.testing.assert_allclose(pair.truth.weights.sum(axis=1), 1, atol=1e-12)
 
     moved = creature(kind, vertices=1200, pose=pose_of(pair.target), seed=4).vertices
-    error = np.linalg.norm(pair.target_points - moved, axis=1) / size
+    error = np.linalg.norm(pair.truth.positions(pair.target) - moved, axis=1) / size
     assert error.mean() < 0.004 and error.max() < 0.03
     # Neighbours stay neighbours: no vertex is projected onto another limb, or through a thin one.
     edges = igl.edges(pair.source.faces)
-    ends = pair.target_points[edges]
+    ends = pair.truth.positions(pair.target)[edges]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 0.2 * size
-    normals = igl.per_face_normals(pair.target.vertices, pair.target.faces, np.zeros(3))[pair.target_faces]
+    normals = igl.per_face_normals(pair.target.vertices, pair.target.faces, np.zeros(3))[pair.truth.faces]
     agreement = np.einsum("mx,mx->m", normals, igl.per_vertex_normals(moved, pair.source.faces))
     assert (agreement < 0).mean() < 0.02 and np.median(agreement) > 0.95
 
 
 def test_the_truth_as_vertices(pair):
-    corners = pair.target.faces[pair.target_faces]
-    assert (pair.target_vertices[:, None] == corners).any(axis=1).all()
-    offsets = np.linalg.norm(pair.target.vertices[corners] - pair.target_points[:, None], axis=2)
-    chosen = np.linalg.norm(pair.target.vertices[pair.target_vertices] - pair.target_points, axis=1)
+    corners = pair.target.faces[pair.truth.faces]
+    assert (pair.true_map[:, None] == corners).any(axis=1).all()
+    offsets = np.linalg.norm(pair.target.vertices[corners] - pair.truth.positions(pair.target)[:, None], axis=2)
+    chosen = np.linalg.norm(pair.target.vertices[pair.true_map] - pair.truth.positions(pair.target), axis=1)
     np.testing.assert_array_equal(chosen, offsets.min(axis=1))
-    assert len(np.unique(pair.target_vertices)) > 0.5 * len(pair.target.vertices)
+    assert len(np.unique(pair.true_map)) > 0.5 * len(pair.target.vertices)
 
 
 def test_the_two_meshes_have_nearly_the_same_spectrum(pair):

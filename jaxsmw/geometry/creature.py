@@ -20,6 +20,7 @@ from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 
 _Vector = tuple[float, float, float]
@@ -38,27 +39,19 @@ class CreaturePair:
 
     - `source`: mesh with m vertices.
     - `target`: mesh with n vertices.
-    - `target_faces`: for each source vertex the target triangle (m,) that holds the same point of the body.
-    - `target_weights`: its barycentric weights (m, 3) in that triangle: not negative, sum 1.
+    - `truth`: for each source vertex the same point of the body on the target (m).
     """
 
     source: Mesh
     target: Mesh
-    target_faces: Int64[np.ndarray, " m"]
-    target_weights: Float64[np.ndarray, "m 3"]
+    truth: SurfacePoints
 
     @cached_property
-    def target_points(self) -> Float64[np.ndarray, "m 3"]:
-        """For each source vertex, the same point of the body on the target mesh."""
-        corners = self.target.vertices[self.target.faces[self.target_faces]]
-        return np.einsum("mi,mix->mx", self.target_weights, corners)
-
-    @cached_property
-    def target_vertices(self) -> Int64[np.ndarray, " m"]:
-        """For each source vertex the target vertex nearest to its point, of the true triangle's corners."""
-        corners = self.target.faces[self.target_faces]
-        offsets = np.linalg.norm(self.target.vertices[corners] - self.target_points[:, None], axis=2)
-        return corners[np.arange(len(corners)), offsets.argmin(axis=1)]
+    def true_map(self) -> Int64[np.ndarray, " m"]:
+        """The truth as a pointwise map: the nearest of the corners of each point's triangle."""
+        corners = self.target.faces[self.truth.faces]
+        offsets = self.target.vertices[corners] - self.truth.positions(self.target)[:, None]
+        return corners[np.arange(len(corners)), np.linalg.norm(offsets, axis=2).argmin(axis=1)]
 
 
 # ------------------------------------------------------------------------------------------- implicit bodies
@@ -397,7 +390,7 @@ _QUADRUPED_POSES = {
         hips -42; chest -8; shoulder 24; elbow 18; wrist 6; hip 4 8 8; knee 28; hock -48; foot 62;
         nape 16 -10; neck 14 -14; head 20 -16 -10; tail1 20 20; tail2 10 26; tail3 0 26; tail4 0 26""",
     "bow": """
-        hips 14; chest 14; shoulder -58; elbow -4; wrist 48; paw 10; hip -18; knee 4;
+        hips 14; chest 14; shoulder -58; elbow -4; wrist 24; paw 10; hip -18; knee 4;
         nape -26; neck -16 10; head -2 14 8; tail1 30; tail2 25; tail3 10 15; tail4 0 20""",
 }
 
@@ -615,8 +608,7 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     return CreaturePair(
         source=_posed(body, rest, faces, kind, source_pose, seed),
         target=_posed(body, target_rest, target_faces, kind, target_pose, seed),
-        target_faces=nearest.astype(np.int64),
-        target_weights=weights / weights.sum(axis=1, keepdims=True),
+        truth=SurfacePoints(nearest.astype(np.int64), weights / weights.sum(axis=1, keepdims=True)),
     )
 
 
