@@ -177,7 +177,9 @@ def test_the_truth_is_true(kind, pair):
 def test_the_truth_as_vertices(pair):
     corners = pair.target.faces[pair.truth.faces]
     assert (pair.true_map[:, None] == corners).any(axis=1).all()
-    offsets = np.linalg.norm(pair.target.vertices[corners] - pair.truth.positions(pair.target)[:, None], axis=2)
+    offsets = np.linalg.norm(
+        pair.target.vertices[corners] - pair.truth.positions(pair.target)[:, None], axis=2
+    )
     chosen = np.linalg.norm(pair.target.vertices[pair.true_map] - pair.truth.positions(pair.target), axis=1)
     np.testing.assert_array_equal(chosen, offsets.min(axis=1))
     assert len(np.unique(pair.true_map)) > 0.5 * len(pair.target.vertices)

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import igl
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 from scipy.interpolate import PchipInterpolator
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
