@@ -353,7 +353,7 @@ def _conclude(
     for name, error in errors.items():
         print(f"{name + ' map:':12} {error}")
     times = ", ".join(f"{stage} {time:.2f} s" for stage, time in correspondence.seconds.items())
-    print(f"time:        {times}")
+    print(f"time:        {times} (compilation included)")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
