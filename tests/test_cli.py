@@ -1,5 +1,6 @@
 """The command line as a user meets it."""
 
+import functools
 import json
 import re
 import signal
@@ -411,7 +412,9 @@ def test_an_interrupted_run_ends_soon_and_leaves_nothing_behind(pair, tmp_path):
         "--output", tmp_path / "map.txt", "--iterations", "10000000",
     ]  # fmt: skip
     for last_line in ("eigenbases", "refinement"):
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        # A test run in the background ignores the signal, and so would its children.
+        heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as process:
             try:
                 for line in process.stderr:
                     if line.startswith(last_line):
