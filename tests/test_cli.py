@@ -1,6 +1,5 @@
 """The command line as a user meets it."""
 
-import functools
 import json
 import re
 import signal
@@ -407,14 +406,17 @@ def test_numbers_that_went_wrong_exit_with_1(run, pair, tmp_path, monkeypatch):
 
 def test_an_interrupted_run_ends_soon_and_leaves_nothing_behind(pair, tmp_path):
     """Both while Python runs (imports, reading) and within hours of compiled refinement."""
+    # A test run in the background ignores the signal, and so would its children.
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from jaxsmw.cli import main; main(sys.argv[1:])"
+    )
     command = [
-        sys.executable, "-m", "jaxsmw", "match", pair / "x.off", pair / "y.ply",
+        sys.executable, "-c", program, "match", pair / "x.off", pair / "y.ply",
         "--output", tmp_path / "map.txt", "--iterations", "10000000",
     ]  # fmt: skip
     for last_line in ("eigenbases", "refinement"):
-        # A test run in the background ignores the signal, and so would its children.
-        heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as process:
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             try:
                 for line in process.stderr:
                     if line.startswith(last_line):
