@@ -82,6 +82,10 @@ def _say(message: str) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, **settings: Any) -> None:
+        # An abbreviation would mean something else once there are more options.
+        super().__init__(allow_abbrev=False, **settings)
+
     def error(self, message: str) -> NoReturn:
         _say(f"{self.prog}: {message} (see {self.prog} --help)")
         sys.exit(2)
@@ -272,6 +276,9 @@ def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
+    from jaxsmw.report.figures import check_drawable
+
+    check_drawable()
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
     from jaxsmw.geometry.creature import creature_pair
     from jaxsmw.geometry.mesh_files import write_mesh
@@ -293,7 +300,13 @@ def _demo(options: argparse.Namespace) -> None:
 
 def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
+    _, _, init_file = options.init.partition(":")
+    _keep_inputs(options.output, options.source, options.target, init_file, *(options.ground_truth or ()))
     check_writable(options.output)
+    if options.report:
+        from jaxsmw.report.figures import check_drawable
+
+        check_drawable()
     from jaxsmw.evaluation.ground_truth import read_ground_truth, write_pointwise_map
     from jaxsmw.report.summary import make_directory
 
@@ -357,6 +370,8 @@ def _conclude(
 
 
 def _evaluate(options: argparse.Namespace) -> None:
+    for output in filter(None, (options.output, options.figure)):
+        _keep_inputs(output, options.source, options.target, *options.map, *options.ground_truth)
     _check_outputs(options)
     from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
 
@@ -378,6 +393,12 @@ def _evaluate(options: argparse.Namespace) -> None:
         results = {name: error.as_dictionary() for name, error in errors.items()}
         with atomic_write(options.output) as temporary:
             temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
+
+
+def _keep_inputs(output: str, *inputs: str) -> None:
+    """Refuse to write over what is read."""
+    if os.path.realpath(output) in (os.path.realpath(path) for path in inputs if path):
+        raise InputError(f"{output}: is an input and would be overwritten: choose another name.")
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -418,11 +439,12 @@ def _spectrum(options: argparse.Namespace) -> None:
     from jaxsmw.geometry.eigenbasis import eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
     from jaxsmw.geometry.mesh import diagnose
+    from jaxsmw.geometry.mesh_files import read_mesh
 
-    mesh = _read(options.mesh, options)
+    mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
     eigenvalues, eigenvectors, vertex_areas = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian)
-    print(diagnose(mesh))
+    print("\n".join((*mesh.notes, *diagnose(mesh).sentences())))
     print(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
     for start in range(0, len(eigenvalues), 10):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[start : start + 10])

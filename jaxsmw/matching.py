@@ -189,6 +189,11 @@ def initial_map(
         if given.ndim == 1:
             return _extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
         features_x, features_y = _landmark_features(given, mesh_x, mesh_y)
+    if not np.isfinite(features_x).all() or not np.isfinite(features_y).all():
+        raise InputError(
+            f"{mesh_x.name} to {mesh_y.name}: {init!r} descriptors are not defined on these meshes with "
+            f"{len(spectrum_x.eigenvalues)} eigenvectors; ask for more, or start from another map."
+        )
     dtype = spectrum_x.eigenvectors.dtype
     nearest = nearest_neighbor(
         jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=spectrum_y.mask

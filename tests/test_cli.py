@@ -122,6 +122,27 @@ def test_match_and_evaluate(run, pair, tmp_path):
         assert "strips" in evaluated.output
 
 
+def test_a_tiny_mesh_is_told_what_it_lacks(run, tmp_path):
+    (tmp_path / "tetrahedron.off").write_text(OFF.format(4, 4, TRIANGLES, FACES))
+    call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
+    assert_refused(run(*call), naming="between 1 and 3")
+    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="with 1 eigenvectors")
+    assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
+    assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
+
+
+def test_missing_matplotlib_is_told_before_the_work(run, pair, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    meshes = [pair / "x.off", pair / "y.ply"]
+    for arguments in (
+        ["match", *meshes, "--output", tmp_path / "m", "--report", tmp_path / "r"],
+        ["demo", "--output", tmp_path / "demo"],
+        ["spectrum", pair / "x.off", "--figure", tmp_path / "s.png"],
+    ):
+        assert_refused(run(*arguments, "--quiet"), naming="pip install 'jaxsmw[report]'")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_quiet_is_quiet(run, pair, tmp_path):
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet", *SMALL)
     assert outcome.code == 0 and outcome.errors == ""
@@ -225,7 +246,7 @@ def test_seams_are_named_and_welded(run, tmp_path):
     soup = make_mesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
     write_mesh(tmp_path / "soup.off", soup)
     plain = run("spectrum", tmp_path / "soup.off", "--eigenvectors", "5")
-    assert "--weld" in plain.errors and "242 connected components" in plain.output
+    assert "--weld" in plain.output and "242 connected components" in plain.output
     assert (
         "1 connected component"
         in run("spectrum", tmp_path / "soup.off", "--eigenvectors", "5", "--weld").output
@@ -363,6 +384,17 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --ground-truth {p}/x.vts", "half of a pair"),
         ("match {x} {y} --output {t}/m --precision float16", "float16"),
         ("match {x} {y} --output {t}/m --evaluation-samples -3", "at least 1"),
+        ("match {x} {y} --output {x}", "would be overwritten"),
+        (
+            "match {x} {y} --output {p}/../{p.name}/truth.txt --ground-truth {p}/truth.txt",
+            "would be overwritten",
+        ),
+        ("match {x} {y} --output {p}/truth.txt --init map:{p}/truth.txt", "would be overwritten"),
+        (
+            "evaluate {x} {y} {p}/truth.txt --ground-truth {p}/x.vts {p}/y.vts --output {p}/y.vts",
+            "overwritten",
+        ),
+        ("match {x} {y} --out {t}/m", "--output"),
         ("evaluate {x} {y} {p}/truth.txt", "--ground-truth"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/no/e.json", "no/e.json"),
         ("spectrum {x} --eigenvectors 642", "641"),

@@ -297,6 +297,18 @@ def test_too_few_samples_are_named(pair):
     assert refined.result == RESULTS.nonfinite_functional_map
 
 
+def test_settings_that_do_not_exist():
+    for name in ("convention", "pseudo_inverse", "lambda_max"):
+        with pytest.raises((ValueError, TypeError), match=name):
+            WaveletPreservation(**{name: "pullbakc"})
+
+
+def test_needs_one_vertex_per_vertex(pair):
+    x, y, start, _ = pair
+    with pytest.raises(ValueError, match="X has 300 vertices"):
+        refine(x, y, start[:10])
+
+
 def test_needs_an_iteration(pair):
     with pytest.raises(ValueError, match="at least 1 iteration"):
         refine(*pair[:3], iterations=0)

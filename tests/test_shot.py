@@ -101,7 +101,7 @@ def test_unused_and_coincident_vertices(bumpy, descriptors):
 
 def test_too_coarse():
     coarse = make_mesh(*sphere_mesh(1))
-    with pytest.raises(InputError, match="larger radius"):
+    with pytest.raises(InputError, match="--init wks"):
         shot_descriptors(coarse)
     assert np.isfinite(shot_descriptors(coarse, radius=0.5)).all()
     vertices, faces = sphere_mesh(4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from jaxsmw.core.spectrum import Spectrum
 class RESULTS(eqx.Enumeration):
     """How a refinement ended; each failure carries the sentence to show a person."""
 
-    successful = ""
+    successful = "The refinement went through: all numbers are finite."
     nonfinite_spectrum = (
         "A spectrum holds NaN or infinity, so nothing was refined; recompute it and check the mesh it is of."
     )
@@ -138,6 +138,15 @@ class WaveletPreservation(Refiner):
     pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
     lambda_max: Literal["own", "common"] = eqx.field(static=True, default="own")
 
+    def __check_init__(self) -> None:
+        for name, value, choices in (
+            ("convention", self.convention, get_args(Convention)),
+            ("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse)),
+            ("lambda_max", self.lambda_max, ("own", "common")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
+
     def responses(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum
     ) -> tuple[Float[Array, "filters k_x"], Float[Array, "filters k_y"]]:
@@ -228,12 +237,17 @@ def refine(
 
     **Returns:** A `Refinement`. Nothing is raised for bad numbers: check its `result`.
 
-    **Raises:** `ValueError` for fewer than one iteration or samples on one side only.
+    **Raises:** `ValueError` for fewer than one iteration, samples on one side only, or an initial map that is
+    not one vertex per vertex of X.
     """
     if iterations < 1:
         raise ValueError(f"refine needs at least 1 iteration, not {iterations}")
     if (samples_x is None) != (samples_y is None):
         raise ValueError("samples are needed on both shapes or on neither")
+    if pointwise_map.shape != spectrum_x.mask.shape:
+        raise ValueError(
+            f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"
+        )
 
     whole = working = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
     working_map = pointwise_map = pointwise_map.astype(jnp.int32)

@@ -175,7 +175,7 @@ class Diagnosis:
             f"{count_of(self.components, 'connected component')}, {shape}."
         ]
         if self.unused_vertices:
-            found.append(f"{count_of(self.unused_vertices, 'vertex')} in no face: left out of all maps.")
+            found.append(f"{count_of(self.unused_vertices, 'vertex')} in no face: never matched to.")
         if self.boundary_edges:
             found.append(
                 f"{count_of(self.boundary_edges, 'boundary edge')} in "

@@ -56,8 +56,8 @@ def shot_descriptors(mesh: Mesh, *, radius: float = 0.06) -> Float64[np.ndarray,
     if lonely > 0.01:
         fault = (
             f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
-            f"the SHOT radius of {radius} sqrt(area), as the mesh is coarse there; use a larger radius, a "
-            "finer mesh or another initial map."
+            f"the SHOT radius of {radius} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
+            "from another map (init='wks', on the command line --init wks)."
         )
         if lonely > 0.5:
             raise InputError(fault)

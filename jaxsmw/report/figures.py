@@ -271,6 +271,19 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
         figure.savefig(temporary, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
 
 
+def check_drawable() -> None:
+    """Tell now what would make every drawing fail later.
+
+    **Raises:** `InputError` if matplotlib is missing.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            "figures are drawn by matplotlib, which is not installed: pip install 'jaxsmw[report]'"
+        ) from error
+
+
 def check_figure_path(path: str | os.PathLike[str]) -> None:
     """Tell now what would make `save_figure` fail later.
 
@@ -278,6 +291,7 @@ def check_figure_path(path: str | os.PathLike[str]) -> None:
     """
     if Path(path).suffix.lower() not in _METADATA:
         raise InputError(f"{path}: a figure is written as .png, .pdf or .svg; choose one of these endings.")
+    check_drawable()
     check_writable(path)
 
 
@@ -356,14 +370,11 @@ def _draw_error_scale(figure: Figure, limit: float, exceeded: bool) -> None:
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
     """An empty white figure of so many inches with a canvas in memory; for a plot its parts make room."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-    except ImportError as error:
-        raise InputError(
-            "figures are drawn by matplotlib, which is not installed: pip install 'jaxsmw[report]'"
-        ) from error
+    check_drawable()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12) if plot else None
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
