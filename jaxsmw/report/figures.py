@@ -277,7 +277,7 @@ def check_drawable() -> None:
     **Raises:** `InputError` if matplotlib is missing.
     """
     try:
-        import matplotlib  # noqa: F401
+        import matplotlib.backends.backend_agg  # noqa: F401
     except ImportError as error:
         raise InputError(
             "figures are drawn by matplotlib, which is not installed: pip install 'jaxsmw[report]'"
