@@ -461,7 +461,6 @@ def _spectrum(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    check_writable(options.output)
     from jaxsmw.evaluation.ground_truth import read_pointwise_map
     from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
     from jaxsmw.report.page import write_page
@@ -473,8 +472,8 @@ def _render(options: argparse.Namespace) -> None:
         raise InputError(
             f"{options.output}: a page shows a correspondence; give a target mesh and a map too."
         )
-    if not page:
-        check_figure_path(options.output)
+    check = check_writable if page else check_figure_path
+    check(options.output)
     mesh_x = _read(options.source, options)
     if not options.map:
         save_figure(options.output, draw_mesh(mesh_x, up=options.up))
