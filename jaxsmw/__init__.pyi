@@ -1,8 +1,11 @@
-from .core.filters import FilterBank, Meyer, frame_function
-from .core.functional_map import encode, multiscale_kernel, wavelet_energy
+from .core.filters import FilterBank, Meyer
+from .core.frames import frame_function
+from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
 from .core.pointwise_map import decode, nearest_neighbor
-from .core.refinement import RESULTS, History, Refinement, Refiner, WaveletPreservation, refine
+from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
+from .core.results import RESULTS
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from .core.solutions import DescriptorPair, Filtering, LeastSquares, RegularizedLeastSquares, Solution
 from .core.spectrum import Spectrum
 from .errors import InputError
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
@@ -21,15 +24,21 @@ __all__ = [
     "RESULTS",
     "Correspondence",
     "CreaturePair",
+    "DescriptorPair",
     "FilterBank",
+    "Filtering",
     "GeodesicError",
     "GroundTruth",
     "History",
     "InputError",
+    "LeastSquares",
     "Mesh",
     "Meyer",
+    "QuadraticEnergy",
     "Refinement",
     "Refiner",
+    "RegularizedLeastSquares",
+    "Solution",
     "Spectrum",
     "SurfacePoints",
     "WaveletPreservation",

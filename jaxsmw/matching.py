@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jaxsmw.core.pointwise_map import nearest_neighbor
-from jaxsmw.core.refinement import RESULTS, History, Refiner, WaveletPreservation, refine
+from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
+from jaxsmw.core.results import RESULTS
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError

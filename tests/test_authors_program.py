@@ -4,7 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsmw.core.refinement import RESULTS, WaveletPreservation, refine
+from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.solutions import Filtering
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
@@ -39,9 +41,10 @@ def spectrum(reference: dict, side: str, k: int, dtype: type) -> Spectrum:
 def run(reference: dict, setting: str, iterations: int, dtype: type = np.float64, **options):
     x, y = (spectrum(reference, side, SETTINGS[setting], dtype) for side in "xy")
     start = jnp.asarray(reference["T0"].astype(np.int32))
-    names = ("pseudo_inverse", "convention", "lambda_max")
+    names = ("convention", "lambda_max")
     settings = {name: options.pop(name) for name in names if name in options}
-    refiner = WaveletPreservation(**({"pseudo_inverse": "least_squares"} | settings))
+    solution = Filtering(options.pop("pseudo_inverse", "least_squares"))
+    refiner = WaveletPreservation(solution=solution, **settings)
     refined = refine(x, y, start, refiner=refiner, iterations=iterations, **options)
     assert refined.result == RESULTS.successful
     return np.asarray(refined.pointwise_map), np.asarray(refined.functional_map)

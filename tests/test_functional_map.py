@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.filters import Meyer, frame_function
+from jaxsmw.core.filters import Meyer
+from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
+    QuadraticEnergy,
     dual_eigenvectors,
     encode,
     multiscale_kernel,
     wavelet_energy,
 )
+from jaxsmw.core.spectrum import Spectrum
 
 M, N, K_X, K_Y = 60, 50, 12, 9
 
@@ -28,7 +31,7 @@ def pointwise_map():
 
 
 def responses(spectrum, *, tight=True):
-    bank = Meyer(4)(spectrum.eigenvalues, spectrum.eigenvalues[-1])
+    bank = Meyer(4)(spectrum.eigenvalues, spectrum.eigenvalues)
     return bank if tight else bank * jnp.asarray([[1.0], [0.4], [2.0], [1.3]])
 
 
@@ -65,28 +68,142 @@ def test_kernel_is_the_sum_over_scales(pair):
     np.testing.assert_allclose(c * multiscale_kernel(g_x, g_y), over_scales, atol=1e-14)
 
 
-@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
-@pytest.mark.parametrize("tight", [True, False])
-def test_energy_is_the_sum_over_scales_and_vertices(pair, pointwise_map, convention, tight):
+def stacked(pair, pointwise_map, convention, norm):
+    """What every vertex of X feeds to C and should get back, and its weight, straight from the definition."""
     x, y = pair
-    g_x, g_y = responses(x, tight=tight), responses(y, tight=tight)
-    t = np.asarray(pointwise_map)
-    areas_x, areas_y = np.asarray(x.vertex_areas), np.asarray(y.vertex_areas)
+    p = permutation_matrix(pointwise_map)
+    areas_x = np.asarray(x.vertex_areas)
     if convention == "pullback":
-        fed, returned, g_in, g_out = y.eigenvectors[t], x.eigenvectors, g_y, g_x
-    else:
-        # Columns of Phi_X^+ and of Phi_Y^+ P^T, each divided by the square root of the vertex area.
-        fed = x.eigenvectors
-        returned = (areas_y[:, None] * y.eigenvectors)[t] / areas_x[:, None]
-        g_in, g_out = g_x, g_y
-    c = np.random.default_rng(0).normal(size=(g_out.shape[1], g_in.shape[1]))
-    brute = 0.0
-    for a, b in zip(g_in, g_out, strict=True):
-        for vertex in range(M):
-            mismatch = c @ (a * fed[vertex]) - b * returned[vertex]
-            brute += areas_x[vertex] * np.sum(mismatch**2)
-    energy = wavelet_energy(jnp.asarray(c), pointwise_map, x, y, g_x, g_y, convention=convention)
-    np.testing.assert_allclose(energy, brute, rtol=1e-12)
+        fed, returned = p @ y.eigenvectors, np.asarray(x.eigenvectors)
+    else:  # columns of Phi_X^+ and of Phi_Y^+ P^T
+        fed = (np.asarray(x.eigenvectors).T * areas_x).T
+        returned = p @ (np.asarray(y.eigenvectors) * np.asarray(y.vertex_areas)[:, None])
+    if norm == "frobenius":
+        return fed, returned, np.ones(M)
+    if convention == "pushforward":
+        fed, returned = (columns / np.sqrt(areas_x)[:, None] for columns in (fed, returned))
+        return fed, returned, np.ones(M)
+    return fed, returned, areas_x
+
+
+def tall_system(pair, pointwise_map, g_x, g_y, convention, norm):
+    """All scales and vertices below each other: rows C-independent of any algebra on moments."""
+    fed, returned, weights = stacked(pair, pointwise_map, convention, norm)
+    g_in, g_out = (g_y, g_x) if convention == "pullback" else (g_x, g_y)
+    root = np.sqrt(weights)[:, None]
+    left = np.concatenate([root * fed * np.asarray(g)[None] for g in g_in])
+    right = np.concatenate([root * returned * np.asarray(g)[None] for g in g_out])
+    return left, right
+
+
+CASES = [
+    (convention, norm, tight)
+    for convention in ("pullback", "pushforward")
+    for norm in ("area", "frobenius")
+    for tight in (True, False)
+]
+
+
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}, {case[1]}, {'tight' if case[2] else 'general'}")
+def case(request, pair, pointwise_map):
+    convention, norm, tight = request.param
+    g_x, g_y = (responses(spectrum, tight=tight) for spectrum in pair)
+    energy = wavelet_energy(pointwise_map, *pair, g_x, g_y, convention=convention, norm=norm)
+    return energy, tall_system(pair, pointwise_map, g_x, g_y, convention, norm)
+
+
+def test_energy_is_the_sum_over_scales_and_vertices(case):
+    energy, (left, right) = case
+    c = np.random.default_rng(0).normal(size=energy.cross.shape)
+    np.testing.assert_allclose(energy(jnp.asarray(c)), np.sum((left @ c.T - right) ** 2), rtol=1e-12)
+
+
+def test_minimizer_is_the_least_squares_solution_of_the_tall_system(case):
+    energy, (left, right) = case
+    brute, *_ = np.linalg.lstsq(left, right)
+    np.testing.assert_allclose(jax.jit(lambda e: e.minimizer())(energy), brute.T, atol=1e-9)
+    singular_values = np.linalg.svd(left, compute_uv=False)
+    condition = (singular_values[0] / singular_values[-1]) ** 2
+    np.testing.assert_allclose(energy.condition_number(), condition, rtol=1e-8)
+
+
+def test_nothing_scores_below_the_minimizer(case):
+    energy, _ = case
+    generator = np.random.default_rng(1)
+    best = energy.minimizer()
+    np.testing.assert_allclose(jax.grad(energy)(best), 0, atol=1e-9)
+    for size in (1e-3, 1e-1, 1.0):
+        assert energy(best + size * generator.normal(size=best.shape)) > energy(best)
+    # Gradient descent from elsewhere comes closer and closer, never below.
+    c = jnp.asarray(generator.normal(size=best.shape))
+    step = 1 / jnp.linalg.eigvalsh(energy.gram)[-1]
+    before = jnp.inf
+    for _ in range(5):
+        c = c - 0.3 * step * jax.grad(energy)(c)
+        assert energy(best) < energy(c) < before
+        before = energy(c)
+
+
+def test_closed_forms(pair, pointwise_map):
+    """The four solutions as one derives them one by one, without the common form."""
+    x, y = pair
+    g_x, g_y = (responses(spectrum, tight=False) for spectrum in pair)
+    areas_x = np.asarray(x.vertex_areas)
+    phi_x, phi_y = np.asarray(x.eigenvectors), np.asarray(y.eigenvectors)
+    p = permutation_matrix(pointwise_map)
+    inverse_x, inverse_y = (np.asarray(encode_inverse(s)) for s in pair)
+    frame_x = np.asarray(frame_function(g_x))
+
+    def solve(convention, norm):
+        return wavelet_energy(pointwise_map, x, y, g_x, g_y, convention=convention, norm=norm).minimizer()
+
+    k_yx = np.asarray(g_y).T @ np.asarray(g_x)
+    expected = (inverse_y @ p.T @ phi_x * k_yx) / frame_x[None]
+    np.testing.assert_allclose(solve("pushforward", "area"), expected, atol=1e-10)
+    gram = inverse_x @ inverse_x.T * (np.asarray(g_x).T @ np.asarray(g_x))
+    expected = np.linalg.solve(gram, (inverse_y @ p.T @ inverse_x.T * k_yx).T).T
+    np.testing.assert_allclose(solve("pushforward", "frobenius"), expected, atol=1e-10)
+    gram_y = np.asarray(g_y).T @ np.asarray(g_y)
+    for norm, weights in (("area", areas_x), ("frobenius", np.ones(M))):
+        gram = (phi_y.T @ p.T * weights) @ p @ phi_y * gram_y
+        cross = (phi_x.T * weights) @ p @ phi_y * k_yx.T
+        np.testing.assert_allclose(solve("pullback", norm), np.linalg.solve(gram, cross.T).T, atol=1e-10)
+
+
+def encode_inverse(spectrum):
+    return spectrum.eigenvectors.T * spectrum.vertex_areas[None]
+
+
+def test_padding_changes_nothing(pair, pointwise_map):
+    x, y = pair
+    padded = Spectrum(
+        x.eigenvalues,
+        jnp.pad(x.eigenvectors, ((0, 7), (0, 0))),
+        jnp.pad(x.vertex_areas, (0, 7)),
+        jnp.pad(x.mask, (0, 7)),
+    )
+    g_x, g_y = (responses(spectrum, tight=False) for spectrum in pair)
+    longer = jnp.pad(pointwise_map, (0, 7), constant_values=3)
+    for convention in ("pullback", "pushforward"):
+        for norm in ("area", "frobenius"):
+            options = {"convention": convention, "norm": norm}
+            plain = wavelet_energy(pointwise_map, x, y, g_x, g_y, **options)
+            other = wavelet_energy(longer, padded, y, g_x, g_y, **options)
+            for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(other), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
+
+
+def test_energies_add_and_scale():
+    generator = np.random.default_rng(0)
+
+    def sum_of_squares(columns):
+        a, b = generator.normal(size=(4, columns)), generator.normal(size=(3, columns))
+        return QuadraticEnergy(jnp.asarray(a @ a.T), jnp.asarray(b @ a.T), jnp.asarray(np.sum(b**2)))
+
+    first, second = sum_of_squares(9), sum_of_squares(5)
+    c = jnp.asarray(generator.normal(size=(3, 4)))
+    total = first + jnp.asarray(0.3) * second + QuadraticEnergy.zero(3, 4, jnp.float64)
+    np.testing.assert_allclose(total(c), first(c) + 0.3 * second(c), rtol=1e-12)
 
 
 def test_tight_update_minimises_the_energy_where_the_fed_vectors_are_orthonormal(pair, pointwise_map):
@@ -94,26 +211,23 @@ def test_tight_update_minimises_the_energy_where_the_fed_vectors_are_orthonormal
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)
-    slope = jax.grad(lambda c: wavelet_energy(c, pointwise_map, x, y, g_x, g_y, convention="pushforward"))(
-        update
-    )
-    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    energy = wavelet_energy(pointwise_map, x, y, g_x, g_y, convention="pushforward")
+    np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
+    np.testing.assert_allclose(energy.condition_number(), 1, atol=1e-12)
     # For a permuted copy of one shape the pullback is such a case too.
     order = jnp.asarray(np.random.default_rng(5).permutation(M))
-    copy = x.sample(order)
-    copy = type(copy)(copy.eigenvalues, copy.eigenvectors, x.vertex_areas[order], copy.mask)
+    copy = Spectrum(x.eigenvalues, x.eigenvectors[order], x.vertex_areas[order], x.mask)
     inverse = jnp.argsort(order)
     update = encode(inverse, x, copy) * multiscale_kernel(g_x, g_x)
-    slope = jax.grad(lambda c: wavelet_energy(c, inverse, x, copy, g_x, g_x))(update)
-    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    energy = wavelet_energy(inverse, x, copy, g_x, g_x)
+    np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
     # There the energy is what is left of k_X: the wavelets of a copy are preserved exactly.
-    identity = jnp.eye(K_X)
-    np.testing.assert_allclose(wavelet_energy(identity, inverse, x, copy, g_x, g_x), 0, atol=1e-12)
+    np.testing.assert_allclose(energy(jnp.eye(K_X)), 0, atol=1e-12)
 
 
 def test_energy_of_the_zero_map(pair, pointwise_map):
     x, y = pair
     g_x, g_y = responses(x), responses(y)
-    energy = wavelet_energy(jnp.zeros((K_X, K_Y)), pointwise_map, x, y, g_x, g_y)
+    energy = wavelet_energy(pointwise_map, x, y, g_x, g_y)(jnp.zeros((K_X, K_Y)))
     np.testing.assert_allclose(energy, jnp.sum(frame_function(g_x)), rtol=1e-12)
     np.testing.assert_allclose(energy, K_X, rtol=1e-12)

@@ -10,6 +10,7 @@ from synthetic import bumpy_mesh
 
 from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
@@ -93,7 +94,7 @@ def test_landmarks_are_matched_to_each_other(pair):
         {"iterations": 1},
         {"number_of_eigenvectors": 25},
         {"refiner": WaveletPreservation(bank=Meyer(6))},
-        {"refiner": WaveletPreservation(bank=Meyer(4), pseudo_inverse="least_squares")},
+        {"refiner": WaveletPreservation(bank=Meyer(4), solution=LeastSquares())},
         {"number_of_samples": 150},
         {"laplacian": "robust"},
     ],
@@ -170,8 +171,9 @@ def test_maps_and_landmarks_must_lie_on_the_surface(pair):
 
 def test_numbers_that_went_wrong_are_not_returned(pair):
     class Broken(WaveletPreservation):
-        def update(self, problem, pointwise_map):
-            return super().update(problem, pointwise_map) * jnp.nan
+        def update(self, problem, pointwise_map, previous):
+            functional_map, result = super().update(problem, pointwise_map, previous)
+            return functional_map * jnp.nan, result
 
     with pytest.raises(ArithmeticError, match="NaN or infinite"):
         match(*pair[:2], number_of_eigenvectors=20, refiner=Broken())

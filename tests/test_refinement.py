@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.filters import Meyer
-from jaxsmw.core.functional_map import encode, multiscale_kernel, wavelet_energy
+from jaxsmw.core.filters import CubicSpline, Meyer
+from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode, matching_objective
-from jaxsmw.core.refinement import RESULTS, Refiner, WaveletPreservation, refine
+from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
 M, K = 300, 15
@@ -41,7 +43,13 @@ def pair():
 
 REFINERS = {
     "default": WaveletPreservation(),
-    "least squares": WaveletPreservation(pseudo_inverse="least_squares"),
+    "least-squares pseudo-inverse": WaveletPreservation(solution=Filtering("least_squares")),
+    "exact": WaveletPreservation(solution=LeastSquares()),
+    "exact, frobenius": WaveletPreservation(solution=LeastSquares("frobenius")),
+    "exact, pushforward": WaveletPreservation(
+        bank=CubicSpline(5), solution=LeastSquares(), convention="pushforward"
+    ),
+    "regularized": WaveletPreservation(solution=RegularizedLeastSquares()),
     "pushforward": WaveletPreservation(convention="pushforward"),
     "common": WaveletPreservation(lambda_max="common"),
     "three filters": WaveletPreservation(bank=Meyer(3)),
@@ -59,15 +67,20 @@ def test_recovers_a_disturbed_copy(pair):
 @pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
 def test_is_the_plain_loop(pair, refiner):
     x, y, start, _ = pair
-    t = start
+    problem = refiner.problem(x, y)
+    t, c = start, None
     for _ in range(3):
-        g_x, g_y = refiner.responses(x, y)
-        kernel = (
-            multiscale_kernel(g_x, g_y) if refiner.convention == "pullback" else multiscale_kernel(g_y, g_x)
-        )
-        c = kernel * encode(t, x, y, convention=refiner.convention, pseudo_inverse=refiner.pseudo_inverse)
+        if isinstance(refiner.solution, Filtering):
+            kernel = multiscale_kernel(*problem.responses)
+            options = {"convention": refiner.convention, "pseudo_inverse": refiner.solution.pseudo_inverse}
+            c = kernel * encode(t, x, y, **options)
+        elif isinstance(refiner.solution, LeastSquares):
+            c = problem.energy(t, norm=refiner.solution.norm).minimizer()
+        else:
+            c, _ = refiner.solution.solve(problem, None, t, c)
         t = decode(c, x, y, convention=refiner.convention)
     refined = refine(x, y, start, refiner=refiner)
+    assert refined.result == RESULTS.successful
     np.testing.assert_array_equal(refined.pointwise_map, t)
     np.testing.assert_allclose(refined.functional_map, c, atol=1e-12)
 
@@ -169,7 +182,7 @@ def test_history_is_what_it_says(pair):
     for i in range(4):
         assert history.changed[i] == np.mean(np.asarray(maps[i]) != np.asarray(maps[i + 1]))
         c = refine(x, y, start, iterations=i + 1).functional_map
-        energy = wavelet_energy(c, maps[i], x, y, *refiner.responses(x, y))
+        energy = refiner.problem(x, y).energy(maps[i])(c)
         np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
         np.testing.assert_allclose(history.objective[i], matching_objective(c, maps[i + 1], x, y), rtol=1e-9)
     assert refine(x, y, start).history is None
@@ -193,7 +206,7 @@ def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
     generator = np.random.default_rng(1)
     samples_x, samples_y = (jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
     refiner = WaveletPreservation()
-    kernel = multiscale_kernel(*refiner.responses(x, y))
+    kernel = multiscale_kernel(*refiner.problem(x, y).responses)
     c = kernel * encode(start, x, y)
     for _ in range(3):
         t = decode(c, x.sample(samples_x), y.sample(samples_y))
@@ -248,9 +261,9 @@ def test_compiles_once_per_size_and_setting():
     traces = []
 
     class Counting(WaveletPreservation):
-        def update(self, problem, pointwise_map):
+        def update(self, problem, pointwise_map, previous):
             traces.append(1)
-            return super().update(problem, pointwise_map)
+            return super().update(problem, pointwise_map, previous)
 
     refiner = Counting()
     start = jnp.zeros(50, jnp.int32)
@@ -298,9 +311,14 @@ def test_too_few_samples_are_named(pair):
 
 
 def test_settings_that_do_not_exist():
-    for name in ("convention", "pseudo_inverse", "lambda_max"):
+    for name, maker in {
+        "convention": WaveletPreservation,
+        "lambda_max": WaveletPreservation,
+        "pseudo_inverse": Filtering,
+        "norm": LeastSquares,
+    }.items():
         with pytest.raises((ValueError, TypeError), match=name):
-            WaveletPreservation(**{name: "pullbakc"})
+            maker(**{name: "pullbakc"})
 
 
 def test_needs_one_vertex_per_vertex(pair):
@@ -318,9 +336,9 @@ def test_a_new_refiner_plugs_in(pair):
     """Spectral ICP's half-step in place of the filter: the loop knows nothing of wavelets."""
 
     class Orthogonal(WaveletPreservation):
-        def update(self, problem, pointwise_map):
+        def update(self, problem, pointwise_map, previous):
             u, _, vt = jnp.linalg.svd(encode(pointwise_map, problem.spectrum_x, problem.spectrum_y))
-            return u @ vt
+            return u @ vt, RESULTS.successful
 
     x, y, start, truth = pair
     assert issubclass(Orthogonal, Refiner)

@@ -11,34 +11,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.filters import FilterBank, Meyer
-from jaxsmw.core.functional_map import (
-    Convention,
-    PseudoInverse,
-    dual_eigenvectors,
-    multiscale_kernel,
-    project_matches,
-    wavelet_energy,
-)
+from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import decode, matching_objective
+from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem, check_choice
 from jaxsmw.core.spectrum import Spectrum
-
-
-class RESULTS(eqx.Enumeration):
-    """How a refinement ended; each failure carries the sentence to show a person."""
-
-    successful = "The refinement went through: all numbers are finite."
-    nonfinite_spectrum = (
-        "A spectrum holds NaN or infinity, so nothing was refined; recompute it and check the mesh it is of."
-    )
-    invalid_initial_map = (
-        "The initial map names target vertices that do not exist or are masked, so nothing was refined; it "
-        "needs one index from 0 to n - 1 per source vertex."
-    )
-    nonfinite_functional_map = (
-        "The functional map became NaN or infinite. In float32 this can be overflow (scale the surfaces to "
-        "area 1, or use float64); with the least-squares pseudo-inverse it can be that there are fewer "
-        "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
-    )
 
 
 class Problem(eqx.Module):
@@ -60,8 +37,16 @@ class Refiner(eqx.Module):
         """
 
     @abc.abstractmethod
-    def update(self, problem: Problem, pointwise_map: Int[Array, " m"]) -> Float[Array, "k_out k_in"]:
-        """The functional map that follows from a pointwise map."""
+    def update(
+        self,
+        problem: Problem,
+        pointwise_map: Int[Array, " m"],
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """The functional map that follows from a pointwise map, and how its computation ended.
+
+        `previous` is the functional map of the iteration before; None in the first.
+        """
 
     @abc.abstractmethod
     def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
@@ -117,68 +102,60 @@ class Refinement(eqx.Module):
 
 
 class WaveletPreservation(Refiner):
-    """Multiscale spectral manifold wavelets preservation with a tight frame: Algorithm 1 of the MWP paper.
+    """Multiscale spectral manifold wavelets preservation: Algorithm 1 of the MWP paper, with any frame.
 
-    The functional map is filtered, `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (eq. 8), which is one
-    elementwise product with a (k, k) kernel; the pointwise map is its nearest neighbours. For this to be
-    the minimiser of the energy (5) the bank has to be Parseval.
+    The functional map preserves the wavelets of all scales, the pointwise map is its nearest neighbours.
 
     **Arguments:**
 
     - `bank`: the filters.
+    - `solution`: how the functional map is found. `Filtering()` (eq. 8) is meant for Parseval frames, whose
+      filters' squares sum to one; `LeastSquares()` is exact for every frame; `RegularizedLeastSquares()`
+      adds other wishes.
     - `convention`: which way C goes; see `jaxsmw.core.functional_map`. `"pushforward"`, as the paper
       prints, is there for study: on real pairs it fails (`spectral_embeddings` says why).
-    - `pseudo_inverse`: see `dual_eigenvectors`. Samples are always taken by least squares.
     - `lambda_max`: where the bank ends: `"own"`, each shape's largest eigenvalue, which makes a difference
-      in size cancel; or `"common"`, the larger of the two.
+      in size cancel; or `"common"`, that of both shapes' eigenvalues taken together.
     """
 
     bank: FilterBank = Meyer()
+    solution: Solution = Filtering()
     convention: Convention = eqx.field(static=True, default="pullback")
-    pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
     lambda_max: Literal["own", "common"] = eqx.field(static=True, default="own")
 
     def __check_init__(self) -> None:
-        for name, value, choices in (
-            ("convention", self.convention, get_args(Convention)),
-            ("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse)),
-            ("lambda_max", self.lambda_max, ("own", "common")),
-        ):
-            if value not in choices:
-                raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
+        check_choice("convention", self.convention, get_args(Convention))
+        check_choice("lambda_max", self.lambda_max, ("own", "common"))
 
-    def responses(
-        self, spectrum_x: Spectrum, spectrum_y: Spectrum
-    ) -> tuple[Float[Array, "filters k_x"], Float[Array, "filters k_y"]]:
-        """The bank on both shapes' eigenvalues."""
-        lambda_max_x, lambda_max_y = spectrum_x.eigenvalues[-1], spectrum_y.eigenvalues[-1]
+    def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
+        """The pair with the bank on both shapes' eigenvalues."""
+        eigenvalues_x, eigenvalues_y = spectrum_x.eigenvalues, spectrum_y.eigenvalues
+        layout_x, layout_y = eigenvalues_x, eigenvalues_y
         if self.lambda_max == "common":
-            lambda_max_x = lambda_max_y = jnp.maximum(lambda_max_x, lambda_max_y)
-        return (
-            self.bank(spectrum_x.eigenvalues, lambda_max_x),
-            self.bank(spectrum_y.eigenvalues, lambda_max_y),
+            layout_x = layout_y = jnp.sort(jnp.concatenate([eigenvalues_x, eigenvalues_y]))
+        return WaveletProblem(
+            spectrum_x,
+            spectrum_y,
+            self.bank(eigenvalues_x, layout_x),
+            self.bank(eigenvalues_y, layout_y),
+            self.convention,
+            sampled,
         )
 
     def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool) -> Problem:
-        """Prepare the multiscale kernel and the dual eigenvectors of the shape that C leads to."""
-        responses_x, responses_y = self.responses(spectrum_x, spectrum_y)
-        pseudo_inverse: PseudoInverse = "least_squares" if sampled else self.pseudo_inverse
-        if self.convention == "pullback":
-            kernel = multiscale_kernel(responses_x, responses_y)
-            dual_out = dual_eigenvectors(spectrum_x, pseudo_inverse)
-        else:
-            kernel = multiscale_kernel(responses_y, responses_x)
-            dual_out = dual_eigenvectors(spectrum_y, pseudo_inverse)
-        return Problem(spectrum_x, spectrum_y, (kernel, dual_out))
+        """Prepare the bank's responses, and what the solution wants to be prepared."""
+        wavelets = self.problem(spectrum_x, spectrum_y, sampled=sampled)
+        return Problem(spectrum_x, spectrum_y, (wavelets, self.solution.prepare(wavelets)))
 
-    def update(self, problem: Problem, pointwise_map: Int[Array, " m"]) -> Float[Array, "k_out k_in"]:
-        """Eq. (8)."""
-        kernel, dual_out = problem.prepared
-        spectrum_in = problem.spectrum_y if self.convention == "pullback" else problem.spectrum_x
-        unfiltered = project_matches(
-            pointwise_map, dual_out, spectrum_in.eigenvectors, convention=self.convention
-        )
-        return unfiltered * kernel
+    def update(
+        self,
+        problem: Problem,
+        pointwise_map: Int[Array, " m"],
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """See `Solution.solve`."""
+        wavelets, prepared = problem.prepared
+        return self.solution.solve(wavelets, prepared, pointwise_map, previous)
 
     def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
         """Nearest neighbours; see `decode`."""
@@ -187,11 +164,9 @@ class WaveletPreservation(Refiner):
     def energy(
         self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Eq. (5); see `wavelet_energy`."""
-        spectra = problem.spectrum_x, problem.spectrum_y
-        return wavelet_energy(
-            functional_map, pointwise_map, *spectra, *self.responses(*spectra), convention=self.convention
-        )
+        """Eq. (5), area-weighted; see `wavelet_energy`."""
+        wavelets, _ = problem.prepared
+        return wavelets.energy(pointwise_map)(functional_map)
 
     def objective(
         self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
@@ -269,12 +244,12 @@ def refine(
 
     def turn(state: _State) -> tuple[_State, tuple[Array, Array, Array]]:
         after, changed, objective = search(working, state.functional_map, state.pointwise_map)
-        functional_map = refiner.update(working, after)
+        functional_map, result = refiner.update(working, after, state.functional_map)
         following = _State(
             after,
             functional_map,
             energy(working, functional_map, after),
-            finite=state.finite & jnp.all(jnp.isfinite(functional_map)),
+            result=where(state.result == RESULTS.successful, _checked(functional_map, result), state.result),
             iterations=state.iterations + 1,
             unchanged=changed == 0,
         )
@@ -287,12 +262,12 @@ def refine(
             return turn(state)
         return lax.cond(state.unchanged, lambda state: (state, (undefined,) * 3), turn, state)
 
-    functional_map = refiner.update(whole, pointwise_map)
+    functional_map, result = refiner.update(whole, pointwise_map, None)
     state = _State(
         working_map,
         functional_map,
         energy(whole, functional_map, pointwise_map),
-        finite=jnp.all(jnp.isfinite(functional_map)),
+        result=_checked(functional_map, result),
         iterations=jnp.asarray(1, jnp.int32),
         unchanged=jnp.asarray(False),
     )
@@ -300,7 +275,7 @@ def refine(
     before = state.pointwise_map if samples_x is None else pointwise_map
     refined, changed, objective = search(whole, state.functional_map, before)
 
-    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, state.finite)
+    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, state.result)
     recorded = None
     if history:
         last = (changed if samples_x is None else undefined, state.energy, objective)
@@ -320,13 +295,19 @@ class _State(NamedTuple):
     pointwise_map: Int32[Array, " s"]
     functional_map: Float[Array, "k_out k_in"]
     energy: Float[Array, ""]
-    finite: Bool[Array, ""]
+    result: RESULTS
     iterations: Int32[Array, ""]
     unchanged: Bool[Array, ""]
 
 
+def _checked(functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
+    """How a functional map came out: a failure that its computation reported says more than a NaN."""
+    finite = jnp.all(jnp.isfinite(functional_map)) | (result != RESULTS.successful)
+    return where(finite, result, RESULTS.nonfinite_functional_map)
+
+
 def _diagnose(
-    spectrum_x: Spectrum, spectrum_y: Spectrum, pointwise_map: Int32[Array, " m"], finite: Bool[Array, ""]
+    spectrum_x: Spectrum, spectrum_y: Spectrum, pointwise_map: Int32[Array, " m"], result: RESULTS
 ) -> RESULTS:
     """The result code, the first cause first."""
     vertices_y = spectrum_y.mask.shape[0]
@@ -336,7 +317,5 @@ def _diagnose(
     for spectrum in (spectrum_x, spectrum_y):
         for leaf in (spectrum.eigenvalues, spectrum.eigenvectors, spectrum.vertex_areas):
             finite_spectra &= jnp.all(jnp.isfinite(leaf))
-    # Type checkers take an Enumeration's members for the strings they are declared with.
-    result: Any = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)  # type: ignore[arg-type]
-    result = RESULTS.where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)  # type: ignore[arg-type]
-    return RESULTS.where(finite_spectra, result, RESULTS.nonfinite_spectrum)  # type: ignore[arg-type]
+    result = where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
+    return where(finite_spectra, result, RESULTS.nonfinite_spectrum)

@@ -52,7 +52,7 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
     smallest, largest = _positive_range(spectrum)
     peaks = jnp.geomspace(smallest, largest / 2, dimensions)
     # Of three Meyer filters on [0, 2 peak] the middle one is that band.
-    wavelets = jax.vmap(lambda peak: Meyer(3)(spectrum.eigenvalues, 2 * peak)[1])(peaks)
+    wavelets = jax.vmap(lambda peak: Meyer(3)(spectrum.eigenvalues, 2 * peak[None])[1])(peaks)
     return _signature(spectrum, wavelets**2)
 
 

@@ -109,9 +109,9 @@ def write_report(
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
     """The filters of a bank over the eigenvalues of a shape, with their frame function."""
-    lambda_max = jnp.asarray(eigenvalues[-1])
-    grid = jnp.linspace(0, lambda_max, 1000)
-    return draw_filters(np.asarray(grid), np.asarray(bank(grid, lambda_max)), eigenvalues)
+    spectrum = jnp.asarray(eigenvalues)
+    grid = jnp.linspace(0, spectrum[-1], 1000)
+    return draw_filters(np.asarray(grid), np.asarray(bank(grid, spectrum)), eigenvalues)
 
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:

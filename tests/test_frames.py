@@ -1,0 +1,142 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxsmw.core.filters import (
+    CubicSpline,
+    FilterBank,
+    Gabor,
+    HalfCosine,
+    Heat,
+    Identity,
+    Itersine,
+    LowPass,
+    MexicanHat,
+    Meyer,
+    SpectralDistribution,
+    Warped,
+)
+from jaxsmw.core.frames import FrameBounds, frame_bounds, frame_function, tighten
+
+EIGENVALUES = jnp.asarray(np.cumsum(np.random.default_rng(0).uniform(0, 2, 40)) - 0.5).at[0].set(0)
+COVERING = [
+    CubicSpline(),
+    MexicanHat(8, 30),
+    Heat([1, 10]),
+    Gabor(5, 0.4),
+    Warped(Gabor(), SpectralDistribution()),
+]
+
+
+class Impulse(FilterBank):
+    """One filter that passes a single point of the interval."""
+
+    def __call__(self, points, eigenvalues):
+        return jnp.where(points == eigenvalues[-1], 3.0, 0.5)[None, :]
+
+
+def test_the_frame_function_is_the_sum_of_squares():
+    responses = jnp.asarray([[1.0, 2.0, 0.0], [3.0, -1.0, 0.0]])
+    np.testing.assert_array_equal(frame_function(responses), [10, 5, 0])
+
+
+@pytest.mark.parametrize("over", ["eigenvalues", "interval"])
+@pytest.mark.parametrize("bank", [Meyer(), Itersine(), HalfCosine(4), Identity()])
+def test_bounds_of_parseval_banks_are_one(bank, over):
+    bounds = frame_bounds(bank, EIGENVALUES, over=over)
+    assert isinstance(bounds, FrameBounds)
+    np.testing.assert_allclose(bounds, 1, atol=1e-12)
+
+
+def test_bounds_are_the_extrema_at_the_eigenvalues_or_on_the_interval():
+    at_eigenvalues = frame_bounds(Heat([2.0]), EIGENVALUES[5:])
+    first = float(EIGENVALUES[5] / EIGENVALUES[-1])
+    np.testing.assert_allclose(at_eigenvalues, [np.exp(-4), np.exp(-4 * first)])
+    np.testing.assert_allclose(frame_bounds(Heat([2.0]), EIGENVALUES[5:], over="interval"), [np.exp(-4), 1])
+    np.testing.assert_allclose(frame_bounds(Impulse(), EIGENVALUES, over="interval"), [0.25, 9])
+    bank = CubicSpline()
+    inner, outer = frame_bounds(bank, EIGENVALUES), frame_bounds(bank, EIGENVALUES, over="interval")
+    assert outer.lower < inner.lower < inner.upper < outer.upper
+    np.testing.assert_allclose(outer, [1.281025, 2.123018], atol=1e-5)
+    np.testing.assert_allclose(
+        frame_bounds(MexicanHat(), EIGENVALUES, over="interval"), [0.176830, 0.270027], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("bank", [CubicSpline(8), MexicanHat(8), Gabor(8), Heat([1, 10, 50])])
+def test_the_default_resolution_is_as_fine_as_it_says(bank):
+    coarse = frame_bounds(bank, EIGENVALUES, over="interval")
+    fine = frame_bounds(bank, EIGENVALUES, over="interval", resolution=100_001)
+    np.testing.assert_allclose(coarse, fine, rtol=1e-5)
+    rough = frame_bounds(CubicSpline(), EIGENVALUES, over="interval", resolution=5)
+    assert rough.upper < frame_bounds(CubicSpline(), EIGENVALUES, over="interval").upper - 0.01
+
+
+def test_bounds_are_traced_and_keep_the_precision():
+    single = jax.jit(lambda bank, e: frame_bounds(bank, e, over="interval"))(
+        CubicSpline(), EIGENVALUES.astype(jnp.float32)
+    )
+    assert single.lower.dtype == jnp.float32
+    np.testing.assert_allclose(single, [1.281025, 2.123018], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"over": "graph"}, "eigenvalues"), ({"over": "interval", "resolution": 1}, "at least 2")],
+)
+def test_hostile_options_are_refused(options, message):
+    # In the tests the type check is the first to refuse a word that is neither.
+    with pytest.raises((ValueError, TypeError), match=message):
+        frame_bounds(Meyer(), EIGENVALUES, **options)
+
+
+@pytest.mark.parametrize("bank", COVERING)
+def test_tightened_banks_are_parseval_and_proportional(bank):
+    plain, tight = bank(EIGENVALUES, EIGENVALUES), tighten(bank)(EIGENVALUES, EIGENVALUES)
+    np.testing.assert_allclose(frame_function(tight), 1, atol=1e-12)
+    np.testing.assert_allclose(tight * jnp.sqrt(frame_function(plain))[None, :], plain, atol=1e-12)
+    single = tighten(bank)(EIGENVALUES.astype(jnp.float32), EIGENVALUES.astype(jnp.float32))
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(frame_function(single), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "bank", [Meyer(), Itersine(overlap=4), HalfCosine(), Identity(), tighten(CubicSpline())]
+)
+def test_tightening_leaves_a_parseval_bank_as_it_is(bank):
+    expected = bank(EIGENVALUES, EIGENVALUES)
+    np.testing.assert_allclose(tighten(bank)(EIGENVALUES, EIGENVALUES), expected, atol=1e-14)
+
+
+def test_tightened_banks_are_pytrees_and_differentiable():
+    bank = tighten(Gabor(4, 0.4))
+    assert len(jax.tree.leaves(bank)) == 1
+    sample = jax.jit(lambda b, e: b(e, e))
+    np.testing.assert_allclose(sample(bank, EIGENVALUES), bank(EIGENVALUES, EIGENVALUES), atol=1e-14)
+    check_grads(
+        lambda *arguments: sample(*jax.tree.map(jnp.asarray, arguments)),
+        (bank, EIGENVALUES[:9]),
+        order=1,
+        eps=1e-6,
+        rtol=1e-5,
+    )
+
+
+def test_nothing_is_made_of_a_vanishing_frame_function():
+    bank = LowPass(0.25)
+    responses = tighten(bank)(EIGENVALUES, EIGENVALUES)
+    passed = np.asarray(EIGENVALUES) < 0.49 * float(EIGENVALUES[-1])
+    np.testing.assert_allclose(responses[0, passed], 1, atol=1e-15)
+    slopes = jax.grad(lambda b, e: jnp.sum(tighten(b)(e, e)), argnums=(0, 1))(bank, EIGENVALUES)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    # So narrow that all but the centres underflow; the squares do long before.
+    narrow = Gabor(3, 0.007)
+    points = jnp.asarray([0.0, 0.25, 0.3, 0.4, 0.49, 1.0])
+    plain, tight = narrow(points, points), tighten(narrow)(points, points)
+    assert frame_function(plain)[3] == 0 < plain[1, 3]
+    np.testing.assert_array_equal(frame_function(tight), jnp.asarray([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    slopes = jax.grad(lambda b, p: jnp.sum(tighten(b)(p, p)), argnums=(0, 1))(narrow, points)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    assert slopes[1][1] == 0

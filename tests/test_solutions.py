@@ -1,0 +1,372 @@
+"""Ways to a functional map: what they minimise, what they must not depend on, and how they fail."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from synthetic import random_spectrum
+
+from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
+from jaxsmw.core.functional_map import QuadraticEnergy
+from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.solutions import (
+    DescriptorPair,
+    Filtering,
+    LeastSquares,
+    RegularizedLeastSquares,
+)
+from jaxsmw.core.spectrum import Spectrum
+
+M, N, K_X, K_Y, D = 70, 60, 7, 6, 3
+TERMS = (
+    "wavelet_preservation",
+    "laplacian_commutativity",
+    "orthogonality",
+    "descriptor_preservation",
+    "descriptor_commutativity",
+)
+OFF = dict.fromkeys(TERMS)
+PRECISE = {"tolerance": 1e-10, "max_steps": 2000}
+
+
+@pytest.fixture
+def pair():
+    return random_spectrum(M, K_X, seed=1), random_spectrum(N, K_Y, seed=2)
+
+
+@pytest.fixture
+def pointwise_map():
+    return jnp.asarray(np.random.default_rng(3).integers(0, N, M))
+
+
+@pytest.fixture
+def descriptors(pair):
+    generator = np.random.default_rng(4)
+    values = [jnp.asarray(generator.normal(size=(len(s.mask), D))) for s in pair]
+    return DescriptorPair.project(*values, *pair, operators=True)
+
+
+def solve(solution, pair, pointwise_map, *, bank=None, convention="pullback", previous=None):
+    bank = CubicSpline(4) if bank is None else bank
+    problem = WaveletPreservation(bank=bank, solution=solution, convention=convention).problem(*pair)
+    return solution.solve(problem, solution.prepare(problem), pointwise_map, previous)
+
+
+def objective(c, pair, pointwise_map, weights, descriptors, *, convention="pullback", bank=None):
+    """The sum of terms as the docstring writes it, term by term."""
+    bank = CubicSpline(4) if bank is None else bank
+    problem = WaveletPreservation(bank=bank, convention=convention).problem(*pair)
+    eigenvalues_out, eigenvalues_in = (s.eigenvalues for s in problem.spectra)
+    k_out, k_in = c.shape
+    weights = OFF | weights
+    total = 0.0
+    if weights["wavelet_preservation"]:
+        total += weights["wavelet_preservation"] * problem.energy(pointwise_map)(c)
+    if weights["laplacian_commutativity"]:
+        largest = max(eigenvalues_out[-1], eigenvalues_in[-1])
+        commutator = jnp.diag(eigenvalues_out) @ c - c @ jnp.diag(eigenvalues_in)
+        total += weights["laplacian_commutativity"] * jnp.sum((commutator / largest) ** 2)
+    if weights["orthogonality"]:
+        gram = c.T @ c if k_in <= k_out else c @ c.T
+        total += weights["orthogonality"] * jnp.sum((gram - jnp.eye(len(gram))) ** 2)
+    x_out = convention == "pullback"
+    if weights["descriptor_preservation"]:
+        f_out, f_in = descriptors.coefficients_x, descriptors.coefficients_y
+        f_out, f_in = (f_out, f_in) if x_out else (f_in, f_out)
+        scale = k_out / jnp.sum(f_out**2)
+        total += weights["descriptor_preservation"] * scale * jnp.sum((c @ f_in - f_out) ** 2)
+    if weights["descriptor_commutativity"]:
+        d_out, d_in = descriptors.operators_x, descriptors.operators_y
+        d_out, d_in = (d_out, d_in) if x_out else (d_in, d_out)
+        scale = k_out / jnp.sum(d_out**2)
+        commutators = sum(jnp.sum((c @ d_in[i] - d_out[i] @ c) ** 2) for i in range(D))
+        total += weights["descriptor_commutativity"] * scale * commutators
+    return total
+
+
+QUADRATIC = [
+    {"wavelet_preservation": 1.0},
+    {"wavelet_preservation": 0.3, "laplacian_commutativity": 2.0},
+    {"wavelet_preservation": 1.0, "descriptor_preservation": 0.7},
+    {"wavelet_preservation": 1.0, "descriptor_commutativity": 5.0},
+    {"descriptor_preservation": 1.0, "laplacian_commutativity": 10.0},
+    dict.fromkeys(("wavelet_preservation", "laplacian_commutativity", "descriptor_preservation", "descriptor_commutativity"), 1.0),
+]  # fmt: skip
+
+
+def with_weights(weights, descriptors, **options):
+    needed = {"descriptor_preservation", "descriptor_commutativity"} & weights.keys()
+    return RegularizedLeastSquares(
+        **(OFF | weights), descriptors=descriptors if needed else None, **(PRECISE | options)
+    )
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+@pytest.mark.parametrize("weights", QUADRATIC, ids=lambda w: ", ".join(w))
+def test_quadratic_objectives_are_minimised_exactly(pair, pointwise_map, descriptors, weights, convention):
+    """Against the dense solution of the k² normal equations."""
+    c, result = solve(with_weights(weights, descriptors), pair, pointwise_map, convention=convention)
+    assert result == RESULTS.successful
+
+    def loss(vector):
+        return objective(
+            vector.reshape(c.shape), pair, pointwise_map, weights, descriptors, convention=convention
+        )
+
+    origin = jnp.zeros(c.size)
+    dense = jnp.linalg.lstsq(jax.hessian(loss)(origin), -jax.grad(loss)(origin))[0].reshape(c.shape)
+    np.testing.assert_allclose(c, dense, atol=1e-6)
+
+
+@pytest.mark.parametrize("norm", ["area", "frobenius"])
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+def test_wavelets_alone_give_the_closed_form(pair, pointwise_map, norm, convention):
+    options = {"convention": convention}
+    exact, _ = solve(LeastSquares(norm), pair, pointwise_map, **options)
+    weights = {"wavelet_preservation": 2.0}
+    iterative, result = solve(with_weights(weights, None, norm=norm), pair, pointwise_map, **options)
+    assert result == RESULTS.successful
+    np.testing.assert_allclose(iterative, exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+def test_orthogonality_is_minimised_to_first_order(pair, pointwise_map, descriptors, convention):
+    weights = dict.fromkeys(TERMS, 0.5)
+    c, result = solve(with_weights(weights, descriptors), pair, pointwise_map, convention=convention)
+    assert result == RESULTS.successful
+
+    def loss(c):
+        return objective(c, pair, pointwise_map, weights, descriptors, convention=convention)
+
+    np.testing.assert_allclose(jax.grad(loss)(c), 0, atol=1e-6)
+    generator = np.random.default_rng(0)
+    for size in (1e-3, 1e-1):
+        assert loss(c + size * generator.normal(size=c.shape)) > loss(c)
+
+
+@pytest.mark.parametrize("term", TERMS[1:])
+def test_every_weight_changes_the_result_and_lowers_its_term(pair, pointwise_map, descriptors, term):
+    def minimiser(weight):
+        weights = {"wavelet_preservation": 1.0, term: weight}
+        c, result = solve(with_weights(weights, descriptors), pair, pointwise_map)
+        assert result == RESULTS.successful
+        return c, objective(c, pair, pointwise_map, {term: 1.0}, descriptors)
+
+    (weak, cost_weak), (strong, cost_strong) = minimiser(0.01), minimiser(3.0)
+    assert jnp.max(jnp.abs(weak - strong)) > 1e-3
+    assert cost_strong < 0.9 * cost_weak
+
+
+def test_wavelet_weight_changes_the_result(pair, pointwise_map):
+    light, heavy = (
+        solve(with_weights({"wavelet_preservation": w, "orthogonality": 1.0}, None), pair, pointwise_map)[0]
+        for w in (0.5, 5.0)
+    )
+    assert jnp.max(jnp.abs(light - heavy)) > 1e-3
+
+
+def test_norm_changes_the_result(pair, pointwise_map):
+    area, frobenius = (
+        solve(RegularizedLeastSquares(norm=norm), pair, pointwise_map)[0] for norm in ("area", "frobenius")
+    )
+    assert jnp.max(jnp.abs(area - frobenius)) > 1e-2
+
+
+@pytest.mark.parametrize("solution", [LeastSquares(), RegularizedLeastSquares(**PRECISE)], ids=["exact", "regularized"])  # fmt: skip
+def test_vmap_equals_one_by_one(solution):
+    pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(3)]
+    maps = [jnp.asarray(np.random.default_rng(s).integers(0, N, M)) for s in range(3)]
+
+    def stack(*trees):
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+    batch, results = eqx.filter_vmap(lambda x, y, t: solve(solution, (x, y), t))(
+        stack(*(x for x, _ in pairs)), stack(*(y for _, y in pairs)), jnp.stack(maps)
+    )
+    for i in range(3):
+        alone, result = solve(solution, pairs[i], maps[i])
+        assert result == RESULTS.successful
+        np.testing.assert_allclose(batch[i], alone, atol=1e-8)
+    assert bool(jnp.all(results == RESULTS.successful))
+
+
+def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, descriptors):
+    weights = dict.fromkeys(TERMS, 0.5)
+
+    def corner(weight, shift):
+        solution = with_weights(weights, descriptors, tolerance=1e-13)
+        solution = eqx.tree_at(lambda s: s.orthogonality, solution, jnp.asarray(weight))
+        x, y = pair
+        x = eqx.tree_at(lambda s: s.eigenvalues, x, x.eigenvalues + jnp.asarray(shift))
+        c, _ = solve(solution, (x, y), pointwise_map)
+        return jnp.sum(jnp.sin(3 * c))
+
+    shift = jnp.linspace(0.1, 0.3, K_X)
+    check_grads(corner, (jnp.asarray(0.4), shift), order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
+
+
+def test_derivative_of_the_closed_form(pair, pointwise_map):
+    def corner(eigenvectors):
+        x = eqx.tree_at(lambda s: s.eigenvectors, pair[0], jnp.asarray(eigenvectors))
+        return jnp.sum(jnp.sin(3 * solve(LeastSquares(), (x, pair[1]), pointwise_map)[0]))
+
+    check_grads(corner, (pair[0].eigenvectors,), order=1)
+
+
+def test_starts_from_the_previous_functional_map(pair, pointwise_map):
+    c, _ = solve(RegularizedLeastSquares(**PRECISE), pair, pointwise_map)
+    hasty = RegularizedLeastSquares(max_steps=3, tolerance=1e-6)
+    _, cold = solve(hasty, pair, pointwise_map)
+    again, warm = solve(hasty, pair, pointwise_map, previous=c)
+    assert cold == RESULTS.solver_not_converged
+    assert warm == RESULTS.successful
+    np.testing.assert_allclose(again, c, atol=1e-5)
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+def test_signs_of_eigenvectors_do_not_matter(pair, pointwise_map, convention):
+    generator = np.random.default_rng(0)
+    signs = [jnp.asarray(generator.choice([-1.0, 1.0], k)) for k in (K_X, K_Y)]
+    flipped = [
+        eqx.tree_at(lambda s: s.eigenvectors, s, s.eigenvectors * sign[None])
+        for s, sign in zip(pair, signs, strict=True)
+    ]
+    out, into = signs if convention == "pullback" else signs[::-1]
+    for solution in (LeastSquares("frobenius"), RegularizedLeastSquares(**PRECISE)):
+        c, _ = solve(solution, pair, pointwise_map, convention=convention)
+        other, _ = solve(solution, flipped, pointwise_map, convention=convention)
+        np.testing.assert_allclose(other, out[:, None] * c * into[None], atol=1e-7)
+
+
+class Gap(FilterBank):
+    """Passes nothing in the middle of the spectrum."""
+
+    def __call__(self, points, eigenvalues):
+        return jnp.where(jnp.abs(points / eigenvalues[-1] - 0.5) < 0.2, 0.0, Meyer(3)(points, eigenvalues))
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+@pytest.mark.parametrize(
+    "solution",
+    [LeastSquares(), RegularizedLeastSquares(laplacian_commutativity=None)],
+    ids=["exact", "regularized"],
+)
+def test_a_vanishing_frame_function_is_named(pair, pointwise_map, solution, convention):
+    refiner = WaveletPreservation(bank=Gap(), solution=solution, convention=convention)
+    refined = refine(*pair, pointwise_map, refiner=refiner)
+    assert refined.result == RESULTS.undetermined_functional_map
+    assert (refined.pointwise_map == -1).all()
+    assert "frame function" in RESULTS[refined.result] and "Filtering()" in RESULTS[refined.result]
+    filtering = WaveletPreservation(bank=Gap(), convention=convention)
+    assert refine(*pair, pointwise_map, refiner=filtering).result == RESULTS.successful
+
+
+def test_a_map_to_too_few_vertices_is_named(pair):
+    """One target for all vertices, and one filter only: the gram matrix has rank one."""
+
+    class Flat(FilterBank):
+        def __call__(self, points, eigenvalues):
+            return jnp.ones_like(points)[None]
+
+    for dtype in (jnp.float32, jnp.float64):
+        x, y = (jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, s) for s in pair)
+        refiner = WaveletPreservation(bank=Flat(), solution=LeastSquares())
+        refined = refine(x, y, jnp.full(M, 5), refiner=refiner)
+        assert refined.result == RESULTS.singular_system
+
+
+def test_giving_up_is_named(pair, pointwise_map):
+    solution = RegularizedLeastSquares(orthogonality=1.0, max_steps=2, tolerance=1e-9)
+    refined = refine(*pair, pointwise_map, refiner=WaveletPreservation(solution=solution))
+    assert refined.result == RESULTS.solver_not_converged
+    assert "max_steps" in RESULTS[refined.result]
+
+
+def test_numbers_that_went_wrong_have_a_code(pair, pointwise_map):
+    x, y = pair
+    broken = eqx.tree_at(lambda s: s.eigenvectors, x, x.eigenvectors.at[0, 0].set(jnp.nan))
+    for solution in (Filtering(), LeastSquares(), RegularizedLeastSquares()):
+        refined = refine(broken, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
+        assert refined.result == RESULTS.nonfinite_spectrum
+
+
+def test_descriptors_in_the_eigenbases(pair):
+    x, _ = pair
+    coefficients = np.random.default_rng(0).normal(size=(K_X, 2))
+    values = x.eigenvectors @ coefficients
+    projected = DescriptorPair.project(values, values, x, x, operators=True)
+    np.testing.assert_allclose(projected.coefficients_x, coefficients, atol=1e-12)
+    # Multiplication by a function, seen in the basis, is a symmetric matrix; by one it is the identity.
+    np.testing.assert_allclose(projected.operators_x, projected.operators_x.transpose(0, 2, 1), atol=1e-12)
+    ones = jnp.ones((M, 1))
+    identity = DescriptorPair.project(ones, ones, x, x, operators=True).operators_x[0]
+    np.testing.assert_allclose(identity, np.eye(K_X), atol=1e-12)
+    assert DescriptorPair.project(values, values, x, x).operators_x is None
+
+
+def test_descriptors_alone_find_the_functional_map_of_a_copy(pair):
+    """The descriptor-based functional map: as many functions as it takes to know C."""
+    x, _ = pair
+    order = jnp.asarray(np.random.default_rng(0).permutation(M))
+    y = Spectrum(x.eigenvalues, x.eigenvectors[order], x.vertex_areas[order], x.mask)
+    y = eqx.tree_at(
+        lambda s: s.eigenvectors, y, y.eigenvectors * jnp.asarray([1.0, -1, 1, 1, -1, 1, -1])[None]
+    )
+    values = jnp.asarray(np.random.default_rng(1).normal(size=(M, 9)))
+    descriptors = DescriptorPair.project(values, values[order], x, y)
+    solution = RegularizedLeastSquares(
+        wavelet_preservation=None,
+        orthogonality=None,
+        descriptor_preservation=1.0,
+        laplacian_commutativity=1.0,
+        descriptors=descriptors,
+        **PRECISE,
+    )
+    c, result = solution.minimize(None, x.eigenvalues, y.eigenvalues)
+    assert result == RESULTS.successful
+    np.testing.assert_allclose(c, jnp.diag(jnp.asarray([1.0, -1, 1, 1, -1, 1, -1])), atol=1e-8)
+
+
+def test_float32_stays_float32_and_agrees(pair, pointwise_map):
+    single = [jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, s) for s in pair]
+    for solution in (LeastSquares(), RegularizedLeastSquares()):
+        c, result = solve(solution, single, pointwise_map)
+        assert c.dtype == jnp.float32 and result == RESULTS.successful
+        np.testing.assert_allclose(c, solve(solution, pair, pointwise_map)[0], atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"descriptor_preservation": 1.0}, "go together"),
+        ({"wavelet_preservation": None}, "nothing ties C"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"max_steps": 0}, "max_steps"),
+    ],
+)
+def test_settings_that_cannot_work(options, message):
+    with pytest.raises(ValueError, match=message):
+        RegularizedLeastSquares(**options)
+
+
+def test_descriptors_need_a_weight_and_operators_their_matrices(pair):
+    values = [jnp.ones((len(s.mask), 1)) for s in pair]
+    descriptors = DescriptorPair.project(*values, *pair)
+    with pytest.raises(ValueError, match="go together"):
+        RegularizedLeastSquares(descriptors=descriptors)
+    with pytest.raises(ValueError, match="operators=True"):
+        RegularizedLeastSquares(descriptors=descriptors, descriptor_commutativity=1.0)
+
+
+def test_adding_an_energy_of_ones_own(pair):
+    """`minimize` takes any sum of squares: here one whose minimum is known."""
+    generator = np.random.default_rng(0)
+    a, target = generator.normal(size=(K_Y, 20)), generator.normal(size=(K_X, K_Y))
+    b = target @ a
+    energy = QuadraticEnergy(jnp.asarray(a @ a.T), jnp.asarray(b @ a.T), jnp.asarray(np.sum(b**2)))
+    solution = RegularizedLeastSquares(laplacian_commutativity=None, orthogonality=None, **PRECISE)
+    c, _ = solution.minimize(energy, pair[0].eigenvalues, pair[1].eigenvalues)
+    np.testing.assert_allclose(c, target, atol=1e-8)
