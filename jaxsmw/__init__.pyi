@@ -1,11 +1,41 @@
-from .core.filters import FilterBank, Meyer
-from .core.frames import frame_function
+from .core.filters import (
+    ControlPoints,
+    CubicSpline,
+    ExponentialWindow,
+    FilterBank,
+    Gabor,
+    HalfCosine,
+    Heat,
+    Held,
+    Identity,
+    Itersine,
+    Logarithm,
+    LowPass,
+    MexicanHat,
+    Meyer,
+    Papadakis,
+    Power,
+    Regular,
+    Simoncelli,
+    SimpleTight,
+    SpectralDistribution,
+    Warp,
+    Warped,
+)
+from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
 from .core.pointwise_map import decode, nearest_neighbor
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
 from .core.results import RESULTS
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
-from .core.solutions import DescriptorPair, Filtering, LeastSquares, RegularizedLeastSquares, Solution
+from .core.solutions import (
+    DescriptorPair,
+    Filtering,
+    LeastSquares,
+    RegularizedLeastSquares,
+    Solution,
+    WaveletProblem,
+)
 from .core.spectrum import Spectrum
 from .errors import InputError
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
@@ -22,26 +52,48 @@ from .matching import Correspondence, initial_map, match
 __version__: str
 __all__ = [
     "RESULTS",
+    "ControlPoints",
     "Correspondence",
     "CreaturePair",
+    "CubicSpline",
     "DescriptorPair",
+    "ExponentialWindow",
     "FilterBank",
     "Filtering",
+    "FrameBounds",
+    "Gabor",
     "GeodesicError",
     "GroundTruth",
+    "HalfCosine",
+    "Heat",
+    "Held",
     "History",
+    "Identity",
     "InputError",
+    "Itersine",
     "LeastSquares",
+    "Logarithm",
+    "LowPass",
     "Mesh",
+    "MexicanHat",
     "Meyer",
+    "Papadakis",
+    "Power",
     "QuadraticEnergy",
     "Refinement",
     "Refiner",
+    "Regular",
     "RegularizedLeastSquares",
+    "Simoncelli",
+    "SimpleTight",
     "Solution",
+    "SpectralDistribution",
     "Spectrum",
     "SurfacePoints",
+    "Warp",
+    "Warped",
     "WaveletPreservation",
+    "WaveletProblem",
     "compute_spectrum",
     "coverage",
     "creature_pair",
@@ -49,6 +101,7 @@ __all__ = [
     "diagnose",
     "encode",
     "farthest_point_samples",
+    "frame_bounds",
     "frame_function",
     "geodesic_distances",
     "geodesic_error",
@@ -63,6 +116,7 @@ __all__ = [
     "read_pointwise_map",
     "refine",
     "shot_descriptors",
+    "tighten",
     "wave_kernel_signature",
     "wavelet_energy",
     "wavelet_signature",

@@ -20,6 +20,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write, check_writable
 
 if TYPE_CHECKING:
+    from jaxsmw.core.filters import FilterBank
     from jaxsmw.core.refinement import WaveletPreservation
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
@@ -159,9 +160,7 @@ def _parser() -> argparse.ArgumentParser:
     spectrum.add_argument(
         "--output", metavar="FILE.npz", help="write eigenvalues, eigenvectors and vertex_areas (area 1)"
     )
-    spectrum.add_argument(
-        "--filters", type=_integer(2), default=6, help="for --figure (default: %(default)s)"
-    )
+    _add_bank(spectrum)
     spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
     _add_laplacian(spectrum)
     _add_reading(spectrum, indices=False)
@@ -202,14 +201,22 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "--init",
         metavar="START",
         default="shot",
-        help="initial map: shot, wks, hks or wavelet descriptors, landmarks:FILE (a source and a target "
-        "vertex per line) or map:FILE (default: %(default)s, of the descriptors the only one that tells left "
+        help="initial map: shot, wks, hks or wavelet descriptors, functional (the functional map that "
+        "preserves shot), landmarks:FILE (a source and a target vertex per line) or map:FILE (default: %(default)s, of the descriptors the only one that tells left "
         "from right)",
     )
     group.add_argument(
         "--eigenvectors", type=_integer(1), default=100, help="per shape (default: %(default)s)"
     )
-    group.add_argument("--filters", type=_integer(2), default=6, help="of the frame (default: %(default)s)")
+    _add_bank(group)
+    group.add_argument(
+        "--solution",
+        choices=("filtering", "least-squares", "frobenius", "regularized"),
+        default="filtering",
+        help="how the functional map is found: filtering is for banks that are tight frames, least-squares "
+        "is exact for all (frobenius: with every vertex counting the same), regularized adds commutativity "
+        "with the Laplacian and orthogonality (default: %(default)s)",
+    )
     group.add_argument("--iterations", type=_integer(1), default=3, help="(default: %(default)s)")
     group.add_argument(
         "--samples",
@@ -224,6 +231,38 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "--precision", choices=("float32", "float64"), default="float32", help="(default: %(default)s)"
     )
     _add_laplacian(group)
+
+
+# Names of banks on the command line, and their classes.
+_BANKS = {
+    "meyer": "Meyer",
+    "simple-tight": "SimpleTight",
+    "itersine": "Itersine",
+    "half-cosine": "HalfCosine",
+    "adapted-itersine": "Itersine",
+    "adapted-half-cosine": "HalfCosine",
+    "held": "Held",
+    "simoncelli": "Simoncelli",
+    "papadakis": "Papadakis",
+    "regular": "Regular",
+    "cubic-spline": "CubicSpline",
+    "mexican-hat": "MexicanHat",
+    "gabor": "Gabor",
+    "identity": "Identity",
+}
+
+
+def _add_bank(parser: argparse._ActionsContainer) -> None:
+    parser.add_argument(
+        "--bank",
+        choices=tuple(_BANKS),
+        default="meyer",
+        metavar="BANK",
+        help=f"the filters, one of {', '.join(_BANKS)} (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--filters", type=_integer(2), help="how many, where the bank lets choose (default: 6)"
+    )
 
 
 def _add_laplacian(parser: argparse._ActionsContainer) -> None:
@@ -434,6 +473,7 @@ def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options)
     if options.output and Path(options.output).suffix != ".npz":
         raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
+    bank = _bank(options)
     import numpy as np
 
     from jaxsmw.geometry.eigenbasis import eigenpairs
@@ -453,11 +493,10 @@ def _spectrum(options: argparse.Namespace) -> None:
         with atomic_write(options.output) as temporary:
             np.savez(temporary, eigenvalues=eigenvalues, eigenvectors=eigenvectors, vertex_areas=vertex_areas)
     if options.figure:
-        from jaxsmw.core.filters import Meyer
         from jaxsmw.report.figures import save_figure
         from jaxsmw.report.summary import draw_bank
 
-        save_figure(options.figure, draw_bank(Meyer(options.filters), eigenvalues))
+        save_figure(options.figure, draw_bank(bank, eigenvalues))
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -502,19 +541,45 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
     from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
 
     kind, _, path = options.init.partition(":")
-    if not path and kind in ("shot", "wks", "hks", "wavelet"):
+    if not path and kind in ("shot", "wks", "hks", "wavelet", "functional"):
         return kind
     if path and kind in ("landmarks", "map"):
         read = read_landmarks if kind == "landmarks" else read_pointwise_map
         return read(path, mesh_x, mesh_y, index_base=options.index_base or 0)
     raise InputError(
-        f"--init {options.init}: is no initial map: choose shot, wks, hks, wavelet, landmarks:FILE or "
-        "map:FILE."
+        f"--init {options.init}: is no initial map: choose shot, wks, hks, wavelet, functional, "
+        "landmarks:FILE or map:FILE."
     )
 
 
+def _bank(options: argparse.Namespace) -> FilterBank:
+    from jaxsmw.core import filters
+
+    kind = getattr(filters, _BANKS[options.bank])
+    if options.filters is None:
+        bank = kind()
+    elif "filters" not in kind.__dataclass_fields__:
+        raise InputError(f"--filters: the number of filters of {options.bank} is fixed; leave --filters out.")
+    else:
+        try:
+            bank = kind(options.filters)
+        except ValueError as error:
+            raise InputError(f"--filters {options.filters}: {error}; ask for more.") from error
+    if options.bank.startswith("adapted-"):
+        return filters.Warped(bank, filters.SpectralDistribution())
+    return bank
+
+
 def _refiner(options: argparse.Namespace) -> WaveletPreservation:
-    from jaxsmw.core.filters import Meyer
+    from jaxsmw.core import solutions
     from jaxsmw.core.refinement import WaveletPreservation
 
-    return WaveletPreservation(bank=Meyer(options.filters))
+    solution: solutions.Solution
+    match options.solution:
+        case "filtering":
+            solution = solutions.Filtering()
+        case "regularized":
+            solution = solutions.RegularizedLeastSquares()
+        case norm:
+            solution = solutions.LeastSquares("frobenius" if norm == "frobenius" else "area")
+    return WaveletPreservation(bank=_bank(options), solution=solution)

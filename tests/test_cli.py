@@ -157,7 +157,14 @@ def test_quiet_is_quiet(run, pair, tmp_path):
         ["--iterations", "1"],
         ["--samples", "40"],
         ["--eigenvectors", "15"],
+        ["--init", "functional"],
         ["--filters", "2"],
+        ["--bank", "itersine"],
+        ["--bank", "adapted-itersine"],
+        ["--bank", "cubic-spline"],
+        ["--solution", "least-squares"],
+        ["--solution", "frobenius"],
+        ["--solution", "regularized"],
         ["--laplacian", "robust"],
         ["--precision", "float64"],
         ["--stop-when-unchanged", "--iterations", "20"],
@@ -372,6 +379,10 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --eigenvectors 0", "at least 1"),
         ("match {x} {y} --output {t}/m --eigenvectors many", "no whole number"),
         ("match {x} {y} --output {t}/m --filters 1", "at least 2"),
+        ("match {x} {y} --output {t}/m --bank haar", "haar"),
+        ("match {x} {y} --output {t}/m --bank held --filters 3", "--filters"),
+        ("match {x} {y} --output {t}/m --bank half-cosine --filters 2", "at least 3 filters"),
+        ("match {x} {y} --output {t}/m --solution guess", "guess"),
         ("match {x} {y} --output {t}/m --iterations 0", "at least 1"),
         ("match {x} {y} --output {t}/m --samples 5", "cannot tell"),
         ("match {x} {y} --output {t}/m --samples 5000 --eigenvectors 20", "642 used vertices"),
@@ -398,6 +409,7 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("evaluate {x} {y} {p}/truth.txt", "--ground-truth"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/no/e.json", "no/e.json"),
         ("spectrum {x} --eigenvectors 642", "641"),
+        ("spectrum {x} --bank regular --filters 6", "--filters"),
         ("spectrum {x} --output {t}/s.txt", ".npz"),
         ("spectrum {x} --figure {t}/s.nonsense", "s.nonsense"),
         ("render {x} {y} --output {t}/a.png", "give the map"),
@@ -480,3 +492,15 @@ def test_read_mesh_is_exported():
     assert set(jaxsmw.__all__) <= set(dir(jaxsmw))
     for name in jaxsmw.__all__:
         assert getattr(jaxsmw, name) is not None
+
+
+def test_every_bank_has_a_name(run, pair, tmp_path):
+    from jaxsmw.cli import _BANKS
+
+    pictures = set()
+    for name in _BANKS:
+        path = tmp_path / f"{name}.png"
+        call = ["spectrum", pair / "x.off", "--eigenvectors", "20", "--figure", path, "--bank", name]
+        assert run(*call).code == 0
+        pictures.add(path.read_bytes())
+    assert len(pictures) == len(_BANKS)

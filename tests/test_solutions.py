@@ -49,6 +49,10 @@ def descriptors(pair):
     return DescriptorPair.project(*values, *pair, operators=True)
 
 
+def as_type(spectrum, dtype):
+    return jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, spectrum)
+
+
 def solve(solution, pair, pointwise_map, *, bank=None, convention="pullback", previous=None):
     bank = CubicSpline(4) if bank is None else bank
     problem = WaveletPreservation(bank=bank, solution=solution, convention=convention).problem(*pair)
@@ -272,7 +276,7 @@ def test_a_map_to_too_few_vertices_is_named(pair):
             return jnp.ones_like(points)[None]
 
     for dtype in (jnp.float32, jnp.float64):
-        x, y = (jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, s) for s in pair)
+        x, y = (as_type(spectrum, dtype) for spectrum in pair)
         refiner = WaveletPreservation(bank=Flat(), solution=LeastSquares())
         refined = refine(x, y, jnp.full(M, 5), refiner=refiner)
         assert refined.result == RESULTS.singular_system
@@ -331,7 +335,7 @@ def test_descriptors_alone_find_the_functional_map_of_a_copy(pair):
 
 
 def test_float32_stays_float32_and_agrees(pair, pointwise_map):
-    single = [jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, s) for s in pair]
+    single = [as_type(spectrum, jnp.float32) for spectrum in pair]
     for solution in (LeastSquares(), RegularizedLeastSquares()):
         c, result = solve(solution, single, pointwise_map)
         assert c.dtype == jnp.float32 and result == RESULTS.successful

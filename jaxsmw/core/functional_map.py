@@ -22,15 +22,15 @@ Frobenius norm in which eq. (5) is printed:
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||^2,
 
-and since `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`, elementwise, it needs two moments only,
-no loop over scales and nothing of size m x n:
+and since `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`, elementwise, it needs two moments
+only, no loop over scales and nothing of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
-Its minimiser solves the (k_in, k_in) system `C gram = cross`. Where the fed vectors are orthonormal (always in
-the pushforward convention with the area norm; in the pullback where T preserves area) the gram matrix is
-the frame function on the diagonal, and the minimiser is `cross` with its columns divided by it: for a
+Its minimiser solves the (k_in, k_in) system `C gram = cross`. Where the fed vectors are orthonormal (always
+in the pushforward convention with the area norm; in the pullback where T preserves area) the gram matrix
+is the frame function on the diagonal, and the minimiser is `cross` with its columns divided by it: for a
 Parseval frame that is filtering alone, eq. (8). `docs/frames.md` derives all of this.
 """
 

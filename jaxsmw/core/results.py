@@ -25,10 +25,10 @@ class RESULTS(eqx.Enumeration):
         "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
     )
     undetermined_functional_map = (
-        "Nothing determines a part of the functional map, to working precision: at one of the eigenvalues the "
-        "frame function of the filter bank vanishes (or, without wavelets, every descriptor does). Use a bank "
-        "that covers the whole spectrum (what is missing is mostly the lowest band, for which a low-pass "
-        "filter helps, or the highest), fewer eigenvectors, or solution=Filtering(), which solves nothing."
+        "Nothing determines a part of the functional map, to working precision: the frame function of the "
+        "filter bank vanishes at an eigenvalue (or, without wavelets, every descriptor does). Use a bank "
+        "that covers the whole spectrum (mostly the lowest band is missing, for which a low-pass filter "
+        "helps, or the highest), fewer eigenvectors, or solution=Filtering(), which solves nothing."
     )
     singular_system = (
         "The least-squares problem for the functional map is singular, to working precision: the pointwise "
@@ -44,3 +44,8 @@ class RESULTS(eqx.Enumeration):
 def where(condition: Bool[Array, ""] | bool, if_true: Any, if_false: Any) -> Any:
     """One result or the other. Type checkers take the members of an Enumeration for plain strings."""
     return RESULTS.where(condition, if_true, if_false)
+
+
+def sentence(result: RESULTS) -> str:
+    """What a result means, for a person."""
+    return RESULTS[result]  # type: ignore[misc]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
@@ -354,8 +354,8 @@ class RegularizedLeastSquares(Solution):
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if start is None:
             start = columns.cross * unit**2
-        # Full Gauss–Newton steps: on real pairs a trust region never shortened one (and those of optimistix do
-        # not take float32 while jax_enable_x64 is set).
+        # Full Gauss–Newton steps: on real pairs a trust region never shortened one (and those of optimistix
+        # do not take float32 while jax_enable_x64 is set).
         inner = lx.Normal(lx.CG(rtol=0.1 * self.tolerance, atol=0.1 * self.tolerance))
         solution: optx.Solution = optx.least_squares(
             lambda scaled, _: [term(scaled * unit) for term in terms],
