@@ -202,8 +202,8 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         metavar="START",
         default="shot",
         help="initial map: shot, wks, hks or wavelet descriptors, functional (the functional map that "
-        "preserves shot), landmarks:FILE (a source and a target vertex per line) or map:FILE (default: %(default)s, of the descriptors the only one that tells left "
-        "from right)",
+        "preserves shot), landmarks:FILE (a source and a target vertex per line) or map:FILE (default: "
+        "%(default)s; it and what builds on it alone tell left from right)",
     )
     group.add_argument(
         "--eigenvectors", type=_integer(1), default=100, help="per shape (default: %(default)s)"

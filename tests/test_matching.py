@@ -186,3 +186,14 @@ def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
     spectra = [compute_spectrum(mesh, 10) for mesh in (mesh_x, mesh_y)]
     distances = cdist(shot_descriptors(mesh_x), shot_descriptors(mesh_y))
     np.testing.assert_array_equal(initial_map(mesh_x, mesh_y, *spectra), distances.argmin(axis=1))
+
+
+def test_functional_start_preserves_descriptors_smoothly(pair):
+    """Among the same descriptors the functional map finds better matches than the nearest neighbours do."""
+    mesh_x, mesh_y, truth = pair
+    spectra = [compute_spectrum(mesh, 30) for mesh in (mesh_x, mesh_y)]
+    nearest, functional = (
+        mean_error(mesh_y, initial_map(mesh_x, mesh_y, *spectra, init=init), truth)
+        for init in ("shot", "functional")
+    )
+    assert functional < 0.5 * nearest

@@ -374,3 +374,41 @@ def test_adding_an_energy_of_ones_own(pair):
     solution = RegularizedLeastSquares(laplacian_commutativity=None, orthogonality=None, **PRECISE)
     c, _ = solution.minimize(energy, pair[0].eigenvalues, pair[1].eigenvalues)
     np.testing.assert_allclose(c, target, atol=1e-8)
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+@pytest.mark.parametrize("norm", ["area", "frobenius"])
+@pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])
+def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
+    """The residual of the stacked system of all scales and vertices is orthogonal to what C is fed."""
+    reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
+    x, y = (
+        Spectrum(
+            jnp.asarray(reference[f"{side}_eigenvalues"][:100]),
+            jnp.asarray(reference[f"{side}_eigenvectors"][:, :100]),
+            jnp.asarray(reference[f"{side}_vertex_areas"]),
+            jnp.ones(len(reference[f"{side}_vertex_areas"]), bool),
+        )
+        for side in "xy"
+    )
+    t = np.asarray(reference["T0"])
+    problem = WaveletPreservation(bank=bank, convention=convention).problem(x, y)
+    c, result = LeastSquares(norm).solve(problem, None, jnp.asarray(t), None)
+    assert result == RESULTS.successful
+    areas = np.asarray(x.vertex_areas)[:, None]
+    if convention == "pullback":
+        fed, returned = y.eigenvectors[t], x.eigenvectors
+    else:
+        fed, returned = x.eigenvectors * areas, (y.eigenvectors * y.vertex_areas[:, None])[t]
+    weights = {
+        ("pullback", "area"): areas,
+        ("pushforward", "area"): 1 / areas,
+    }.get((convention, norm), np.ones_like(areas))
+    g_out, g_in = (np.asarray(g) for g in problem.responses)
+    correlation, size = 0.0, 0.0
+    for scale_out, scale_in in zip(g_out, g_in, strict=True):
+        given = np.asarray(fed) * scale_in[None]
+        residual = given @ np.asarray(c).T - np.asarray(returned) * scale_out[None]
+        correlation += residual.T @ (weights * given)
+        size += np.linalg.norm(np.sqrt(weights) * given) * np.linalg.norm(np.sqrt(weights) * residual)
+    assert np.abs(correlation).max() < 1e-10 * size
