@@ -391,7 +391,7 @@ def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
         )
         for side in "xy"
     )
-    t = np.asarray(reference["T0"])
+    t = reference["T0"].astype(np.int32)
     problem = WaveletPreservation(bank=bank, convention=convention).problem(x, y)
     c, result = LeastSquares(norm).solve(problem, None, jnp.asarray(t), None)
     assert result == RESULTS.successful

@@ -1,0 +1,32 @@
+"""The code blocks of README and docs, run as a reader would, from top to bottom."""
+
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+from jaxsmw import creature_pair, write_mesh
+
+ROOT = Path(__file__).parents[1]
+
+
+def code_blocks(path: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/frames.md"])
+def test_code_blocks_run(page, tmp_path, monkeypatch):
+    pair = creature_pair(vertices=700)
+    write_mesh(tmp_path / "source.off", pair.source)
+    write_mesh(tmp_path / "target.ply", pair.target)
+    monkeypatch.chdir(tmp_path)
+    # Readers use JAX as it comes, without the strictness of these tests.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"), jax.enable_x64(False):
+        namespace: dict[str, object] = {}
+        blocks = code_blocks(ROOT / page)
+        assert len(blocks) >= 2
+        for block in blocks:
+            exec(compile(block, page, "exec"), namespace)
+    refinement = namespace["refinement"]
+    assert (refinement.pointwise_map >= 0).all()
