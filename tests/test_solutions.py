@@ -348,6 +348,8 @@ def test_float32_stays_float32_and_agrees(pair, pointwise_map):
         ({"descriptor_preservation": 1.0}, "go together"),
         ({"wavelet_preservation": None}, "nothing ties C"),
         ({"tolerance": 0.0}, "tolerance"),
+        ({"orthogonality": -1.0}, "orthogonality"),
+        ({"laplacian_commutativity": float("nan")}, "laplacian_commutativity"),
         ({"max_steps": 0}, "max_steps"),
     ],
 )

@@ -22,6 +22,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxsmw.core.checks import check_between, check_choice
+
 
 class FilterBank(eqx.Module):
     """A scaling function g_0 and wavelets g_1 … g_L, as functions of the eigenvalue.
@@ -50,19 +52,6 @@ def _leaf(value: ArrayLike | Sequence[float | int]) -> Array:
 def _require_filters(bank: FilterBank, filters: int, least: int) -> None:
     if filters < least:
         raise ValueError(f"a {type(bank).__name__} bank needs at least {least} filters, not {filters}")
-
-
-def _require_between(
-    owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf
-) -> None:
-    """Check a parameter, unless it is traced and has no value yet."""
-    if isinstance(value, jax.core.Tracer):
-        return
-    # On the host, because under jit even a comparison of constants is traced.
-    host = np.asarray(value)
-    if not ((low < host) & (host < high)).all():
-        limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"
-        raise ValueError(f"the {name} of {type(owner).__name__} must be {limits}, not {host}")
 
 
 # Partitions of unity made of transitions
@@ -152,7 +141,7 @@ class _TwoBands(_Transitions):
     edge: Float[Array, ""] = eqx.field(converter=_leaf, default=1 / 3)
 
     def __check_init__(self) -> None:
-        _require_between(self, "edge", self.edge, high=1.0)
+        check_between(self, "edge", self.edge, high=1.0)
 
     @abc.abstractmethod
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -329,7 +318,7 @@ class Gabor(FilterBank):
 
     def __check_init__(self) -> None:
         _require_filters(self, self.filters, 2)
-        _require_between(self, "width", self.width)
+        check_between(self, "width", self.width)
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -352,7 +341,7 @@ class _LogSpacedDilates(FilterBank):
 
     def __check_init__(self) -> None:
         _require_filters(self, self.filters, 2)
-        _require_between(self, "ratio", self.ratio, low=1.0)
+        check_between(self, "ratio", self.ratio, low=1.0)
 
     @abc.abstractmethod
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -436,7 +425,7 @@ class Heat(FilterBank):
     def __check_init__(self) -> None:
         if self.times.ndim != 1 or not self.times.size:
             raise ValueError(f"the times of Heat must be a list of at least one, not {self.times.shape}")
-        _require_between(self, "times", self.times)
+        check_between(self, "times", self.times)
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -464,8 +453,8 @@ class ExponentialWindow(FilterBank):
     slope: Float[Array, ""] = eqx.field(converter=_leaf, default=1.0)
 
     def __check_init__(self) -> None:
-        _require_between(self, "edge", self.edge)
-        _require_between(self, "slope", self.slope)
+        check_between(self, "edge", self.edge)
+        check_between(self, "slope", self.slope)
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -490,7 +479,7 @@ class LowPass(FilterBank):
     edge: Float[Array, ""] = eqx.field(converter=_leaf, default=0.25)
 
     def __check_init__(self) -> None:
-        _require_between(self, "edge", self.edge, high=1.0)
+        check_between(self, "edge", self.edge, high=1.0)
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -552,7 +541,7 @@ class Logarithm(Warp):
     strength: Float[Array, ""] = eqx.field(converter=_leaf, default=10.0)
 
     def __check_init__(self) -> None:
-        _require_between(self, "strength", self.strength)
+        check_between(self, "strength", self.strength)
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
         return jnp.log1p(jnp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
@@ -569,7 +558,7 @@ class Power(Warp):
     exponent: Float[Array, ""] = eqx.field(converter=_leaf, default=0.5)
 
     def __check_init__(self) -> None:
-        _require_between(self, "exponent", self.exponent)
+        check_between(self, "exponent", self.exponent)
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
         relative = points / eigenvalues[-1]
@@ -596,8 +585,7 @@ class ControlPoints(Warp):
     kind: Literal["linear", "cubic"] = eqx.field(static=True, default="linear")
 
     def __check_init__(self) -> None:
-        if self.kind not in ("linear", "cubic"):
-            raise ValueError(f'the kind of ControlPoints must be "linear" or "cubic", not "{self.kind}"')
+        check_choice("kind", self.kind, ("linear", "cubic"))
         if self.positions.ndim != 1 or self.positions.shape != self.values.shape or self.values.size < 2:
             raise ValueError(
                 "ControlPoints needs as many positions as values and at least 2, "

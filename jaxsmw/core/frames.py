@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsmw.core.checks import check_choice
 from jaxsmw.core.filters import FilterBank
 
 
@@ -48,14 +49,12 @@ def frame_bounds(
 
     **Raises:** `ValueError` if `over` is neither, or the resolution is below 2.
     """
-    if over == "eigenvalues":
-        points = eigenvalues
-    elif over == "interval":
+    check_choice("over", over, ("eigenvalues", "interval"))
+    points = eigenvalues
+    if over == "interval":
         if resolution < 2:
             raise ValueError(f"an interval needs a resolution of at least 2 points, not {resolution}")
         points = jnp.linspace(0, eigenvalues[-1], resolution, dtype=eigenvalues.dtype)
-    else:
-        raise ValueError(f'frame bounds are taken over "eigenvalues" or "interval", not "{over}"')
     covered = frame_function(bank(points, eigenvalues))
     return FrameBounds(jnp.min(covered), jnp.max(covered))
 

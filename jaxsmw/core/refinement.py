@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
+from jaxsmw.core.checks import check_choice
 from jaxsmw.core.filters import FilterBank, Meyer
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import decode, matching_objective
 from jaxsmw.core.results import RESULTS, where
-from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem, check_choice
+from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
 
 

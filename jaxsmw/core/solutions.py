@@ -16,6 +16,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
+from jaxsmw.core.checks import check_between, check_choice
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
     Convention,
@@ -219,6 +220,15 @@ class DescriptorPair(eqx.Module):
         return DescriptorPair(self.coefficients_y, self.coefficients_x, self.operators_y, self.operators_x)
 
 
+_TERMS = (
+    "wavelet_preservation",
+    "laplacian_commutativity",
+    "orthogonality",
+    "descriptor_preservation",
+    "descriptor_commutativity",
+)
+
+
 def _as_weight(value: Any) -> Array | None:
     return None if value is None else jnp.asarray(value, jnp.result_type(float))
 
@@ -241,8 +251,8 @@ class RegularizedLeastSquares(Solution):
 
     The many thousand columns of the wavelet and of the descriptor term are first reduced to k_in, exactly.
     Then `optimistix.least_squares` takes Gauss–Newton steps, each solved by conjugate gradients: no matrix
-    of size k² x k² is ever formed. It starts from the previous functional
-    map where there is one. The result can be differentiated, implicitly at the minimum.
+    of size k² x k² is ever formed. It starts from the previous functional map where there is one. The
+    result can be differentiated, implicitly at the minimum.
 
     **Arguments:**
 
@@ -253,7 +263,7 @@ class RegularizedLeastSquares(Solution):
     - `tolerance`: when to stop, relative to C and to the residuals.
     - `max_steps`: when to give up, with `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` if weights and descriptors do not fit together.
+    **Raises:** `ValueError` if a weight is not positive, or weights and descriptors do not fit together.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -268,6 +278,9 @@ class RegularizedLeastSquares(Solution):
 
     def __check_init__(self) -> None:
         check_choice("norm", self.norm, get_args(Norm))
+        for term in _TERMS:
+            if getattr(self, term) is not None:
+                check_between(self, term, getattr(self, term))
         if self.wavelet_preservation is None and self.descriptor_preservation is None:
             raise ValueError("without wavelet and descriptor preservation nothing ties C to the shapes")
         weighted = self.descriptor_preservation is not None or self.descriptor_commutativity is not None
@@ -369,12 +382,6 @@ class RegularizedLeastSquares(Solution):
             solution.result == optx.RESULTS.successful, RESULTS.successful, RESULTS.solver_not_converged
         )
         return solution.value * unit, where(jnp.all(determined), result, RESULTS.undetermined_functional_map)
-
-
-def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """**Raises:** `ValueError` if the value of an option is none of the choices."""
-    if value not in choices:
-        raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
 
 
 def _tolerance(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
