@@ -364,14 +364,16 @@ class RegularizedLeastSquares(Solution):
 
         # In units in which the quadratic terms curve the same everywhere, conjugate gradients take few steps.
         determined = curvature > ridge
+        solvable = jnp.all(determined)
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if start is None:
             start = columns.cross * unit**2
         # Full Gauss–Newton steps: on real pairs a trust region never shortened one (and those of optimistix
-        # do not take float32 while jax_enable_x64 is set).
-        inner = lx.Normal(lx.CG(rtol=0.1 * self.tolerance, atol=0.1 * self.tolerance))
+        # do not take float32 while jax_enable_x64 is set). What cannot be solved is not tried at length.
+        precision = 0.1 * self.tolerance
+        inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(k_out, k_in)))
         solution: optx.Solution = optx.least_squares(
-            lambda scaled, _: [term(scaled * unit) for term in terms],
+            lambda scaled, _: [jnp.where(solvable, term(scaled * unit), 0) for term in terms],
             optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
             jax.lax.stop_gradient(start / unit),
             max_steps=self.max_steps,
@@ -381,7 +383,7 @@ class RegularizedLeastSquares(Solution):
         result = where(
             solution.result == optx.RESULTS.successful, RESULTS.successful, RESULTS.solver_not_converged
         )
-        return solution.value * unit, where(jnp.all(determined), result, RESULTS.undetermined_functional_map)
+        return solution.value * unit, where(solvable, result, RESULTS.undetermined_functional_map)
 
 
 def _tolerance(matrix: Float[Array, "k k"]) -> Float[Array, ""]:

@@ -32,6 +32,7 @@ _INK, _FAINT = "#1d2430", "#79818c"
 # Okabe and Ito's colours, told apart by colour-blind eyes; lines differ in style as well, for print.
 _LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 
 
 def draw_correspondence(
@@ -255,6 +256,210 @@ def draw_quality_curves(
     for text in legend.get_texts():
         text.set_parse_math(False)
     _style(axes, grid=True)
+    return figure
+
+
+def draw_functions(
+    meshes: Sequence[Mesh],
+    functions: Sequence[Float[np.ndarray | Array, "functions n"]],
+    *,
+    titles: Sequence[str],
+    marked: Sequence[int],
+    up: Axis | None = None,
+    azimuth: float | None = None,
+) -> Figure:
+    """Functions on bodies: a row for each body and a column for each function, red above and blue below zero.
+
+    The colours of a column mean the same on all bodies; they are full where the absolute value exceeds that
+    of 99.5 % of the vertices.
+
+    **Arguments:**
+
+    - `meshes`: the bodies, n vertices each.
+    - `functions`: for each body the same functions, one value per vertex.
+    - `titles`: of the functions.
+    - `marked`: one vertex of each body, around which there is a ring.
+    - `up`, `azimuth`: as in `draw_correspondence`.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if the functions do not fit the meshes or the titles, or matplotlib is missing.
+    """
+    for mesh, values in zip(meshes, functions, strict=True):
+        if np.shape(values) != (len(titles), len(mesh.vertices)):
+            raise InputError(
+                f"{mesh.name}: {len(titles)} functions on {len(mesh.vertices)} vertices are "
+                f"{(len(titles), len(mesh.vertices))} numbers, but these have shape {np.shape(values)}."
+            )
+    standing = [stand(mesh, up) for mesh in meshes]
+    angle = choose_azimuth(standing) if azimuth is None else np.radians(azimuth)
+    axes = camera_axes(angle)[:2]
+    reach = [np.abs(mesh.vertices[mesh.used_vertices] @ axes.T).max(axis=0) for mesh in standing]
+    scale = np.min(np.divide((280, 420), 2 * np.max(reach, axis=0)))
+    cell_width = int(np.ceil(2 * scale * max(x for x, _ in reach)))
+    heights = [int(np.ceil(2 * scale * y)) for _, y in reach]
+    gap, header = 24, 60
+    width = len(titles) * (cell_width + gap) + gap
+    height = header + sum(heights) + gap * len(meshes)
+    figure = _new_figure(width / _DPI, height / _DPI)
+    import matplotlib
+
+    colormap = matplotlib.colormaps["RdBu_r"]
+    for column, title in enumerate(titles):
+        left = gap + column * (cell_width + gap)
+        center = (left + cell_width / 2) / width
+        figure.text(center, 1 - gap / height, title, ha="center", va="top", fontsize=8, color=_INK)
+        columns = [np.asarray(of_mesh[column], dtype=float) for of_mesh in functions]
+        limit = np.quantile(np.abs(np.concatenate(columns)), 0.995) or 1.0
+        top = header
+        for mesh, of_mesh, vertex, body_height in zip(standing, columns, marked, heights, strict=True):
+            colors = colormap(0.5 + 0.5 * np.clip(of_mesh / limit, -1, 1))[:, :3]
+            picture = render(mesh, colors, azimuth=angle, scale=scale, width=cell_width, height=body_height)
+            place = (left / width, 1 - (top + body_height) / height, cell_width / width, body_height / height)
+            drawing = figure.add_axes(place, label=f"{mesh.name}, {title}")
+            drawing.imshow(picture, aspect="auto", interpolation="nearest")
+            right, upwards = scale * axes @ mesh.vertices[vertex]
+            x, y = cell_width / 2 + right, body_height / 2 - upwards
+            for edge, linewidth in ((_INK, 1.6), ("white", 0.8)):
+                drawing.plot(x, y, "o", mfc="none", mec=edge, mew=linewidth, ms=3.5, clip_on=False)
+            drawing.set_axis_off()
+            top += body_height + gap
+    return figure
+
+
+def draw_forest(
+    panels: Mapping[str, Mapping[str, Float[np.ndarray, "rows 3"]]],
+    *,
+    rows: Sequence[str],
+    xlabel: str,
+    linear_up_to: float = 1.0,
+) -> Figure:
+    """A forest plot: estimates with their intervals, side by side for groups of cases, around a line at zero.
+
+    The scale is linear around zero and logarithmic beyond, because some differ by a little, some by a lot.
+
+    **Arguments:**
+
+    - `panels`: by the title of a panel and the name of a series, estimate, lower and upper end of each row;
+      NaN where there is none. All panels have the same series.
+    - `rows`: their names, from top to bottom.
+    - `xlabel`: what the estimates are.
+    - `linear_up_to`: the absolute value where the scale becomes logarithmic.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if a series does not have three numbers per row, or matplotlib is missing.
+    """
+    for title, series in panels.items():
+        for name, intervals in series.items():
+            if np.shape(intervals) != (len(rows), 3):
+                raise InputError(
+                    f"{title}, {name}: {len(rows)} rows need {(len(rows), 3)} numbers, but there are "
+                    f"{np.shape(intervals)}."
+                )
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    pitch = 0.075 * len(names) + 0.1
+    figure = _new_figure(2.6 + 3.3 * len(panels), 1.2 + pitch * len(rows), plot=True)
+    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+
+    grid = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    heights = np.arange(len(rows), dtype=float)
+    for axes, (title, series) in zip(grid, panels.items(), strict=True):
+        axes.set_xscale("symlog", linthresh=linear_up_to, linscale=1.0)
+        for band in range(0, len(rows), 2):
+            axes.axhspan(band - 0.5, band + 0.5, color="#f4f5f7", linewidth=0, zorder=0)
+        axes.axvline(0, color=_FAINT, linewidth=0.8, zorder=1)
+        for index, name in enumerate(names):
+            estimate, low, high = np.asarray(series[name], dtype=float).T
+            color = _LINE_COLORS[index % len(_LINE_COLORS)]
+            offset = 0.7 * ((index + 0.5) / len(names) - 0.5)
+            axes.hlines(heights + offset, low, high, color=color, linewidth=1.1, zorder=2)
+            axes.plot(
+                estimate,
+                heights + offset,
+                linestyle="none",
+                marker=_MARKERS[index % len(_MARKERS)],
+                markersize=3.4,
+                color=color,
+                label=name,
+                zorder=3,
+            )
+        axes.set_title(title, fontsize=9, color=_INK)
+        axes.set_xlabel(xlabel)
+        axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=linear_up_to))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:+g}".replace("-", "−") if value else "0")
+        _style(axes)
+        axes.grid(axis="x", color="#e6e8ec", linewidth=0.6)
+        axes.tick_params(axis="y", length=0)
+    grid[0].set_yticks(heights, rows)
+    grid[0].set_ylim(len(rows) - 0.5, -0.5)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=min(len(names), 4),
+        frameon=False,
+        fontsize=8,
+        labelcolor=_INK,
+    )
+    return figure
+
+
+def draw_heat_maps(
+    panels: Mapping[str, Float[np.ndarray, "rows columns"]],
+    *,
+    rows: tuple[str, Sequence[object]],
+    columns: tuple[str, Sequence[object]],
+    label: str,
+) -> Figure:
+    """Tables of positive numbers as colours on one logarithmic scale, each number written in its cell.
+
+    **Arguments:**
+
+    - `panels`: the tables by title.
+    - `rows`, `columns`: what they are, and their values.
+    - `label`: what the numbers are.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if a table does not fit the rows and columns or holds a number that is not
+    positive, or matplotlib is missing.
+    """
+    shape = len(rows[1]), len(columns[1])
+    for title, table in panels.items():
+        if np.shape(table) != shape or not (np.isfinite(table).all() and np.min(table) > 0):
+            raise InputError(f"{title}: needs {shape} positive numbers, but has shape {np.shape(table)}.")
+    size = 1.2 + (0.6 + 0.42 * shape[1]) * len(panels), max(2.6, 1.1 + 0.3 * shape[0])
+    figure = _new_figure(*size, plot=True)
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    everything = np.concatenate([np.ravel(table) for table in panels.values()])
+    norm = LogNorm(everything.min(), max(everything.max(), 1.01 * everything.min()))
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (title, table) in zip(grid, panels.items(), strict=True):
+        image = axes.imshow(table, cmap="cividis", norm=norm, aspect="auto", interpolation="nearest")
+        for (row, column), value in np.ndenumerate(np.asarray(table)):
+            text = f"{value:.1f}" if value < 100 else f"{value:.0f}"
+            color = _INK if norm(value) > 0.55 else "white"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
+        axes.set_title(title, fontsize=9, color=_INK)
+        axes.set_xlabel(columns[0])
+        axes.set_xticks(range(shape[1]), [str(value) for value in columns[1]])
+        _style(axes)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+    grid[0].set_ylabel(rows[0])
+    grid[0].set_yticks(range(shape[0]), [str(value) for value in rows[1]])
+    scale = figure.colorbar(image, ax=list(grid), pad=0.02)
+    scale.set_label(label, fontsize=8, color=_INK)
+    scale.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    scale.ax.yaxis.set_minor_locator(NullLocator())
+    scale.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    scale.outline.set_visible(False)
+    _style(scale.ax)
     return figure
 
 

@@ -1,0 +1,255 @@
+"""Which frame, which update, which convention: one study on remeshed FAUST and TOSCA, figures and tables.
+
+    python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
+                                     [--workers N] [--quick]
+
+DATA_DIRECTORY holds `faust_r` and `tosca_r` (each with `off/`, `corres/` and `test_pairs.txt`). The output
+directory gets everything from this one command: `summary.md` with all tables, the figures, `results.csv` (a
+row per pair and variant), `parameters.csv` (eigenvectors x filters x iterations), `invariance.csv`,
+`times.csv`, and `provenance.json` with versions, machine, seeds and settings. Interrupted in whatever way,
+it goes on where it was when started again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import multiprocessing
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from frame_study import measurement, variants
+from frame_study.drawing import draw_figures
+from frame_study.journal import Journal, Row, claim_directory, code_digest
+from frame_study.measurement import (
+    DATA_SETS,
+    INVARIANCE_FRAMES,
+    PairName,
+    Settings,
+    Task,
+    files_of,
+    measure,
+    measure_times,
+    start_worker,
+    use_one_core,
+)
+from frame_study.summary import Study, write_summary
+from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
+from tqdm import tqdm
+
+import jaxsmw
+from jaxsmw import InputError
+from jaxsmw.files import atomic_write
+from jaxsmw.report.figures import check_drawable
+from jaxsmw.report.summary import make_directory, provenance
+
+QUICK = Settings(
+    pairs=2,
+    iterations=2,
+    evaluated_points=200,
+    wavelet_centers=20,
+    frames=QUICK_FRAMES,
+    parameter_pairs=1,
+    parameter_eigenvectors=(20, 40),
+    parameter_filters=(2, 6),
+    parameter_iterations=2,
+)
+
+
+def evenly_spread(items: Sequence, count: int) -> list:
+    """So many of the items, from the first to the last; all if there are no more."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items)))
+    return [items[int(place)] for place in np.round(places)]
+
+
+def select_pairs(data: Path, count: int) -> list[PairName]:
+    pairs = []
+    for data_set in DATA_SETS:
+        listing = data / data_set / "test_pairs.txt"
+        if not listing.is_file():
+            raise InputError(f"{listing}: is missing; give the directory that holds {data_set}.")
+        lines = [line.split() for line in listing.read_text("utf-8").splitlines()]
+        pairs += [PairName(data_set, *line) for line in evenly_spread(lines, count)]
+    return pairs
+
+
+def digest(data: Path, pairs: list[PairName]) -> str:
+    """A hash of all files that pairs are read from."""
+    found = hashlib.sha256()
+    for pair in pairs:
+        for name in pair[1:]:
+            mesh, truth = files_of(data, pair.data_set, name)
+            found.update(mesh.read_bytes())
+            found.update(truth.read_bytes())
+    return found.hexdigest()[:16]
+
+
+class Journals:
+    """The tables that grow while the study runs, and what they should hold in the end."""
+
+    def __init__(self, output: Path, pairs: list[PairName], settings: Settings, measured: list[Variant]):
+        self.pairs, self.settings, self.measured = pairs, settings, measured
+        self.parameters_of = {
+            pair
+            for data_set in DATA_SETS
+            for pair in evenly_spread([p for p in pairs if p.data_set == data_set], settings.parameter_pairs)
+        }
+        self.parameters_wanted = [
+            (k, filters) for k in settings.parameter_eigenvectors for filters in settings.parameter_filters
+        ]
+        self.invariance_wanted = [
+            (frame, scale) for frame in INVARIANCE_FRAMES for scale in range(settings.number_of_filters)
+        ]
+        self.results = Journal(output / "results.csv", [*PairName._fields, *Variant._fields])
+        self.parameters = Journal(output / "parameters.csv", [*PairName._fields, "eigenvectors", "filters"])
+        self.invariance = Journal(output / "invariance.csv", [*PairName._fields, "frame", "scale"])
+
+    def missing(self) -> Iterator[Task]:
+        """What is left to do, by pair."""
+        for pair in self.pairs:
+            parameters = self.parameters_wanted if pair in self.parameters_of else []
+            task = Task(
+                pair,
+                [variant for variant in self.measured if (*pair, *variant) not in self.results],
+                [cell for cell in parameters if (*pair, *cell) not in self.parameters],
+                [cell for cell in self.invariance_wanted if (*pair, *cell) not in self.invariance],
+            )
+            if task.variants or task.parameters or task.wavelets:
+                yield task
+
+    def append(self, results: list[Row], parameters: list[Row], invariance: list[Row]) -> None:
+        self.results.append(results)
+        self.parameters.append(parameters)
+        self.invariance.append(invariance)
+
+    def sort(self) -> None:
+        """Put all rows in an order that does not depend on which worker was first."""
+        self.results.sort((*pair, *variant) for pair in self.pairs for variant in self.measured)
+        self.parameters.sort(
+            (*pair, *cell)
+            for pair in self.pairs
+            if pair in self.parameters_of
+            for cell in self.parameters_wanted
+        )
+        self.invariance.sort((*pair, *cell) for pair in self.pairs for cell in self.invariance_wanted)
+
+
+def run(data: Path, journals: Journals, workers: int) -> None:
+    """Measure what is missing, pair by pair in worker processes, and keep each pair as it comes."""
+    tasks = list(journals.missing())
+    if not tasks:
+        return
+    progress = tqdm(
+        total=len(journals.pairs),
+        initial=len(journals.pairs) - len(tasks),
+        desc="pairs",
+        unit="pair",
+        smoothing=0,
+    )
+    with progress, Workers(min(workers, len(tasks))) as executor:
+        futures = [executor.submit(measure, data, task, journals.settings) for task in tasks]
+        for future in as_completed(futures):
+            journals.append(*future.result())
+            progress.update()
+
+
+class Workers(ProcessPoolExecutor):
+    """Worker processes that end at once when the work is given up."""
+
+    def __init__(self, count: int):
+        super().__init__(count, multiprocessing.get_context("spawn"), initializer=start_worker)
+
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
+        if kind is not None:
+            for process in multiprocessing.active_children():
+                process.terminate()
+        self.shutdown(wait=True, cancel_futures=True)
+
+
+def measured_times(
+    output: Path, data: Path, pairs: list[PairName], measured: list[Variant], settings: Settings
+) -> list[Row]:
+    """Times per update, measured in one process while nothing else of this study runs; once per directory."""
+    path = output / "times.csv"
+    key = [*PairName._fields, *Variant._fields]
+    if not path.exists():
+        print("measuring times per update", file=sys.stderr)
+        firsts = [next(pair for pair in pairs if pair.data_set == data_set) for data_set in DATA_SETS]
+        with Workers(1) as executor:
+            rows = executor.submit(measure_times, data, firsts, measured, settings).result()
+        with atomic_write(path) as temporary:
+            Journal(temporary, key).append(rows)
+    return Journal(path, key).rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument(
+        "--output", type=Path, help="default: docs/frames, with --quick a new temporary directory"
+    )
+    parser.add_argument("--pairs", type=int, help="per data set (default: 40, with --quick 2)")
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="default: %(default)s")
+    parser.add_argument("--quick", action="store_true", help="a small study that tries everything out")
+    options = parser.parse_args()
+    settings = replace(QUICK if options.quick else Settings(), seed=options.seed)
+    if options.pairs is not None:
+        settings = replace(settings, pairs=options.pairs)
+    output = options.output or (
+        Path(tempfile.mkdtemp(prefix="jaxsmw-frames-")) if options.quick else Path("docs/frames")
+    )
+    try:
+        if settings.pairs < 1 or options.workers < 1:
+            raise InputError("a study needs at least 1 pair per data set and 1 worker.")
+        study(options.data, output, settings, options.workers)
+    except InputError as error:
+        sys.exit(f"compare_frames: {error}")
+    except KeyboardInterrupt:
+        sys.exit(f"\ninterrupted; the same command with --output {output} goes on from here")
+
+
+def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
+    """Measure, summarise and draw."""
+    check_drawable()
+    use_one_core()
+    pairs = select_pairs(data, settings.pairs)
+    library = Path(jaxsmw.__file__).parent
+    code = [
+        *sorted(
+            path for part in ("core", "geometry", "evaluation") for path in (library / part).glob("*.py")
+        ),
+        library / "matching.py",
+        Path(variants.__file__),
+        Path(measurement.__file__),
+    ]
+    origin = {
+        "settings": asdict(settings),
+        "versions": {**provenance(), "code": code_digest(code)},
+        "data": {"digest of the pairs' files": digest(data, pairs)},
+    }
+    claim_directory(make_directory(output), origin)
+    every = variants.variants(settings.frames)
+    same = twins(every, frames(settings.number_of_filters))
+    measured = [variant for variant in every if variant not in same]
+    journals = Journals(output, pairs, settings, measured)
+    run(data, journals, workers)
+    journals.sort()
+    times = measured_times(output, data, pairs, measured, settings)
+    whole = Study(journals.results.rows, times, pairs, every, same, settings)
+    with atomic_write(output / "summary.md") as temporary:
+        temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")
+    draw_figures(output, data, whole, journals.parameters.rows)
+    print(output / "summary.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,416 @@
+"""What is measured on one pair of shapes. Everything here runs in worker processes, on one core each."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from benchmark_speed import medians
+from jax import lax
+from jaxtyping import Array, Float, Float64, Int, Int32, Int64
+
+from frame_study.journal import Row
+from frame_study.variants import (
+    DEFAULT,
+    TabulatedPreservation,
+    Variant,
+    frames,
+    least_kernel_eigenvalue,
+    refiner,
+    tabulate,
+)
+from jaxsmw import read_mesh
+from jaxsmw.core.filters import FilterBank, Meyer
+from jaxsmw.core.refinement import Problem, Refiner
+from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
+from jaxsmw.evaluation.metrics import GeodesicError
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching import initial_map
+
+DATA_SETS = ("faust_r", "tosca_r")
+# Shapes are padded to a multiple of this, so that one compiled program serves a whole data set.
+_PADDING = 1024
+MOVE = 0.02
+"""How far a match must go, straight and in square roots of the area, to count as moved: about one edge."""
+INVARIANCE_FRAMES = ("Meyer", "cubic spline")
+SEARCH = DEFAULT._replace(update="nearest neighbors")
+"""What the other half of an iteration is called among the times."""
+_SERIES = "error", "changed", "moved"
+_TIMED_RUNS = 9
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the results depend on besides data and code; every field goes into `provenance.json`."""
+
+    pairs: int = 40
+    seed: int = 0
+    number_of_eigenvectors: int = 100
+    number_of_filters: int = 6
+    iterations: int = 5
+    evaluated_points: int = 1000
+    wavelet_centers: int = 200
+    frames: tuple[str, ...] = tuple(frames(6))
+    parameter_pairs: int = 10
+    parameter_eigenvectors: tuple[int, ...] = (20, 40, 60, 80, 100, 120, 150)
+    parameter_filters: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
+    parameter_iterations: int = 10
+
+
+class PairName(NamedTuple):
+    data_set: str
+    source: str
+    target: str
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A pair of shapes, its start and its truth, ready to be refined.
+
+    **Attributes:**
+
+    - `mesh_x`, `mesh_y`: source and target.
+    - `spectra`: of source and target, padded.
+    - `start`: the initial map, padded like the source.
+    - `sources`, `targets`: the evaluated part of the ground truth, vertices of X and of Y (p,).
+    - `distances`: from the targets to all vertices of Y, (p, n), in square roots of its area.
+    """
+
+    mesh_x: Mesh
+    mesh_y: Mesh
+    spectra: tuple[Spectrum, Spectrum]
+    start: Int32[Array, " m"]
+    sources: Int64[np.ndarray, " p"]
+    targets: Int64[np.ndarray, " p"]
+    distances: Float64[np.ndarray, "p n"]
+
+    def error(self, pointwise_map: Int[np.ndarray, " m"]) -> float:
+        """The mean geodesic error; `jaxsmw.evaluation.metrics.geodesic_error` with the distances at hand."""
+        errors = self.distances[np.arange(len(self.sources)), pointwise_map[self.sources]]
+        return GeodesicError(errors, self.sources, "strips").mean
+
+
+def files_of(data: Path, data_set: str, shape: str) -> tuple[Path, Path]:
+    """Where a shape's mesh and its part of the ground truth are."""
+    return data / data_set / "off" / f"{shape}.off", data / data_set / "corres" / f"{shape}.vts"
+
+
+def read_pair(data: Path, name: PairName) -> tuple[Mesh, Mesh, GroundTruth]:
+    """Source, target and what is true of them."""
+    files = [files_of(data, name.data_set, shape) for shape in (name.source, name.target)]
+    mesh_x, mesh_y = (read_mesh(mesh) for mesh, _ in files)
+    return mesh_x, mesh_y, read_ground_truth([truth for _, truth in files], mesh_x, mesh_y)
+
+
+def load_pair(data: Path, name: PairName, settings: Settings) -> Pair:
+    """Read a pair and compute what all variants share."""
+    mesh_x, mesh_y, truth = read_pair(data, name)
+    k = settings.number_of_eigenvectors
+    spectra = compute_spectrum(mesh_x, k), compute_spectrum(mesh_y, k)
+    start = initial_map(mesh_x, mesh_y, *spectra)
+    padded = pad(spectra[0]), pad(spectra[1])
+    rows = np.random.default_rng(settings.seed).permutation(len(truth.source_vertices))
+    rows = rows[: settings.evaluated_points]
+    sources, targets = truth.source_vertices[rows], np.asarray(truth.targets)[rows]
+    different, row = np.unique(targets, return_inverse=True)
+    distances = geodesic_distances(mesh_y, different) / np.sqrt(mesh_y.area)
+    return Pair(mesh_x, mesh_y, padded, pad_map(start, padded[0]), sources, targets, distances[row])
+
+
+def pad(spectrum: Spectrum) -> Spectrum:
+    """The shape with masked vertices up to a multiple of a common size."""
+    n = -len(spectrum.mask) % _PADDING
+    return Spectrum(
+        spectrum.eigenvalues,
+        jnp.pad(spectrum.eigenvectors, ((0, n), (0, 0))),
+        jnp.pad(spectrum.vertex_areas, (0, n)),
+        jnp.pad(spectrum.mask, (0, n)),
+    )
+
+
+def pad_map(pointwise_map: Int[np.ndarray, " m"], padded: Spectrum) -> Int32[Array, " padded_m"]:
+    """A pointwise map from a padded shape, its masked vertices sent to vertex 0."""
+    n = len(padded.mask) - len(pointwise_map)
+    return jnp.pad(jnp.asarray(pointwise_map, jnp.int32), (0, n))
+
+
+class Trajectory(NamedTuple):
+    """What `jaxsmw.refine` goes through: the map of each iteration, the last C, and how it ended."""
+
+    maps: Int32[Array, "iterations m"]
+    functional_map: Float[Array, "k_out k_in"]
+    result: RESULTS
+
+
+@eqx.filter_jit
+def refine_recording(
+    refiner: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum, start: Int32[Array, " m"], iterations: int
+) -> Trajectory:
+    """`jaxsmw.refine` with the map of every iteration kept."""
+    problem = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
+
+    def update(
+        pointwise_map: Array, previous: Array | None, before: RESULTS
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        functional_map, result = refiner.update(problem, pointwise_map, previous)
+        finite = jnp.all(jnp.isfinite(functional_map)) | (result != RESULTS.successful)
+        result = where(finite, result, RESULTS.nonfinite_functional_map)
+        return functional_map, where(before == RESULTS.successful, result, before)
+
+    def turn(state: tuple[Array, RESULTS], _: None) -> tuple[tuple[Array, RESULTS], Array]:
+        functional_map, result = state
+        pointwise_map = refiner.recover(problem, functional_map)
+        return update(pointwise_map, functional_map, result), pointwise_map
+
+    successful: Any = RESULTS.successful
+    state = update(start, None, successful)
+    (functional_map, result), maps = lax.scan(turn, state, None, length=iterations - 1)
+    last = refiner.recover(problem, functional_map)
+    return Trajectory(jnp.concatenate([maps, last[None]]), functional_map, result)
+
+
+class Diagnosis(NamedTuple):
+    """The energy (5), area norm, of the last C under the last map, and the condition of the first problem."""
+
+    energy: Float[Array, ""]
+    energy_of_zero: Float[Array, ""]
+    condition_number: Float[Array, ""]
+
+
+@eqx.filter_jit
+def diagnose(
+    refiner: TabulatedPreservation,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    start: Int32[Array, " m"],
+    pointwise_map: Int32[Array, " m"],
+    functional_map: Float[Array, "k_out k_in"],
+) -> Diagnosis:
+    problem = refiner.problem(spectrum_x, spectrum_y)
+    energy = problem.energy(pointwise_map)
+    condition_number = jnp.asarray(jnp.nan)
+    if isinstance(refiner.solution, LeastSquares | RegularizedLeastSquares):
+        condition_number = problem.energy(start, norm=refiner.solution.norm).condition_number()
+    return Diagnosis(energy(functional_map), energy.constant, condition_number)
+
+
+@lru_cache
+def _frames(number_of_filters: int) -> dict[str, FilterBank]:
+    return frames(number_of_filters)
+
+
+def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings: Settings) -> list[Row]:
+    """Refine with every variant; a row of the main table for each."""
+    banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
+    start = np.asarray(pair.start)
+    rows = []
+    for variant in wanted:
+        began = time.perf_counter()
+        method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
+        maps, functional_map, result = refine_recording(
+            method, *pair.spectra, pair.start, settings.iterations
+        )
+        seconds = time.perf_counter() - began
+        diagnosis = diagnose(method, *pair.spectra, pair.start, maps[-1], functional_map)
+        least = least_kernel_eigenvalue(
+            variant, banks[variant.frame], pair.spectra[0], number_of_filters=filters
+        )
+        successful = bool(result == RESULTS.successful)
+        rows.append(
+            {
+                **name._asdict(),
+                **variant._asdict(),
+                "result": "successful" if successful else sentence(result),
+                **_follow(pair, [start, *np.asarray(maps)], successful),
+                **{name: f"{value:.6g}" for name, value in diagnosis._asdict().items()},
+                "least_kernel_eigenvalue": f"{least:.3g}",
+                "seconds": f"{seconds:.4f}",
+            }
+        )
+    return rows
+
+
+def sentence(result: RESULTS) -> str:
+    """What a result says to a person."""
+    return RESULTS[result]  # type: ignore[misc]
+
+
+def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
+    """Errors of the maps, and the shares of matches that each iteration changes and moves; or NaN."""
+    m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
+    row: dict[str, float] = {"error_0": pair.error(maps[0])}
+    for i, (before, after) in enumerate(pairwise(maps), start=1):
+        if successful:
+            steps = np.linalg.norm(positions[before[:m]] - positions[after[:m]], axis=1)
+            measured = pair.error(after), np.mean(before[:m] != after[:m]), np.mean(steps > MOVE)
+        else:
+            measured = (np.nan,) * 3
+        row |= {f"{what}_{i}": value for what, value in zip(_SERIES, measured, strict=True)}
+    return {name: f"{value:.7f}" for name, value in row.items()}
+
+
+def measure_parameters(
+    pair: Pair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
+) -> list[Row]:
+    """Meyer, filtering, with other numbers of eigenvectors and filters; the error after each iteration."""
+    if not wanted:
+        return []
+    largest = max(k for k, _ in wanted)
+    spectra = [pad(compute_spectrum(mesh, largest)) for mesh in (pair.mesh_x, pair.mesh_y)]
+    most = max(settings.parameter_filters)
+    rows = []
+    for k, filters in wanted:
+        cut = spectra[0].truncate(k), spectra[1].truncate(k)
+        tables = [tabulate(Meyer(filters), spectrum, most) for spectrum in cut]
+        method = TabulatedPreservation(responses_x=tables[0], responses_y=tables[1])
+        maps = refine_recording(method, *cut, pair.start, settings.parameter_iterations).maps
+        series = [np.asarray(pair.start), *np.asarray(maps)]
+        rows.append(
+            {
+                **name._asdict(),
+                "eigenvectors": k,
+                "filters": filters,
+                **{f"error_{i}": f"{pair.error(T):.7f}" for i, T in enumerate(series)},
+            }
+        )
+    return rows
+
+
+def measure_invariance(
+    pair: Pair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
+) -> list[Row]:
+    """How much wavelets at corresponding centres differ at corresponding points, per frame and scale.
+
+    Medians over the centres of the relative difference `|a - b| / sqrt((|a|² + |b|²) / 2)` (0 for equal ones,
+    sqrt(2) for unrelated ones) and of the correlation.
+    """
+    banks = _frames(settings.number_of_filters)
+    vertices = pair.sources, pair.targets
+    rows = []
+    for frame, scale in wanted:
+        a, b = (
+            wavelets(banks[frame], spectrum, scale, points[: settings.wavelet_centers])[:, points]
+            for spectrum, points in zip(pair.spectra, vertices, strict=True)
+        )
+        squares = (np.sum(a**2, axis=1) + np.sum(b**2, axis=1)) / 2
+        difference = np.sqrt(np.sum((a - b) ** 2, axis=1) / squares)
+        centered = [values - values.mean(axis=1, keepdims=True) for values in (a, b)]
+        norms = np.prod([np.linalg.norm(values, axis=1) for values in centered], axis=0)
+        correlation = np.sum(centered[0] * centered[1], axis=1) / norms
+        rows.append(
+            {
+                **name._asdict(),
+                "frame": frame,
+                "scale": scale,
+                "relative_difference": f"{np.median(difference):.6f}",
+                "correlation": f"{np.median(correlation):.6f}",
+            }
+        )
+    return rows
+
+
+def wavelets(
+    bank: FilterBank, spectrum: Spectrum, scale: int, centers: Int[np.ndarray, " c"]
+) -> Float64[np.ndarray, "c n"]:
+    """Wavelets of one scale around some vertices, on all vertices (eq. 2); 0 is the scaling function."""
+    eigenvectors = np.asarray(spectrum.eigenvectors, dtype=float)
+    response = np.asarray(bank(spectrum.eigenvalues, spectrum.eigenvalues)[scale], dtype=float)
+    return (eigenvectors[centers] * response) @ eigenvectors.T
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is still missing of one pair."""
+
+    name: PairName
+    variants: list[Variant]
+    parameters: list[tuple[int, int]]
+    wavelets: list[tuple[str, int]]
+
+
+def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list[Row], list[Row]]:
+    """Rows of the three tables."""
+    pair = load_pair(data, task.name, settings)
+    return (
+        measure_variants(pair, task.name, task.variants, settings),
+        measure_parameters(pair, task.name, task.parameters, settings),
+        measure_invariance(pair, task.name, task.wavelets, settings),
+    )
+
+
+@eqx.filter_jit
+def _update(
+    method: Refiner, problem: Problem, pointwise_map: Int32[Array, " m"], previous: Float[Array, "k_out k_in"]
+) -> Float[Array, "k_out k_in"]:
+    return method.update(problem, pointwise_map, previous)[0]
+
+
+@eqx.filter_jit
+def _search(
+    method: Refiner, problem: Problem, functional_map: Float[Array, "k_out k_in"]
+) -> Int32[Array, " m"]:
+    return method.recover(problem, functional_map)
+
+
+def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
+    """Median milliseconds of the second update, and of one search, of every variant, measured in turns."""
+    banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
+    candidates: dict[Variant, Callable[[], Array]] = {}
+    rows = []
+    for name in names:
+        pair = load_pair(data, name, settings)
+        for variant in wanted:
+            method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
+            problem = eqx.filter_jit(method.prepare)(*pair.spectra, sampled=False)
+            first, _ = method.update(problem, pair.start, None)
+            following = _search(method, problem, first)
+            candidates[variant] = partial(_update, method, problem, following, first)
+        candidates[SEARCH] = partial(_search, method, problem, first)
+        rows += [
+            {**name._asdict(), **variant._asdict(), "milliseconds": f"{1e3 * seconds:.4f}"}
+            for variant, seconds in medians(candidates, _TIMED_RUNS).items()
+        ]
+    return rows
+
+
+# Worker processes
+
+
+def start_worker() -> None:
+    """Leave Ctrl-C to the parent process, and end with it however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def use_one_core() -> None:
+    """Have this process compute on the CPU, and every process started from now on with one core of it."""
+    jax.config.update("jax_platforms", "cpu")
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PJRT_NPROC"):
+        os.environ[variable] = "1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"

@@ -1,0 +1,249 @@
+"""What is compared: frames, ways to a functional map, conventions, and ablations that separate causes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int
+from scipy.optimize import brentq
+
+from jaxsmw.core.filters import (
+    CubicSpline,
+    ExponentialWindow,
+    FilterBank,
+    Gabor,
+    HalfCosine,
+    Heat,
+    Held,
+    Identity,
+    Itersine,
+    Logarithm,
+    LowPass,
+    MexicanHat,
+    Meyer,
+    Papadakis,
+    Regular,
+    Simoncelli,
+    SimpleTight,
+    SpectralDistribution,
+    Warped,
+)
+from jaxsmw.core.frames import frame_bounds, tighten
+from jaxsmw.core.functional_map import Convention, multiscale_kernel
+from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares, Solution, WaveletProblem
+from jaxsmw.core.spectrum import Spectrum
+
+CONVENTIONS: tuple[Convention, ...] = ("pullback", "pushforward")
+
+
+class Variant(NamedTuple):
+    """One row of the comparison."""
+
+    frame: str
+    update: str
+    convention: Convention
+
+
+DEFAULT = Variant("Meyer", "filtering", "pullback")
+
+UPDATES: dict[str, Solution] = {
+    "filtering": Filtering(),
+    "least squares (area)": LeastSquares(),
+    "least squares (Frobenius)": LeastSquares(norm="frobenius"),
+    "regularized": RegularizedLeastSquares(),
+}
+
+
+def frames(number_of_filters: int) -> dict[str, FilterBank]:
+    """All frames and controls; so many filters where a bank leaves the choice."""
+    # Octaves, as those of the Meyer frame.
+    heat = Heat(jnp.asarray(2.0 ** np.arange(number_of_filters)))
+    return {
+        "Meyer": Meyer(number_of_filters),
+        "simple tight": SimpleTight(number_of_filters),
+        "itersine": Itersine(number_of_filters),
+        "half-cosine": HalfCosine(number_of_filters),
+        "Meyer, warped by the spectrum": Warped(Meyer(number_of_filters), SpectralDistribution()),
+        "itersine, warped by the spectrum": Warped(Itersine(number_of_filters), SpectralDistribution()),
+        "half-cosine, warped by a logarithm": Warped(HalfCosine(number_of_filters), Logarithm()),
+        "Held (2 filters)": Held(),
+        "Simoncelli (2 filters)": Simoncelli(),
+        "Papadakis (2 filters)": Papadakis(),
+        "regular (2 filters)": Regular(),
+        "cubic spline": CubicSpline(number_of_filters),
+        "Mexican hat": MexicanHat(number_of_filters),
+        "heat": heat,
+        "Gabor": Gabor(number_of_filters),
+        "cubic spline, tightened": tighten(CubicSpline(number_of_filters)),
+        "Mexican hat, tightened": tighten(MexicanHat(number_of_filters)),
+        "heat, tightened": tighten(heat),
+        "Gabor, tightened": tighten(Gabor(number_of_filters)),
+        "exponential window (1 filter)": ExponentialWindow(),
+        "low-pass (1 filter)": LowPass(),
+        "no filter": Identity(),
+    }
+
+
+QUICK_FRAMES = ("Meyer", "cubic spline", "cubic spline, tightened", "low-pass (1 filter)", "no filter")
+
+# Not in the grid of frames and updates: (frame, update), in both conventions.
+ABLATIONS = (("Meyer", "projected"), ("no filter", "projected"), ("Meyer", "band mask"))
+
+
+def variants(frame_names: Iterable[str]) -> list[Variant]:
+    """Every frame with every update in both conventions, and the ablations."""
+    grid = [(frame, update) for frame in frame_names for update in UPDATES]
+    return [Variant(*cell, convention) for convention in CONVENTIONS for cell in (*grid, *ABLATIONS)]
+
+
+def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
+    """Variants that provably equal another one, with that one.
+
+    Least squares in the pushforward convention and the area norm divides the columns of the filtered map by
+    the frame function, which is one for a Parseval frame.
+    """
+    return {
+        name: name._replace(update="filtering")
+        for name in names
+        if name.update == "least squares (area)"
+        and name.convention == "pushforward"
+        and is_parseval(banks[name.frame])
+    }
+
+
+def is_parseval(bank: FilterBank) -> bool:
+    """Whether the frame function is one on all of [0, lambda_max], up to rounding."""
+    bounds = eqx.filter_jit(frame_bounds)(bank, jnp.arange(100.0), over="interval")
+    return bool(np.allclose(bounds, 1, atol=1e-5))
+
+
+class TabulatedPreservation(WaveletPreservation):
+    """`WaveletPreservation` with the bank's responses on both shapes computed beforehand.
+
+    So all banks run the same compiled program.
+    """
+
+    responses_x: Float[Array, "filters k_x"] = eqx.field(kw_only=True)
+    responses_y: Float[Array, "filters k_y"] = eqx.field(kw_only=True)
+
+    def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
+        return WaveletProblem(
+            spectrum_x, spectrum_y, self.responses_x, self.responses_y, self.convention, sampled
+        )
+
+
+class BandMask(Filtering):
+    """`Filtering` with a given mask in the place of the frame's kernel."""
+
+    mask: Float[Array, "k_out k_in"] = eqx.field(kw_only=True)
+
+    def prepare(self, problem: WaveletProblem) -> tuple[Array, Array]:
+        _, dual_out = super().prepare(problem)
+        return self.mask, dual_out
+
+
+class Projected(Solution):
+    """The orthogonal matrix nearest to another solution (ICP's, after filtering)."""
+
+    solution: Solution
+
+    def prepare(self, problem: WaveletProblem) -> Any:
+        return self.solution.prepare(problem)
+
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: Any,
+        pointwise_map: Int[Array, " m"],
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
+        left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
+        return left @ right, result
+
+
+def refiner(
+    variant: Variant,
+    bank: FilterBank,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    *,
+    number_of_filters: int,
+) -> TabulatedPreservation:
+    """The refiner of a variant on a pair; filters that a bank has less than `number_of_filters` are zero."""
+    tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
+    if variant.update == "projected":
+        solution: Solution = Projected(Filtering())
+    elif variant.update == "band mask":
+        spectrum_out, spectrum_in = spectrum_x, spectrum_y
+        kernel = multiscale_kernel(*tables)
+        if variant.convention == "pushforward":
+            spectrum_out, spectrum_in, kernel = spectrum_y, spectrum_x, kernel.T
+        octaves_out, octaves_in = (
+            octaves(np.asarray(spectrum.eigenvalues), number_of_filters)
+            for spectrum in (spectrum_out, spectrum_in)
+        )
+        half_width = matching_half_width(octaves_out, octaves_in, float(kernel.sum()))
+        solution = BandMask(mask=jnp.asarray(band_mask(octaves_out, octaves_in, half_width), kernel.dtype))
+    else:
+        solution = UPDATES[variant.update]
+    return TabulatedPreservation(
+        solution=solution, convention=variant.convention, responses_x=tables[0], responses_y=tables[1]
+    )
+
+
+_sample_bank: Callable[[FilterBank, Array], Array] = eqx.filter_jit(
+    lambda bank, eigenvalues: bank(eigenvalues, eigenvalues)
+)
+
+
+def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Float[Array, "filters k"]:
+    """The responses of a bank on a shape, with zero filters up to the given number."""
+    responses = _sample_bank(bank, spectrum.eigenvalues)
+    return jnp.pad(responses, ((0, number_of_filters - len(responses)), (0, 0)))
+
+
+def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
+    """How many octaves eigenvalues lie above the scaling function's edge of the Meyer frame, at least 0."""
+    edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
+    return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
+
+
+def band_mask(
+    octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], half_width: float
+) -> Float64[np.ndarray, "k_out k_in"]:
+    """A smooth mask around the diagonal that comes from no frame.
+
+    One up to half the half-width (in octaves), one half at the half-width, zero from one and a half times the
+    half-width on, a cosine in between. Its flat top makes it indefinite, which no `G^T G` is.
+    """
+    distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
+    return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))
+
+
+def matching_half_width(
+    octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], total: float
+) -> float:
+    """The half-width, in octaves, at which the entries of the mask have a given sum."""
+    return brentq(lambda width: band_mask(octaves_out, octaves_in, width).sum() - total, 1e-3, 100)
+
+
+def least_kernel_eigenvalue(
+    variant: Variant, bank: FilterBank, spectrum: Spectrum, *, number_of_filters: int
+) -> float:
+    """Smallest over largest eigenvalue of what a variant multiplies C_0 with, from a shape to itself.
+
+    Not negative, up to rounding, for every filter bank; `band_mask` is indefinite.
+    """
+    method = refiner(variant, bank, spectrum, spectrum, number_of_filters=number_of_filters)
+    kernel = multiscale_kernel(method.responses_x, method.responses_y)
+    if isinstance(method.solution, BandMask):
+        kernel = method.solution.mask
+    eigenvalues = np.linalg.eigvalsh(np.asarray(kernel, dtype=float))
+    return float(eigenvalues[0] / eigenvalues[-1])
