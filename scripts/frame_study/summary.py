@@ -131,6 +131,11 @@ class Study:
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
+    def difference(self, variant: Variant, reference: Variant, data_set: str) -> Interval:
+        """One variant minus another on the pairs on which neither failed."""
+        differences = self.errors(variant, data_set) - self.errors(reference, data_set)
+        return mean_interval(differences[np.isfinite(differences)], self.settings.seed)
+
     def relative_energy(self, variant: Variant, data_set: str) -> float:
         """The mean of E(C) / E(0), which makes frames of different height comparable."""
         ratios = self.numbers(variant, data_set, "energy") / self.numbers(variant, data_set, "energy_of_zero")
@@ -193,7 +198,16 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             f"## Mean error and difference, {convention}, both data sets",
             _overview(study, convention),
         ]
-    parts += ["## Ablations, both data sets", _ablations(study)]
+    parts += [
+        "## Ablations, both data sets",
+        _ablations(study),
+        "## What the update changes within a frame, pullback",
+        "Paired differences of the error, one update minus another.",
+        _updates_within_frames(study),
+        "## What tightening changes, pullback",
+        "Paired differences of the error, the canonical tight frame of a bank minus the bank.",
+        _tightening(study),
+    ]
     for convention in CONVENTIONS:
         for name in study.pairs:
             parts += [
@@ -262,6 +276,41 @@ def _ablations(study: Study) -> str:
         "\n\nThe last column: smallest over largest eigenvalue of what C₀ is multiplied with, for X with "
         "itself, the least of all pairs; a frame's cannot be negative."
     )
+
+
+def _updates_within_frames(study: Study) -> str:
+    contrasts = (
+        ("least squares (area)", "filtering"),
+        ("least squares (Frobenius)", "least squares (area)"),
+        ("regularized", "least squares (area)"),
+    )
+    rows = []
+    for frame in study.settings.frames:
+        cells = []
+        for update, reference in contrasts:
+            pair = (Variant(frame, name, "pullback") for name in (update, reference))
+            cells.append(_interval(study.difference(*pair, "both")))
+        rows.append([frame, *cells])
+    return _table(["frame", *(f"{update} − {reference}" for update, reference in contrasts)], rows)
+
+
+def _tightening(study: Study) -> str:
+    rows = []
+    for frame in study.settings.frames:
+        tightened = f"{frame}, tightened"
+        if tightened in study.settings.frames:
+            contrasts = [
+                *(
+                    (Variant(tightened, name, "pullback"), Variant(frame, name, "pullback"))
+                    for name in UPDATES
+                ),
+                (
+                    Variant(tightened, "filtering", "pullback"),
+                    Variant(frame, "least squares (area)", "pullback"),
+                ),
+            ]
+            rows.append([frame, *(_interval(study.difference(*pair, "both")) for pair in contrasts)])
+    return _table(["frame", *UPDATES, "tightened, filtering − plain, least squares (area)"], rows)
 
 
 def _details(study: Study, convention: Convention, data_set: str) -> str:
