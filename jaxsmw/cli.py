@@ -211,10 +211,10 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     _add_bank(group)
     group.add_argument(
         "--solution",
-        choices=("filtering", "least-squares", "frobenius", "regularized"),
+        choices=("filtering", "least-squares", "least-squares-frobenius", "regularized"),
         default="filtering",
         help="how the functional map is found: filtering is for banks that are tight frames, least-squares "
-        "is exact for all (frobenius: with every vertex counting the same), regularized adds commutativity "
+        "is exact for all (-frobenius: with every vertex counting the same), regularized adds commutativity "
         "with the Laplacian and orthogonality (default: %(default)s)",
     )
     group.add_argument("--iterations", type=_integer(1), default=3, help="(default: %(default)s)")
@@ -473,6 +473,8 @@ def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options)
     if options.output and Path(options.output).suffix != ".npz":
         raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
+    if not options.figure and (options.filters is not None or options.bank != "meyer"):
+        raise InputError("--bank and --filters are for --figure: name a figure, or leave them out.")
     bank = _bank(options)
     import numpy as np
 
@@ -574,12 +576,10 @@ def _refiner(options: argparse.Namespace) -> WaveletPreservation:
     from jaxsmw.core import solutions
     from jaxsmw.core.refinement import WaveletPreservation
 
-    solution: solutions.Solution
-    match options.solution:
-        case "filtering":
-            solution = solutions.Filtering()
-        case "regularized":
-            solution = solutions.RegularizedLeastSquares()
-        case norm:
-            solution = solutions.LeastSquares("frobenius" if norm == "frobenius" else "area")
-    return WaveletPreservation(bank=_bank(options), solution=solution)
+    choices: dict[str, solutions.Solution] = {
+        "filtering": solutions.Filtering(),
+        "least-squares": solutions.LeastSquares(),
+        "least-squares-frobenius": solutions.LeastSquares("frobenius"),
+        "regularized": solutions.RegularizedLeastSquares(),
+    }
+    return WaveletPreservation(bank=_bank(options), solution=choices[options.solution])

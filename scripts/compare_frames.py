@@ -74,7 +74,9 @@ def select_pairs(data: Path, count: int) -> list[PairName]:
         listing = data / data_set / "test_pairs.txt"
         if not listing.is_file():
             raise InputError(f"{listing}: is missing; give the directory that holds {data_set}.")
-        lines = [line.split() for line in listing.read_text("utf-8").splitlines()]
+        lines = [line.split() for line in listing.read_text("utf-8").splitlines() if line.strip()]
+        if wrong := [line for line in lines if len(line) != 2]:
+            raise InputError(f"{listing}: {' '.join(wrong[0])!r} does not name two shapes; correct the line.")
         pairs += [PairName(data_set, *line) for line in evenly_spread(lines, count)]
     return pairs
 
@@ -152,11 +154,20 @@ def run(data: Path, journals: Journals, workers: int) -> None:
         unit="pair",
         smoothing=0,
     )
+    failed: list[str] = []
     with progress, Workers(min(workers, len(tasks))) as executor:
-        futures = [executor.submit(measure, data, task, journals.settings) for task in tasks]
+        futures = {executor.submit(measure, data, task, journals.settings): task for task in tasks}
         for future in as_completed(futures):
-            journals.append(*future.result())
+            if (error := future.exception()) is None:
+                journals.append(*future.result())
+            else:
+                failed.append(f"{' '.join(futures[future].name)} ({error})")
             progress.update()
+    if failed:
+        raise InputError(
+            f"{len(failed)} pairs could not be measured, the others are kept: {'; '.join(failed)}. Mend "
+            "them and start again."
+        )
 
 
 class Workers(ProcessPoolExecutor):
@@ -244,6 +255,8 @@ def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
     run(data, journals, workers)
     journals.sort()
     times = measured_times(output, data, pairs, measured, settings)
+    if code_digest(code) != origin["versions"]["code"]:
+        raise InputError(f"{output}: the code changed while it was measured: remove it and start again.")
     whole = Study(journals.results.rows, times, pairs, every, same, settings)
     with atomic_write(output / "summary.md") as temporary:
         temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")

@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from synthetic import random_spectrum
 
 from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
+from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import QuadraticEnergy
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
@@ -68,7 +69,8 @@ def objective(c, pair, pointwise_map, weights, descriptors, *, convention="pullb
     weights = OFF | weights
     total = 0.0
     if weights["wavelet_preservation"]:
-        total += weights["wavelet_preservation"] * problem.energy(pointwise_map)(c)
+        height = jnp.mean(frame_function(problem.responses[0]))
+        total += weights["wavelet_preservation"] / height * problem.energy(pointwise_map)(c)
     if weights["laplacian_commutativity"]:
         largest = max(eigenvalues_out[-1], eigenvalues_in[-1])
         commutator = jnp.diag(eigenvalues_out) @ c - c @ jnp.diag(eigenvalues_in)
@@ -275,11 +277,50 @@ def test_a_map_to_too_few_vertices_is_named(pair):
         def __call__(self, points, eigenvalues):
             return jnp.ones_like(points)[None]
 
+    wavelets_alone = RegularizedLeastSquares(laplacian_commutativity=None, orthogonality=None)
     for dtype in (jnp.float32, jnp.float64):
         x, y = (as_type(spectrum, dtype) for spectrum in pair)
-        refiner = WaveletPreservation(bank=Flat(), solution=LeastSquares())
-        refined = refine(x, y, jnp.full(M, 5), refiner=refiner)
-        assert refined.result == RESULTS.singular_system
+        for solution in (LeastSquares(), wavelets_alone):
+            refiner = WaveletPreservation(bank=Flat(), solution=solution)
+            refined = refine(x, y, jnp.full(M, 5), refiner=refiner)
+            assert refined.result == RESULTS.singular_system
+
+
+def test_the_height_of_a_bank_does_not_weigh(pair, pointwise_map):
+    class Raised(FilterBank):
+        def __call__(self, points, eigenvalues):
+            return 3.0 * CubicSpline(4)(points, eigenvalues)
+
+    solution = RegularizedLeastSquares(orthogonality=0.5, **PRECISE)
+    plain, raised = (solve(solution, pair, pointwise_map, bank=bank)[0] for bank in (None, Raised()))
+    np.testing.assert_allclose(raised, plain, atol=1e-7)
+
+
+def test_new_weights_do_not_compile_again(pair, pointwise_map):
+    traces = []
+
+    @eqx.filter_jit
+    def run(solution):
+        traces.append(1)
+        return solve(solution, pair, pointwise_map)[0]
+
+    first, second = (run(RegularizedLeastSquares(orthogonality=weight)) for weight in (0.1, 0.7))
+    assert len(traces) == 1 and jnp.max(jnp.abs(first - second)) > 1e-3
+
+
+def test_all_solutions_in_a_batch_of_refinements_and_on_samples():
+    pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(2)]
+    maps = jnp.stack([jnp.asarray(np.random.default_rng(s).integers(0, N, M)) for s in range(2)])
+    samples_x, samples_y = jnp.arange(0, M, 2), jnp.arange(0, N, 2)
+    x, y = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *spectra) for spectra in zip(*pairs, strict=True))
+    for solution in (LeastSquares(), LeastSquares("frobenius"), RegularizedLeastSquares(**PRECISE)):
+        options = {"refiner": WaveletPreservation(solution=solution), "iterations": 2}
+        options |= {"samples_x": samples_x, "samples_y": samples_y}
+        batch = jax.vmap(lambda x, y, t, options=options: refine(x, y, t, **options))(x, y, maps)
+        for i, pair in enumerate(pairs):
+            alone = refine(*pair, maps[i], **options)
+            assert alone.result == RESULTS.successful
+            np.testing.assert_allclose(batch.functional_map[i], alone.functional_map, atol=1e-7)
 
 
 def test_giving_up_is_named(pair, pointwise_map):
@@ -349,6 +390,7 @@ def test_float32_stays_float32_and_agrees(pair, pointwise_map):
         ({"wavelet_preservation": None}, "nothing ties C"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"orthogonality": -1.0}, "orthogonality"),
+        ({"orthogonality": jnp.ones(3)}, "one number"),
         ({"laplacian_commutativity": float("nan")}, "laplacian_commutativity"),
         ({"max_steps": 0}, "max_steps"),
     ],
@@ -376,6 +418,8 @@ def test_adding_an_energy_of_ones_own(pair):
     solution = RegularizedLeastSquares(laplacian_commutativity=None, orthogonality=None, **PRECISE)
     c, _ = solution.minimize(energy, pair[0].eigenvalues, pair[1].eigenvalues)
     np.testing.assert_allclose(c, target, atol=1e-8)
+    with pytest.raises(ValueError, match="go together"):
+        solution.minimize(None, pair[0].eigenvalues, pair[1].eigenvalues)
 
 
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])

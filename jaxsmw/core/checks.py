@@ -1,13 +1,21 @@
-"""Checks of settings, made when a module is built."""
+"""Settings of modules: how they become arrays, and checks made when a module is built."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
+
+
+def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
+    """A continuous setting as an array of the default float type, so that it is traced."""
+    return jnp.asarray(value, dtype=float)
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -17,12 +25,16 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def check_between(
-    owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf
+    owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Check a parameter, unless it is traced and has no value yet.
+    """Check a parameter; not its value while it is traced and has none yet.
 
-    **Raises:** `ValueError` if it is not finite and strictly between the limits.
+    **Raises:** `ValueError` if it has another number of dimensions, or is not finite and strictly between
+    the limits.
     """
+    if value.ndim != ndim:
+        wanted = "one number" if ndim == 0 else "a list of numbers"
+        raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
     # On the host, because under jit even a comparison of constants is traced.

@@ -12,17 +12,15 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxsmw.core.checks import check_between, check_choice
+from jaxsmw.core.checks import as_parameter, check_between, check_choice
 
 
 class FilterBank(eqx.Module):
@@ -43,10 +41,6 @@ class FilterBank(eqx.Module):
         - `points`: where to sample, in any order, in [0, lambda_max].
         - `eigenvalues`: those of the shape that the bank is laid out on, ascending; lambda_max is the last.
         """
-
-
-def _leaf(value: ArrayLike | Sequence[float | int]) -> Array:
-    return jnp.asarray(value, dtype=float)
 
 
 def _require_filters(bank: FilterBank, filters: int, least: int) -> None:
@@ -138,7 +132,7 @@ class SimpleTight(_DyadicBands):
 class _TwoBands(_Transitions):
     """A low-pass and a high-pass filter that meet above an edge."""
 
-    edge: Float[Array, ""] = eqx.field(converter=_leaf, default=1 / 3)
+    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=1 / 3)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge, high=1.0)
@@ -198,7 +192,7 @@ class Papadakis(_TwoBands):
       does not come to one.
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=_leaf, default=3 / 8)
+    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=3 / 8)
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
         return jnp.clip(1.5 * excess, 0, 1)
@@ -314,7 +308,7 @@ class Gabor(FilterBank):
     """
 
     filters: int = eqx.field(static=True, default=6)
-    width: Float[Array, ""] = eqx.field(converter=_leaf, default=0.5)
+    width: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
 
     def __check_init__(self) -> None:
         _require_filters(self, self.filters, 2)
@@ -336,7 +330,7 @@ class _LogSpacedDilates(FilterBank):
     """One wavelet at log-spaced scales, and a scaling function for what lies below `lambda_max / ratio`."""
 
     filters: int = eqx.field(static=True, default=6)
-    ratio: Float[Array, ""] = eqx.field(converter=_leaf, default=20.0)
+    ratio: Float[Array, ""] = eqx.field(converter=as_parameter, default=20.0)
     normalize: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
@@ -393,7 +387,7 @@ class MexicanHat(_LogSpacedDilates):
 
     The wavelet of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014, at the
     scales of Hammond, Vandergheynst and Gribonval 2011. Not tight: with the default parameters its frame
-    bounds are 0.177 and 0.271.
+    bounds are 0.177 and 0.270.
 
     **Arguments:**
 
@@ -420,12 +414,12 @@ class Heat(FilterBank):
     - `times`: (filters,) of diffusion, in units of 1 / lambda_max; positive.
     """
 
-    times: Float[Array, " filters"] = eqx.field(converter=_leaf)
+    times: Float[Array, " filters"] = eqx.field(converter=as_parameter)
 
     def __check_init__(self) -> None:
-        if self.times.ndim != 1 or not self.times.size:
-            raise ValueError(f"the times of Heat must be a list of at least one, not {self.times.shape}")
-        check_between(self, "times", self.times)
+        check_between(self, "times", self.times, ndim=1)
+        if not self.times.size:
+            raise ValueError("the times of Heat must be a list of at least one")
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -449,8 +443,8 @@ class ExponentialWindow(FilterBank):
     - `slope`: how steep, `-2 slope / edge` at one half; positive.
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=_leaf, default=0.2)
-    slope: Float[Array, ""] = eqx.field(converter=_leaf, default=1.0)
+    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.2)
+    slope: Float[Array, ""] = eqx.field(converter=as_parameter, default=1.0)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge)
@@ -476,7 +470,7 @@ class LowPass(FilterBank):
     - `edge`: up to where it is one, relative to lambda_max, in (0, 1); it vanishes from twice the edge on.
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=_leaf, default=0.25)
+    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.25)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge, high=1.0)
@@ -538,7 +532,7 @@ class Logarithm(Warp):
     - `strength`: positive.
     """
 
-    strength: Float[Array, ""] = eqx.field(converter=_leaf, default=10.0)
+    strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
 
     def __check_init__(self) -> None:
         check_between(self, "strength", self.strength)
@@ -555,7 +549,7 @@ class Power(Warp):
     - `exponent`: positive.
     """
 
-    exponent: Float[Array, ""] = eqx.field(converter=_leaf, default=0.5)
+    exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
 
     def __check_init__(self) -> None:
         check_between(self, "exponent", self.exponent)
@@ -580,8 +574,8 @@ class ControlPoints(Warp):
     - `kind`: `"linear"` between the points, or `"cubic"` with a continuous slope.
     """
 
-    positions: Float[Array, " c"] = eqx.field(converter=_leaf)
-    values: Float[Array, " c"] = eqx.field(converter=_leaf)
+    positions: Float[Array, " c"] = eqx.field(converter=as_parameter)
+    values: Float[Array, " c"] = eqx.field(converter=as_parameter)
     kind: Literal["linear", "cubic"] = eqx.field(static=True, default="linear")
 
     def __check_init__(self) -> None:
@@ -622,7 +616,8 @@ class ControlPoints(Warp):
 class SpectralDistribution(Warp):
     """How many eigenvalues lie below, interpolated linearly: gives every band equally many of them.
 
-    The warp of Shuman, Wiesmeyr, Holighaus and Vandergheynst 2015. An eigenvalue is mapped to its index, a
+    Uniform translates of it all pass equally many eigenvalues, the first and the last half as many. The warp
+    of Shuman, Wiesmeyr, Holighaus and Vandergheynst 2015. An eigenvalue is mapped to its index, a
     repeated one to the mean of its indices, so that all of an eigenspace is filtered alike. Where none is
     repeated, the responses at the eigenvalues depend on nothing but their indices. By Weyl's law the
     eigenvalues of a surface grow nearly evenly, so there this warp is close to the identity.

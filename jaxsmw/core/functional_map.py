@@ -36,13 +36,15 @@ Parseval frame that is filtering alone, eq. (8). `docs/frames.md` derives all of
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
+from jax import lax
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.spectrum import Spectrum
@@ -50,6 +52,9 @@ from jaxsmw.core.spectrum import Spectrum
 Convention = Literal["pullback", "pushforward"]
 PseudoInverse = Literal["area", "least_squares"]
 Norm = Literal["area", "frobenius"]
+
+# GPUs would otherwise multiply in less than float32, and singular systems would pass for regular ones.
+_product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
@@ -64,7 +69,7 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     """
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
-    gram = spectrum.eigenvectors.T @ spectrum.eigenvectors
+    gram = _product(spectrum.eigenvectors.T, spectrum.eigenvectors)
     return jsp.linalg.cho_solve(jsp.linalg.cho_factor(gram), spectrum.eigenvectors.T).T
 
 
@@ -102,15 +107,15 @@ def project_matches(
     """`encode` with the dual eigenvectors of the shape that C leads to already at hand."""
     # A padded vertex of X has a zero row on its side of the product, whatever its entry of T says.
     if convention == "pullback":
-        return dual_out.T @ eigenvectors_in[pointwise_map]
-    return dual_out[pointwise_map].T @ eigenvectors_in
+        return _product(dual_out.T, eigenvectors_in[pointwise_map])
+    return _product(dual_out[pointwise_map].T, eigenvectors_in)
 
 
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
     """All scales in one: `sum_l g_l(Lambda_out) C g_l(Lambda_in)` is `C` times this kernel, elementwise."""
-    return responses_out.T @ responses_in
+    return _product(responses_out.T, responses_in)
 
 
 class QuadraticEnergy(eqx.Module):
@@ -137,7 +142,9 @@ class QuadraticEnergy(eqx.Module):
 
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
         """The energy of a functional map; non-negative up to rounding, being a difference of large sums."""
-        return jnp.sum(functional_map * (functional_map @ self.gram - 2 * self.cross)) + self.constant
+        return (
+            jnp.sum(functional_map * (_product(functional_map, self.gram) - 2 * self.cross)) + self.constant
+        )
 
     def __add__(self, other: QuadraticEnergy) -> QuadraticEnergy:
         return QuadraticEnergy(
@@ -150,13 +157,24 @@ class QuadraticEnergy(eqx.Module):
     def minimizer(self) -> Float[Array, "k_out k_in"]:
         """The functional map of least energy, by one Cholesky factorisation of the gram matrix.
 
-        NaN or without meaning where the gram matrix is singular; see `condition_number`.
+        NaN or without meaning where the gram matrix is singular; see `is_regular`.
         """
         return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
 
     def cholesky(self) -> Float[Array, "k_in k_in"]:
         """The lower Cholesky factor of the gram matrix."""
         return jnp.linalg.cholesky(self.gram, symmetrize_input=False)
+
+    def is_regular(self) -> Bool[Array, ""]:
+        """Whether the gram matrix can be told from a singular one in this precision."""
+        # The pivots of a singular matrix are rounding errors, or NaN from the first negative one on.
+        pivots = jnp.diagonal(self.cholesky()) ** 2
+        return jnp.min(pivots) > self.rounding()
+
+    def rounding(self) -> Float[Array, ""]:
+        """What cannot be told from zero in the gram matrix: its largest entry times k times the precision."""
+        relative = self.gram.shape[0] * jnp.finfo(self.gram.dtype).eps
+        return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
 
     def condition_number(self) -> Float[Array, ""]:
         """Largest over smallest eigenvalue of the gram matrix; infinite if it is singular."""
@@ -206,7 +224,7 @@ def wavelet_energy(
             fed = fed * areas_x
             returned = jnp.where(spectrum_x.mask[:, None], returned, 0)
     return QuadraticEnergy(
-        (weights * fed).T @ fed * multiscale_kernel(responses_in, responses_in),
-        (weights * returned).T @ fed * multiscale_kernel(responses_out, responses_in),
+        _product((weights * fed).T, fed) * multiscale_kernel(responses_in, responses_in),
+        _product((weights * returned).T, fed) * multiscale_kernel(responses_out, responses_in),
         jnp.sum(weights * returned**2, axis=0) @ frame_function(responses_out),
     )

@@ -25,10 +25,11 @@ class RESULTS(eqx.Enumeration):
         "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
     )
     undetermined_functional_map = (
-        "Nothing determines a part of the functional map, to working precision: the frame function of the "
-        "filter bank vanishes at an eigenvalue (or, without wavelets, every descriptor does). Use a bank "
-        "that covers the whole spectrum (mostly the lowest band is missing, for which a low-pass filter "
-        "helps, or the highest), fewer eigenvectors, or solution=Filtering(), which solves nothing."
+        "Nothing determines a part of the functional map, to working precision: at an eigenvalue the frame "
+        "function of the filter bank (or, without wavelets, all that the descriptors hold) vanishes beside "
+        "its largest value. Use a bank that covers the whole spectrum (mostly the lowest band is missing, "
+        "for which a low-pass filter helps, or the highest), descriptors without their mean and of like "
+        "size, fewer eigenvectors, float64, or solution=Filtering(), which solves nothing."
     )
     singular_system = (
         "The least-squares problem for the functional map is singular, to working precision: the pointwise "

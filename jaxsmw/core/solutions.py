@@ -16,7 +16,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxsmw.core.checks import check_between, check_choice
+from jaxsmw.core.checks import as_parameter, check_between, check_choice
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
     Convention,
@@ -159,14 +159,11 @@ class LeastSquares(Solution):
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """The closed form."""
         energy = problem.energy(pointwise_map, norm=self.norm)
-        # The pivots of a singular matrix are rounding errors, or NaN from the first negative one on.
-        pivots = jnp.diagonal(energy.cholesky()) ** 2
-        tolerance = _tolerance(energy.gram)
-        regular = jnp.min(pivots) > tolerance * jnp.max(jnp.diagonal(energy.gram))
         _, responses_in = problem.responses
         frame = frame_function(responses_in)
-        covers = jnp.min(frame) > tolerance * jnp.max(frame)
-        result = where(regular, RESULTS.successful, RESULTS.singular_system)
+        precision = frame.shape[0] * jnp.finfo(frame.dtype).eps
+        covers = jnp.min(frame) > precision * jnp.max(frame)
+        result = where(energy.is_regular(), RESULTS.successful, RESULTS.singular_system)
         return energy.minimizer(), where(covers, result, RESULTS.undetermined_functional_map)
 
 
@@ -208,8 +205,12 @@ class DescriptorPair(eqx.Module):
         sides = []
         for values, spectrum in ((descriptors_x, spectrum_x), (descriptors_y, spectrum_y)):
             dual = dual_eigenvectors(spectrum, "area")
-            multiply = jax.vmap(lambda f, dual=dual, s=spectrum: (dual * f[:, None]).T @ s.eigenvectors)
-            sides.append((dual.T @ values, multiply(values.T) if operators else None))
+
+            def multiply(f: Array, dual: Array = dual, phi: Array = spectrum.eigenvectors) -> Array:
+                return (dual * f[:, None]).T @ phi
+
+            # One at a time: side by side they would take d arrays of the eigenvectors' size.
+            sides.append((dual.T @ values, jax.lax.map(multiply, values.T) if operators else None))
         (coefficients_x, operators_x), (coefficients_y, operators_y) = sides
         return cls(coefficients_x, coefficients_y, operators_x, operators_y)
 
@@ -230,7 +231,7 @@ _TERMS = (
 
 
 def _as_weight(value: Any) -> Array | None:
-    return None if value is None else jnp.asarray(value, jnp.result_type(float))
+    return None if value is None else as_parameter(value)
 
 
 class RegularizedLeastSquares(Solution):
@@ -246,8 +247,10 @@ class RegularizedLeastSquares(Solution):
     - descriptor preservation, `||C F_in - F_out||^2` (Ovsjanikov et al. 2012);
     - descriptor commutativity, `sum_d ||C D_in - D_out C||^2` (Nogneng and Ovsjanikov 2017).
 
-    The descriptor terms are scaled so that `F_out` and all `D_out` have the squared norm k_out, which is
-    what the wavelet term of a Parseval frame comes to at C = 0. So weights near one are comparable.
+    The terms are scaled so that what C = 0 or either side of a difference costs is about k_out: the wavelet
+    term is divided by the mean of the frame function, which is one for a Parseval frame, `F_out` and all
+    `D_out` are brought to the squared norm k_out. So weights near one are comparable, whatever the height
+    of a bank or the units of descriptors.
 
     The many thousand columns of the wavelet and of the descriptor term are first reduced to k_in, exactly.
     Then `optimistix.least_squares` takes Gauss–Newton steps, each solved by conjugate gradients: no matrix
@@ -303,7 +306,11 @@ class RegularizedLeastSquares(Solution):
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Minimise, starting from the previous functional map."""
-        energy = problem.energy(pointwise_map, norm=self.norm)
+        energy = None
+        if self.wavelet_preservation is not None:
+            responses_out, _ = problem.responses
+            height = jnp.mean(frame_function(responses_out))
+            energy = (1 / height) * problem.energy(pointwise_map, norm=self.norm)
         eigenvalues_out, eigenvalues_in = (spectrum.eigenvalues for spectrum in problem.spectra)
         return self.minimize(
             energy, eigenvalues_out, eigenvalues_in, convention=problem.convention, start=previous
@@ -322,11 +329,15 @@ class RegularizedLeastSquares(Solution):
 
         **Arguments:**
 
-        - `energy`: of any kind; None for the other terms alone.
+        - `energy`: of any kind, weighed by `wavelet_preservation`; None if and only if that is None.
         - `eigenvalues_out`, `eigenvalues_in`: of the shape that C leads to, and that it comes from.
         - `convention`: says on which side of `descriptors` those are.
         - `start`: where to start; by default a guess.
+
+        **Raises:** `ValueError` for an energy without a weight, or a weight without an energy.
         """
+        if (energy is None) != (self.wavelet_preservation is None):
+            raise ValueError("an energy and a weight for it, wavelet_preservation, go together")
         (k_out,), (k_in,), dtype = eigenvalues_out.shape, eigenvalues_in.shape, eigenvalues_in.dtype
         descriptors = None if self.descriptors is None else self.descriptors.oriented(convention)
         columns = QuadraticEnergy.zero(k_out, k_in, dtype)
@@ -340,12 +351,11 @@ class RegularizedLeastSquares(Solution):
 
         # The Cholesky factor has the same inner products as all the columns that were summed over, so it
         # can stand for them. A ridge below rounding lets it exist also where other terms have to decide.
-        diagonal = jnp.diagonal(columns.gram)
-        ridge = _tolerance(columns.gram) * jnp.max(diagonal)
+        ridge = columns.rounding()
         factor = jnp.linalg.cholesky(columns.gram + ridge * jnp.eye(k_in, dtype=dtype))
         target = jsp.linalg.solve_triangular(factor, columns.cross.T, lower=True).T
         terms = [lambda c: c @ factor - target]
-        curvature = jnp.broadcast_to(diagonal[None, :], (k_out, k_in))
+        curvature = jnp.broadcast_to(jnp.diagonal(columns.gram)[None, :], (k_out, k_in))
         if self.laplacian_commutativity is not None:
             largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
             gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
@@ -361,6 +371,9 @@ class RegularizedLeastSquares(Solution):
             d_in: Any = descriptors.operators_y
             scale = jnp.sqrt(self.descriptor_commutativity.astype(dtype) * k_out / jnp.sum(d_out**2))
             terms.append(lambda c: scale * (c[None] @ d_in - d_out @ c[None]))
+            diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
+            squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
+            curvature = curvature + scale**2 * (squares - 2 * diagonal_out.T @ diagonal_in)
 
         # In units in which the quadratic terms curve the same everywhere, conjugate gradients take few steps.
         determined = curvature > ridge
@@ -372,20 +385,18 @@ class RegularizedLeastSquares(Solution):
         # do not take float32 while jax_enable_x64 is set). What cannot be solved is not tried at length.
         precision = 0.1 * self.tolerance
         inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(k_out, k_in)))
-        solution: optx.Solution = optx.least_squares(
-            lambda scaled, _: [jnp.where(solvable, term(scaled * unit), 0) for term in terms],
-            optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
-            jax.lax.stop_gradient(start / unit),
-            max_steps=self.max_steps,
-            adjoint=optx.ImplicitAdjoint(inner),
-            throw=False,
-        )
+        with jax.default_matmul_precision("highest"):
+            solution: optx.Solution = optx.least_squares(
+                lambda scaled, _: [jnp.where(solvable, term(scaled * unit), 0) for term in terms],
+                optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
+                jax.lax.stop_gradient(start / unit),
+                max_steps=self.max_steps,
+                adjoint=optx.ImplicitAdjoint(inner),
+                throw=False,
+            )
         result = where(
             solution.result == optx.RESULTS.successful, RESULTS.successful, RESULTS.solver_not_converged
         )
+        if len(terms) == 1:
+            result = where(columns.is_regular(), result, RESULTS.singular_system)
         return solution.value * unit, where(solvable, result, RESULTS.undetermined_functional_map)
-
-
-def _tolerance(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
-    """What is zero beside one after a matrix was summed up and factorised in this precision."""
-    return jnp.asarray(matrix.shape[0] * jnp.finfo(matrix.dtype).eps, matrix.dtype)

@@ -357,8 +357,16 @@ def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list
 
 
 @eqx.filter_jit
+def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Problem:
+    return method.prepare(spectrum_x, spectrum_y, sampled=False)
+
+
+@eqx.filter_jit
 def _update(
-    method: Refiner, problem: Problem, pointwise_map: Int32[Array, " m"], previous: Float[Array, "k_out k_in"]
+    method: Refiner,
+    problem: Problem,
+    pointwise_map: Int32[Array, " m"],
+    previous: Float[Array, "k_out k_in"] | None,
 ) -> Float[Array, "k_out k_in"]:
     return method.update(problem, pointwise_map, previous)[0]
 
@@ -379,8 +387,8 @@ def measure_times(data: Path, names: list[PairName], wanted: list[Variant], sett
         pair = load_pair(data, name, settings)
         for variant in wanted:
             method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
-            problem = eqx.filter_jit(method.prepare)(*pair.spectra, sampled=False)
-            first, _ = method.update(problem, pair.start, None)
+            problem = _prepare(method, *pair.spectra)
+            first = _update(method, problem, pair.start, None)
             following = _search(method, problem, first)
             candidates[variant] = partial(_update, method, problem, following, first)
         candidates[SEARCH] = partial(_search, method, problem, first)

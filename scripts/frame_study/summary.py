@@ -12,7 +12,7 @@ from scipy.stats import bootstrap
 
 from frame_study.journal import Row
 from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, Settings
-from frame_study.variants import CONVENTIONS, DEFAULT, UPDATES, Variant
+from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.core.functional_map import Convention
 
 CONFIDENCE = 0.95
@@ -47,8 +47,10 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
-    if np.ptp(values) == 0 or len(values) < 3:  # nothing to resample, or nothing to correct with
-        return Interval(mean, *(float(end) for end in (values.min(), values.max())))
+    if np.ptp(values) == 0:  # as of the default with itself
+        return Interval(mean, mean, mean)
+    if len(values) < 3:  # too few to say anything
+        return Interval(mean, np.nan, np.nan)
     found = bootstrap(
         (values,),
         np.mean,
@@ -131,10 +133,12 @@ class Study:
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
-    def difference(self, variant: Variant, reference: Variant, data_set: str) -> Interval:
-        """One variant minus another on the pairs on which neither failed."""
+    def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
+        """One variant minus another on the pairs on which neither failed, and on how many one did."""
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
-        return mean_interval(differences[np.isfinite(differences)], self.settings.seed)
+        both = np.isfinite(differences)
+        text = _interval(mean_interval(differences[both], self.settings.seed))
+        return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
         """The mean of E(C) / E(0), which makes frames of different height comparable."""
@@ -178,7 +182,8 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             f"{settings.evaluated_points} points of the ground truth, the same for all variants.",
             "**difference**: mean over the pairs of the error minus that of the default (Meyer, filtering, "
             f"pullback) on the same pair, with its {CONFIDENCE:.0%} bootstrap interval (BCa, {_RESAMPLES} "
-            "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow.",
+            "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow; and of so "
+            "many intervals one in twenty would miss zero by chance alone.",
             "**better**: the share of pairs with a smaller error than the default's; a failure is none.",
             "**energy**: E(C) / E(0), eq. (5) of the last C under the last map, in the area norm and in the "
             "variant's own frame (for the band mask in the Meyer frame).",
@@ -204,9 +209,13 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "## What the update changes within a frame, pullback",
         "Paired differences of the error, one update minus another.",
         _updates_within_frames(study),
-        "## What tightening changes, pullback",
-        "Paired differences of the error, the canonical tight frame of a bank minus the bank.",
+        "## What scaling and tightening change, pullback",
+        "Paired differences of the error. Scaled: the bank times one number, so that its frame function is "
+        "one in the mean; tightened: its canonical tight frame, the frame function one everywhere.",
         _tightening(study),
+        "## The height of C",
+        "Mean error of Meyer, filtering, with C times a number in every iteration.",
+        _gains(study),
     ]
     for convention in CONVENTIONS:
         for name in study.pairs:
@@ -289,28 +298,45 @@ def _updates_within_frames(study: Study) -> str:
         cells = []
         for update, reference in contrasts:
             pair = (Variant(frame, name, "pullback") for name in (update, reference))
-            cells.append(_interval(study.difference(*pair, "both")))
+            cells.append(study.contrast(*pair, "both"))
         rows.append([frame, *cells])
     return _table(["frame", *(f"{update} − {reference}" for update, reference in contrasts)], rows)
 
 
 def _tightening(study: Study) -> str:
+    contrasts = (
+        *(("scaled", update, "", update) for update in UPDATES),
+        *(("tightened", update, "scaled", update) for update in UPDATES),
+        ("tightened", "filtering", "", "least squares (area)"),
+    )
     rows = []
     for frame in study.settings.frames:
-        tightened = f"{frame}, tightened"
-        if tightened in study.settings.frames:
-            contrasts = [
-                *(
-                    (Variant(tightened, name, "pullback"), Variant(frame, name, "pullback"))
-                    for name in UPDATES
-                ),
-                (
-                    Variant(tightened, "filtering", "pullback"),
-                    Variant(frame, "least squares (area)", "pullback"),
-                ),
-            ]
-            rows.append([frame, *(_interval(study.difference(*pair, "both")) for pair in contrasts)])
-    return _table(["frame", *UPDATES, "tightened, filtering − plain, least squares (area)"], rows)
+        if f"{frame}, tightened" in study.settings.frames:
+            cells = [frame]
+            for kind, update, reference_kind, reference in contrasts:
+                pair = (
+                    Variant(f"{frame}, {of}" if of else frame, name, "pullback")
+                    for of, name in ((kind, update), (reference_kind, reference))
+                )
+                cells.append(study.contrast(*pair, "both"))
+            rows.append(cells)
+    header = [
+        f"{kind}, {update} − {reference_kind or 'plain'}" + (f", {reference}" if reference != update else "")
+        for kind, update, reference_kind, reference in contrasts
+    ]
+    # A row for each contrast: there are more of them than banks.
+    return _table(["", *(row[0] for row in rows)], zip(header, *(row[1:] for row in rows), strict=True))
+
+
+def _gains(study: Study) -> str:
+    updates = sorted(("filtering", *GAINS), key=lambda name: GAINS.get(name, 1.0))
+    rows = []
+    for convention in CONVENTIONS:
+        variants = [Variant("Meyer", update, convention) for update in updates]
+        for name in study.pairs:
+            cells = [_number(study.comparisons[variant, name].mean) for variant in variants]
+            rows.append([convention, name, *cells])
+    return _table(["", "", *(f"x {GAINS.get(update, 1.0)}" for update in updates)], rows)
 
 
 def _details(study: Study, convention: Convention, data_set: str) -> str:
@@ -332,7 +358,7 @@ def _details(study: Study, convention: Convention, data_set: str) -> str:
                     "default" if variant == DEFAULT else f"{found.better:.0%}",
                     _significant(study.relative_energy(variant, data_set)),
                     f"> {study.settings.iterations}" if np.isinf(settling) else _significant(settling),
-                    _significant(study.milliseconds(variant)),
+                    "—" if np.isnan(found.mean) else _significant(study.milliseconds(variant)),
                     "" if np.isnan(conditions).all() else _significant(float(np.median(conditions))),
                     str(found.failures) if found.failures else "",
                 ]
@@ -385,6 +411,8 @@ def _significant(value: float) -> str:
 def _interval(interval: Interval) -> str:
     if np.isnan(interval.mean):
         return "—"
+    if np.isnan(interval.low):
+        return f"{interval.mean:+.1f}".replace("-", "−")
     return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*interval).replace("-", "−")
 
 

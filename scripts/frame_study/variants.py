@@ -32,7 +32,7 @@ from jaxsmw.core.filters import (
     SpectralDistribution,
     Warped,
 )
-from jaxsmw.core.frames import frame_bounds, tighten
+from jaxsmw.core.frames import frame_bounds, frame_function, tighten
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS
@@ -80,6 +80,15 @@ def frames(number_of_filters: int) -> dict[str, FilterBank]:
         "Mexican hat": MexicanHat(number_of_filters),
         "heat": heat,
         "Gabor": Gabor(number_of_filters),
+        **{
+            f"{name}, scaled": Scaled(bank)
+            for name, bank in {
+                "cubic spline": CubicSpline(number_of_filters),
+                "Mexican hat": MexicanHat(number_of_filters),
+                "heat": heat,
+                "Gabor": Gabor(number_of_filters),
+            }.items()
+        },
         "cubic spline, tightened": tighten(CubicSpline(number_of_filters)),
         "Mexican hat, tightened": tighten(MexicanHat(number_of_filters)),
         "heat, tightened": tighten(heat),
@@ -90,10 +99,24 @@ def frames(number_of_filters: int) -> dict[str, FilterBank]:
     }
 
 
-QUICK_FRAMES = ("Meyer", "cubic spline", "cubic spline, tightened", "low-pass (1 filter)", "no filter")
+QUICK_FRAMES = (
+    "Meyer",
+    "cubic spline",
+    "cubic spline, scaled",
+    "cubic spline, tightened",
+    "low-pass (1 filter)",
+    "no filter",
+)
 
 # Not in the grid of frames and updates: (frame, update), in both conventions.
-ABLATIONS = (("Meyer", "projected"), ("no filter", "projected"), ("Meyer", "band mask"))
+# The search compares what C maps with what it does not, so the height of C matters, too.
+GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
+ABLATIONS = (
+    ("Meyer", "projected"),
+    ("no filter", "projected"),
+    ("Meyer", "band mask"),
+    *(("Meyer", name) for name in GAINS),
+)
 
 
 def variants(frame_names: Iterable[str]) -> list[Variant]:
@@ -148,6 +171,41 @@ class BandMask(Filtering):
         return self.mask, dual_out
 
 
+class Scaled(FilterBank):
+    """A bank times one number, so that its frame function is one in the mean over a shape's eigenvalues.
+
+    What tightening does to the height of a bank, without what it does to its shape.
+    """
+
+    bank: FilterBank
+
+    def __call__(
+        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
+    ) -> Float[Array, "filters p"]:
+        height = jnp.mean(frame_function(self.bank(eigenvalues, eigenvalues)))
+        return self.bank(points, eigenvalues) / jnp.sqrt(height)
+
+
+class Amplified(Solution):
+    """Another solution times a number."""
+
+    solution: Solution
+    gain: Float[Array, ""]
+
+    def prepare(self, problem: WaveletProblem) -> Any:
+        return self.solution.prepare(problem)
+
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: Any,
+        pointwise_map: Int[Array, " m"],
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
+        return self.gain * functional_map, result
+
+
 class Projected(Solution):
     """The orthogonal matrix nearest to another solution (ICP's, after filtering)."""
 
@@ -180,6 +238,8 @@ def refiner(
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = Projected(Filtering())
+    elif variant.update in GAINS:
+        solution = Amplified(Filtering(), jnp.asarray(GAINS[variant.update], tables[0].dtype))
     elif variant.update == "band mask":
         spectrum_out, spectrum_in = spectrum_x, spectrum_y
         kernel = multiscale_kernel(*tables)
