@@ -223,30 +223,14 @@ def test_padding_and_tabulating_change_nothing(convention, update):
     assert len(padded_x.mask) == len(padded_y.mask) > 170
     variant = Variant("cubic spline", update, convention)
     method = variants.refiner(variant, bank, padded_x, padded_y, number_of_filters=FILTERS + 2)
-    maps, functional_map, result = measurement.refine_recording(
-        method, padded_x, padded_y, measurement.pad_map(start, padded_x), 3
-    )
+    refined = jaxsmw.refine(padded_x, padded_y, measurement.pad_map(start, padded_x), refiner=method)
     expected = jaxsmw.refine(
         x, y, jnp.asarray(start), refiner=WaveletPreservation(bank, UPDATES[update], convention=convention)
     )
-    assert result == RESULTS.successful and expected.result == RESULTS.successful
-    np.testing.assert_allclose(functional_map, expected.functional_map, atol=1e-9)
-    np.testing.assert_array_equal(maps[-1, :150], expected.pointwise_map)
+    assert refined.result == RESULTS.successful and expected.result == RESULTS.successful
+    np.testing.assert_allclose(refined.functional_map, expected.functional_map, atol=1e-9)
+    np.testing.assert_array_equal(refined.pointwise_map[:150], expected.pointwise_map)
     np.testing.assert_array_equal(start, measurement.pad_map(start, padded_x)[:150])
-
-
-def test_a_failure_is_reported_and_sticks():
-    """Everything after a failure is in doubt, however well the next iteration goes."""
-
-    class FailsAtFirst(WaveletPreservation):
-        def update(self, problem, pointwise_map, previous):
-            functional_map, result = super().update(problem, pointwise_map, previous)
-            return functional_map, RESULTS.singular_system if previous is None else result
-
-    x, y = (measurement.pad(random_spectrum(n, 10, seed=n)) for n in (150, 170))
-    start = measurement.pad_map(np.arange(150), x)
-    refined = measurement.refine_recording(FailsAtFirst(), x, y, start, 3)
-    assert refined.result == RESULTS.singular_system
 
 
 def test_band_mask_is_as_wide_as_the_kernel_and_comes_from_no_frame():

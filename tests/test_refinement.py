@@ -185,6 +185,7 @@ def test_history_is_what_it_says(pair):
         energy = refiner.problem(x, y).energy(maps[i])(c)
         np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
         np.testing.assert_allclose(history.objective[i], matching_objective(c, maps[i + 1], x, y), rtol=1e-9)
+        np.testing.assert_array_equal(history.pointwise_maps[i], maps[i + 1])
     assert refine(x, y, start).history is None
 
 
@@ -199,6 +200,7 @@ def test_stops_when_the_map_no_longer_changes(pair):
     done = int(stopped.iterations)
     assert np.isfinite(stopped.history.energy[: done - 1]).all()
     assert np.isnan(stopped.history.energy[done:-1]).all()
+    assert np.all(np.asarray(stopped.history.pointwise_maps[done:]) == np.asarray(stopped.pointwise_map))
 
 
 def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
@@ -216,6 +218,7 @@ def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
     np.testing.assert_array_equal(refined.pointwise_map, decode(jnp.asarray(c), x, y))
     assert np.isnan(refined.history.changed[jnp.asarray([0, 3])]).all()
     assert np.isfinite(refined.history.changed[1:3]).all()
+    assert refined.history.pointwise_maps is None
     with pytest.raises(ValueError, match="both shapes"):
         refine(x, y, start, samples_x=samples_x)
 
@@ -297,10 +300,22 @@ def test_float32_in_float32_out():
 )  # fmt: skip
 def test_failures_are_named_not_returned_as_if_fine(pair, damage, result):
     x, y, start, _ = pair
-    refined = refine(*damage(x, y, start), iterations=4)
+    refined = refine(*damage(x, y, start), iterations=4, history=True)
     assert refined.result == result
-    assert (refined.pointwise_map == -1).all()
+    assert (refined.pointwise_map == -1).all() and (refined.history.pointwise_maps == -1).all()
     assert len(RESULTS[result]) > 40
+
+
+def test_a_failure_sticks(pair):
+    """Everything after a failure is in doubt, however well the next iteration goes."""
+
+    class FailsAtFirst(WaveletPreservation):
+        def update(self, problem, pointwise_map, previous):
+            functional_map, result = super().update(problem, pointwise_map, previous)
+            return functional_map, RESULTS.singular_system if previous is None else result
+
+    x, y, start, _ = pair
+    assert refine(x, y, start, refiner=FailsAtFirst()).result == RESULTS.singular_system
 
 
 def test_too_few_samples_are_named(pair):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
@@ -76,11 +78,14 @@ class History(eqx.Module):
     - `energy`: (iterations,), `Refiner.energy` of the functional map and the pointwise map it was made of;
       for `WaveletPreservation` the energy of eq. (5).
     - `objective`: (iterations,), `Refiner.objective` of the functional map and the map recovered from it.
+    - `pointwise_maps`: (iterations, m), the map recovered in each iteration; after an early stop the last
+      one, -1 throughout on failure. None when iterating on samples: those turns map no other vertices.
     """
 
     changed: Float[Array, " iterations"]
     energy: Float[Array, " iterations"]
     objective: Float[Array, " iterations"]
+    pointwise_maps: Int32[Array, "iterations m"] | None
 
 
 class Refinement(eqx.Module):
@@ -232,6 +237,7 @@ def refine(
         working_map = jnp.full(samples_x.shape, -1, jnp.int32)
     dtype = spectrum_x.eigenvectors.dtype
     undefined = jnp.asarray(jnp.nan, dtype)
+    keeps_maps = history and samples_x is None
 
     def search(problem: Problem, functional_map: Array, before: Array) -> tuple[Array, Array, Array]:
         after = refiner.recover(problem, functional_map)
@@ -243,7 +249,7 @@ def refine(
     def energy(problem: Problem, functional_map: Array, pointwise_map: Array) -> Array:
         return refiner.energy(problem, functional_map, pointwise_map) if history else undefined
 
-    def turn(state: _State) -> tuple[_State, tuple[Array, Array, Array]]:
+    def turn(state: _State) -> tuple[_State, _Record]:
         after, changed, objective = search(working, state.functional_map, state.pointwise_map)
         functional_map, result = refiner.update(working, after, state.functional_map)
         following = _State(
@@ -256,12 +262,13 @@ def refine(
         )
         if samples_x is not None:
             changed = jnp.where(state.iterations == 1, undefined, changed)
-        return following, (changed, state.energy, objective)
+        return following, (changed, state.energy, objective, after if keeps_maps else None)
 
-    def step(state: _State, _: None) -> tuple[_State, tuple[Array, Array, Array]]:
-        if not stop_when_unchanged:
-            return turn(state)
-        return lax.cond(state.unchanged, lambda state: (state, (undefined,) * 3), turn, state)
+    def stay(state: _State) -> tuple[_State, _Record]:
+        return state, (undefined, undefined, undefined, state.pointwise_map if keeps_maps else None)
+
+    def step(state: _State, _: None) -> tuple[_State, _Record]:
+        return lax.cond(state.unchanged, stay, turn, state) if stop_when_unchanged else turn(state)
 
     functional_map, result = refiner.update(whole, pointwise_map, None)
     state = _State(
@@ -277,12 +284,17 @@ def refine(
     refined, changed, objective = search(whole, state.functional_map, before)
 
     result = _diagnose(spectrum_x, spectrum_y, pointwise_map, state.result)
+    successful = result == RESULTS.successful
     recorded = None
     if history:
-        last = (changed if samples_x is None else undefined, state.energy, objective)
-        recorded = History(*(jnp.append(series, value) for series, value in zip(records, last, strict=True)))
+        changed = changed if samples_x is None else undefined
+        last = (changed, state.energy, objective, refined if keeps_maps else None)
+        recorded = History(*jax.tree.map(lambda rows, row: jnp.append(rows, row[None], 0), records, last))
+        if recorded.pointwise_maps is not None:
+            maps = jnp.where(successful, recorded.pointwise_maps, -1)
+            recorded = dataclasses.replace(recorded, pointwise_maps=maps)
     return Refinement(
-        jnp.where(result == RESULTS.successful, refined, -1),
+        jnp.where(successful, refined, -1),
         state.functional_map,
         result,
         state.iterations,
@@ -299,6 +311,10 @@ class _State(NamedTuple):
     result: RESULTS
     iterations: Int32[Array, ""]
     unchanged: Bool[Array, ""]
+
+
+_Record = tuple[Array, Array, Array, Array | None]
+"""What one turn adds to the four series of `History`."""
 
 
 def _checked(functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:

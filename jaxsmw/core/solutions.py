@@ -214,11 +214,17 @@ class DescriptorPair(eqx.Module):
         (coefficients_x, operators_x), (coefficients_y, operators_y) = sides
         return cls(coefficients_x, coefficients_y, operators_x, operators_y)
 
-    def oriented(self, convention: Convention) -> DescriptorPair:
-        """With the shape that C leads to in the place of X, the one that it comes from in that of Y."""
-        if convention == "pullback":
-            return self
-        return DescriptorPair(self.coefficients_y, self.coefficients_x, self.operators_y, self.operators_x)
+    def coefficients(self, convention: Convention) -> tuple[Float[Array, "k_out d"], Float[Array, "k_in d"]]:
+        """The coefficients on the shape that C leads to, and on the shape that it comes from."""
+        pair = self.coefficients_x, self.coefficients_y
+        return pair if convention == "pullback" else pair[::-1]
+
+    def operators(
+        self, convention: Convention
+    ) -> tuple[Float[Array, "d k_out k_out"] | None, Float[Array, "d k_in k_in"] | None]:
+        """The operators on the shape that C leads to, and on the shape that it comes from."""
+        pair = self.operators_x, self.operators_y
+        return pair if convention == "pullback" else pair[::-1]
 
 
 _TERMS = (
@@ -339,12 +345,11 @@ class RegularizedLeastSquares(Solution):
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError("an energy and a weight for it, wavelet_preservation, go together")
         (k_out,), (k_in,), dtype = eigenvalues_out.shape, eigenvalues_in.shape, eigenvalues_in.dtype
-        descriptors = None if self.descriptors is None else self.descriptors.oriented(convention)
         columns = QuadraticEnergy.zero(k_out, k_in, dtype)
         if energy is not None and self.wavelet_preservation is not None:
             columns += self.wavelet_preservation.astype(dtype) * energy
-        if descriptors is not None and self.descriptor_preservation is not None:
-            f_out, f_in = descriptors.coefficients_x, descriptors.coefficients_y
+        if self.descriptors is not None and self.descriptor_preservation is not None:
+            f_out, f_in = self.descriptors.coefficients(convention)
             size = jnp.sum(f_out**2)
             weight = self.descriptor_preservation.astype(dtype) * k_out / size
             columns += weight * QuadraticEnergy(f_in @ f_in.T, f_out @ f_in.T, size)
@@ -366,9 +371,9 @@ class RegularizedLeastSquares(Solution):
             root = jnp.sqrt(self.orthogonality.astype(dtype))
             identity = jnp.eye(min(k_out, k_in), dtype=dtype)
             terms.append(lambda c: root * ((c.T @ c if k_in <= k_out else c @ c.T) - identity))
-        if descriptors is not None and self.descriptor_commutativity is not None:
-            d_out: Any = descriptors.operators_x
-            d_in: Any = descriptors.operators_y
+        if self.descriptors is not None and self.descriptor_commutativity is not None:
+            operators: Any = self.descriptors.operators(convention)
+            d_out, d_in = operators
             scale = jnp.sqrt(self.descriptor_commutativity.astype(dtype) * k_out / jnp.sum(d_out**2))
             terms.append(lambda c: scale * (c[None] @ d_in - d_out @ c[None]))
             diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark_speed import medians
-from jax import lax
 from jaxtyping import Array, Float, Float64, Int, Int32, Int64
 
 from frame_study.journal import Row
@@ -34,8 +33,8 @@ from frame_study.variants import (
 )
 from jaxsmw import read_mesh
 from jaxsmw.core.filters import FilterBank, Meyer
-from jaxsmw.core.refinement import Problem, Refiner
-from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.refinement import Problem, Refinement, Refiner, refine
+from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
@@ -152,39 +151,10 @@ def pad_map(pointwise_map: Int[np.ndarray, " m"], padded: Spectrum) -> Int32[Arr
     return jnp.pad(jnp.asarray(pointwise_map, jnp.int32), (0, n))
 
 
-class Trajectory(NamedTuple):
-    """What `jaxsmw.refine` goes through: the map of each iteration, the last C, and how it ended."""
-
-    maps: Int32[Array, "iterations m"]
-    functional_map: Float[Array, "k_out k_in"]
-    result: RESULTS
-
-
-@eqx.filter_jit
-def refine_recording(
-    refiner: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum, start: Int32[Array, " m"], iterations: int
-) -> Trajectory:
-    """`jaxsmw.refine` with the map of every iteration kept."""
-    problem = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
-
-    def update(
-        pointwise_map: Array, previous: Array | None, before: RESULTS
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        functional_map, result = refiner.update(problem, pointwise_map, previous)
-        finite = jnp.all(jnp.isfinite(functional_map)) | (result != RESULTS.successful)
-        result = where(finite, result, RESULTS.nonfinite_functional_map)
-        return functional_map, where(before == RESULTS.successful, result, before)
-
-    def turn(state: tuple[Array, RESULTS], _: None) -> tuple[tuple[Array, RESULTS], Array]:
-        functional_map, result = state
-        pointwise_map = refiner.recover(problem, functional_map)
-        return update(pointwise_map, functional_map, result), pointwise_map
-
-    successful: Any = RESULTS.successful
-    state = update(start, None, successful)
-    (functional_map, result), maps = lax.scan(turn, state, None, length=iterations - 1)
-    last = refiner.recover(problem, functional_map)
-    return Trajectory(jnp.concatenate([maps, last[None]]), functional_map, result)
+def map_series(refined: Refinement) -> Int32[np.ndarray, "iterations m"]:
+    """The pointwise map of every iteration."""
+    assert refined.history is not None and refined.history.pointwise_maps is not None
+    return np.asarray(refined.history.pointwise_maps)
 
 
 class Diagnosis(NamedTuple):
@@ -225,21 +195,21 @@ def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings
     for variant in wanted:
         began = time.perf_counter()
         method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
-        maps, functional_map, result = refine_recording(
-            method, *pair.spectra, pair.start, settings.iterations
+        refined = refine(
+            *pair.spectra, pair.start, refiner=method, iterations=settings.iterations, history=True
         )
+        maps, successful = map_series(refined), bool(refined.result == RESULTS.successful)
         seconds = time.perf_counter() - began
-        diagnosis = diagnose(method, *pair.spectra, pair.start, maps[-1], functional_map)
+        diagnosis = diagnose(method, *pair.spectra, pair.start, maps[-1], refined.functional_map)
         least = least_kernel_eigenvalue(
             variant, banks[variant.frame], pair.spectra[0], number_of_filters=filters
         )
-        successful = bool(result == RESULTS.successful)
         rows.append(
             {
                 **name._asdict(),
                 **variant._asdict(),
-                "result": "successful" if successful else sentence(result),
-                **_follow(pair, [start, *np.asarray(maps)], successful),
+                "result": "successful" if successful else sentence(refined.result),
+                **_follow(pair, [start, *maps], successful),
                 **{name: f"{value:.6g}" for name, value in diagnosis._asdict().items()},
                 "least_kernel_eigenvalue": f"{least:.3g}",
                 "seconds": f"{seconds:.4f}",
@@ -281,8 +251,10 @@ def measure_parameters(
         cut = spectra[0].truncate(k), spectra[1].truncate(k)
         tables = [tabulate(Meyer(filters), spectrum, most) for spectrum in cut]
         method = TabulatedPreservation(responses_x=tables[0], responses_y=tables[1])
-        maps = refine_recording(method, *cut, pair.start, settings.parameter_iterations).maps
-        series = [np.asarray(pair.start), *np.asarray(maps)]
+        refined = refine(
+            *cut, pair.start, refiner=method, iterations=settings.parameter_iterations, history=True
+        )
+        series = [np.asarray(pair.start), *map_series(refined)]
         rows.append(
             {
                 **name._asdict(),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
@@ -62,8 +63,13 @@ UPDATES: dict[str, Solution] = {
 
 def frames(number_of_filters: int) -> dict[str, FilterBank]:
     """All frames and controls; so many filters where a bank leaves the choice."""
-    # Octaves, as those of the Meyer frame.
-    heat = Heat(jnp.asarray(2.0 ** np.arange(number_of_filters)))
+    not_tight = {
+        "cubic spline": CubicSpline(number_of_filters),
+        "Mexican hat": MexicanHat(number_of_filters),
+        # Octaves, as those of the Meyer frame.
+        "heat": Heat(jnp.asarray(2.0 ** np.arange(number_of_filters))),
+        "Gabor": Gabor(number_of_filters),
+    }
     return {
         "Meyer": Meyer(number_of_filters),
         "simple tight": SimpleTight(number_of_filters),
@@ -76,23 +82,9 @@ def frames(number_of_filters: int) -> dict[str, FilterBank]:
         "Simoncelli (2 filters)": Simoncelli(),
         "Papadakis (2 filters)": Papadakis(),
         "regular (2 filters)": Regular(),
-        "cubic spline": CubicSpline(number_of_filters),
-        "Mexican hat": MexicanHat(number_of_filters),
-        "heat": heat,
-        "Gabor": Gabor(number_of_filters),
-        **{
-            f"{name}, scaled": Scaled(bank)
-            for name, bank in {
-                "cubic spline": CubicSpline(number_of_filters),
-                "Mexican hat": MexicanHat(number_of_filters),
-                "heat": heat,
-                "Gabor": Gabor(number_of_filters),
-            }.items()
-        },
-        "cubic spline, tightened": tighten(CubicSpline(number_of_filters)),
-        "Mexican hat, tightened": tighten(MexicanHat(number_of_filters)),
-        "heat, tightened": tighten(heat),
-        "Gabor, tightened": tighten(Gabor(number_of_filters)),
+        **not_tight,
+        **{f"{name}, scaled": Scaled(bank) for name, bank in not_tight.items()},
+        **{f"{name}, tightened": tighten(bank) for name, bank in not_tight.items()},
         "exponential window (1 filter)": ExponentialWindow(),
         "low-pass (1 filter)": LowPass(),
         "no filter": Identity(),
@@ -186,11 +178,11 @@ class Scaled(FilterBank):
         return self.bank(points, eigenvalues) / jnp.sqrt(height)
 
 
-class Amplified(Solution):
-    """Another solution times a number."""
+class Modified(Solution):
+    """Another solution with something done to its functional map."""
 
     solution: Solution
-    gain: Float[Array, ""]
+    modify: Callable[[Array], Array]
 
     def prepare(self, problem: WaveletProblem) -> Any:
         return self.solution.prepare(problem)
@@ -203,27 +195,13 @@ class Amplified(Solution):
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
-        return self.gain * functional_map, result
+        return self.modify(functional_map), result
 
 
-class Projected(Solution):
-    """The orthogonal matrix nearest to another solution (ICP's, after filtering)."""
-
-    solution: Solution
-
-    def prepare(self, problem: WaveletProblem) -> Any:
-        return self.solution.prepare(problem)
-
-    def solve(
-        self,
-        problem: WaveletProblem,
-        prepared: Any,
-        pointwise_map: Int[Array, " m"],
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
-        left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
-        return left @ right, result
+def nearest_orthogonal(matrix: Float[Array, "k_out k_in"]) -> Float[Array, "k_out k_in"]:
+    """The matrix of orthonormal rows or columns nearest to another one, as in spectral ICP."""
+    left, _, right = jnp.linalg.svd(matrix, full_matrices=False)
+    return left @ right
 
 
 def refiner(
@@ -237,9 +215,11 @@ def refiner(
     """The refiner of a variant on a pair; filters that a bank has less than `number_of_filters` are zero."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
-        solution: Solution = Projected(Filtering())
+        solution: Solution = Modified(Filtering(), nearest_orthogonal)
     elif variant.update in GAINS:
-        solution = Amplified(Filtering(), jnp.asarray(GAINS[variant.update], tables[0].dtype))
+        # The gain as an array of a pytree: one compiled program serves all gains.
+        gain = jnp.asarray(GAINS[variant.update], tables[0].dtype)
+        solution = Modified(Filtering(), jax.tree_util.Partial(jnp.multiply, gain))
     elif variant.update == "band mask":
         spectrum_out, spectrum_in = spectrum_x, spectrum_y
         kernel = multiscale_kernel(*tables)
