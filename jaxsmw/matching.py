@@ -118,6 +118,10 @@ def match(
     **Raises:** `InputError` for anything about the arguments that cannot work; `ArithmeticError` if numbers
     went wrong on the way.
     """
+    if not isinstance(refiner, Refiner):
+        raise InputError(
+            f"refiner is {refiner!r}; give a Refiner such as WaveletPreservation(bank=Meyer(8))."
+        )
     if iterations < 1:
         raise InputError(f"{iterations} iterations were asked for; at least 1 is needed.")
     if number_of_samples is not None and number_of_samples < number_of_eigenvectors:

@@ -3,7 +3,10 @@
     python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
                                      [--workers N] [--quick]
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r` (each with `off/`, `corres/` and `test_pairs.txt`). The output
+It needs what the extra `dev` installs: `pip install -e ".[dev]"`.
+
+DATA_DIRECTORY holds `faust_r` and `tosca_r`, the remeshed sets of Ren et al. (2018): meshes
+`off/NAME.off`, ground truth `corres/NAME.vts`, and `test_pairs.txt` with two names per line. The output
 directory gets everything from this one command: `summary.md` with all tables, the figures, `results.csv` (a
 row per pair and variant), `parameters.csv` (eigenvectors x filters x iterations), `invariance.csv`,
 `times.csv`, and `provenance.json` with versions, machine, seeds and settings. Interrupted in whatever way,
@@ -208,7 +211,7 @@ def main() -> None:
         "--output", type=Path, help="default: docs/frames, with --quick a new temporary directory"
     )
     parser.add_argument("--pairs", type=int, help="per data set (default: 40, with --quick 2)")
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="at least 0 (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="default: %(default)s")
     parser.add_argument("--quick", action="store_true", help="a small study that tries everything out")
     options = parser.parse_args()
@@ -219,8 +222,8 @@ def main() -> None:
         Path(tempfile.mkdtemp(prefix="jaxsmw-frames-")) if options.quick else Path("docs/frames")
     )
     try:
-        if settings.pairs < 1 or options.workers < 1:
-            raise InputError("a study needs at least 1 pair per data set and 1 worker.")
+        if settings.pairs < 1 or options.workers < 1 or settings.seed < 0:
+            raise InputError("a study needs at least 1 pair per data set, 1 worker and a seed from 0 on.")
         study(options.data, output, settings, options.workers)
     except InputError as error:
         sys.exit(f"compare_frames: {error}")

@@ -143,6 +143,19 @@ def test_missing_matplotlib_is_told_before_the_work(run, pair, tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_bank_that_is_not_tight_gets_a_note(run, pair, tmp_path):
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet", *SMALL]
+    for bank, solution, noted in (
+        ("mexican-hat", "filtering", True),
+        ("mexican-hat", "least-squares", False),
+        ("itersine", "filtering", False),
+        ("adapted-itersine", "filtering", False),
+    ):
+        outcome = run(*call, "--bank", bank, "--solution", solution)
+        assert outcome.code == 0
+        assert (f"{bank} is no tight frame" in outcome.errors) == noted
+
+
 def test_quiet_is_quiet(run, pair, tmp_path):
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet", *SMALL)
     assert outcome.code == 0 and outcome.errors == ""

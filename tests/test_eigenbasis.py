@@ -199,3 +199,10 @@ def test_equals_the_reference_program(shared):
     np.testing.assert_allclose(areas * scale, reference["x_vertex_areas"], rtol=1e-9)
     overlap = np.sum(eigenvectors * areas[:, None] * reference["x_eigenvectors"], axis=0) * np.sqrt(scale)
     np.testing.assert_allclose(np.abs(overlap), 1, atol=1e-6)
+
+
+def test_a_soup_of_triangles_is_named():
+    vertices, faces = sphere_mesh(2)
+    soup = make_mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3))
+    with pytest.raises(InputError, match=r"320 separate parts.*--weld"):
+        compute_spectrum(soup, 30)

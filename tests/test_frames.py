@@ -140,3 +140,36 @@ def test_nothing_is_made_of_a_vanishing_frame_function():
     slopes = jax.grad(lambda b, p: jnp.sum(tighten(b)(p, p)), argnums=(0, 1))(narrow, points)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
     assert slopes[1][1] == 0
+
+
+class Constant(FilterBank):
+    """Two filters with one value everywhere."""
+
+    value: jax.Array
+
+    def __call__(self, points, eigenvalues):
+        return jnp.full((2, len(points)), self.value)
+
+
+def test_tightening_does_not_hide_what_is_not_a_number():
+    bank = Constant(jnp.asarray(jnp.nan))
+    assert np.isnan(tighten(bank)(EIGENVALUES, EIGENVALUES)).all()
+    assert np.isnan(frame_bounds(tighten(bank), EIGENVALUES)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_low_pass_filter_stays_one(dtype):
+    eigenvalues = EIGENVALUES.astype(dtype)
+    for bank in (LowPass(), tighten(LowPass())):
+        assert frame_bounds(bank, eigenvalues).lower == 0
+        assert (bank(eigenvalues, eigenvalues) >= 0).all()
+
+
+@pytest.mark.parametrize("shape", [lambda p: (len(p),), lambda p: (3, 5)], ids=["flat", "short"])
+def test_responses_of_another_shape_are_refused(shape):
+    class Misshapen(FilterBank):
+        def __call__(self, points, eigenvalues):
+            return jnp.ones(shape(points))
+
+    with pytest.raises(ValueError, match=r"Misshapen gave responses of shape .* \(filters, 40\) is needed"):
+        frame_bounds(Misshapen(), EIGENVALUES)

@@ -5,6 +5,7 @@ import logging
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
@@ -197,3 +198,8 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
         for init in ("shot", "functional")
     )
     assert functional < 0.5 * nearest
+
+
+def test_a_bank_is_no_refiner(pair):
+    with pytest.raises((InputError, TypeCheckError), match="refiner"):
+        match(*pair[:2], refiner=Meyer())

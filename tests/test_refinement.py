@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.filters import CubicSpline, Meyer
+from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode, matching_objective
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
@@ -360,3 +361,28 @@ def test_a_new_refiner_plugs_in(pair):
     refined = refine(x, y, start, refiner=Orthogonal(), iterations=5)
     np.testing.assert_allclose(refined.functional_map @ refined.functional_map.T, np.eye(K), atol=1e-10)
     assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
+
+
+def test_a_map_of_nothing_is_named(pair):
+    class Nothing(FilterBank):
+        def __call__(self, points, eigenvalues):
+            return jnp.zeros((2, len(points)))
+
+    x, y, start, _ = pair
+    assert (
+        refine(x, y, start, refiner=WaveletPreservation(Nothing())).result
+        == RESULTS.undetermined_functional_map
+    )
+
+
+def test_two_float_types_are_refused(pair):
+    x, y, start, _ = pair
+    single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, x)
+    with pytest.raises(ValueError, match="X is float32 and that of Y float64"):
+        refine(single, y, start, stop_when_unchanged=True)
+
+
+@pytest.mark.parametrize("settings", [dict(bank=Meyer), dict(bank="meyer"), dict(solution="least-squares")])
+def test_what_is_no_bank_or_solution_is_refused(settings):
+    with pytest.raises((TypeError, TypeCheckError), match=r"bank|solution"):
+        WaveletPreservation(**settings)

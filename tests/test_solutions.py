@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
 from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
@@ -336,6 +337,50 @@ def test_numbers_that_went_wrong_have_a_code(pair, pointwise_map):
     for solution in (Filtering(), LeastSquares(), RegularizedLeastSquares()):
         refined = refine(broken, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
         assert refined.result == RESULTS.nonfinite_spectrum
+
+
+def test_a_weight_that_is_not_a_number_is_named_also_in_a_batch(pair, pointwise_map):
+    def result(weight):
+        solution = RegularizedLeastSquares(orthogonality=weight)
+        return refine(*pair, pointwise_map, refiner=WaveletPreservation(solution=solution)).result
+
+    weights = jnp.asarray([0.1, jnp.nan, 0.0, -1.0])
+    results = jax.vmap(result)(weights)
+    good = results == RESULTS.successful
+    np.testing.assert_array_equal(good, [True, False, True, False])
+    for weight, fine in zip(weights, good, strict=True):
+        assert (jax.jit(result)(weight) == RESULTS.successful) == fine
+
+
+@pytest.mark.parametrize("operators", [False, True])
+def test_descriptors_that_are_not_numbers_are_named(pair, pointwise_map, operators):
+    x, y = pair
+    values = np.random.default_rng(0).normal(size=(M, D))
+    values[3, 1] = np.nan
+    other = jnp.asarray(np.random.default_rng(1).normal(size=(N, D)))
+    descriptors = DescriptorPair.project(jnp.asarray(values), other, x, y, operators=operators)
+    solution = RegularizedLeastSquares(
+        descriptors=descriptors,
+        descriptor_preservation=1.0,
+        descriptor_commutativity=1.0 if operators else None,
+    )
+    refined = refine(x, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
+    assert refined.result == RESULTS.nonfinite_functional_map
+
+
+def test_descriptors_that_do_not_fit_are_refused(pair, pointwise_map):
+    x, y = pair
+    f, g = (jnp.ones((n, D)) for n in (M, N))
+    with pytest.raises((ValueError, TypeCheckError), match="descriptors"):
+        DescriptorPair.project(f[:, 0], g[:, 0], x, y)
+    with pytest.raises((ValueError, TypeCheckError), match="descriptors"):
+        DescriptorPair.project(g, f, x, y)
+    with pytest.raises((ValueError, TypeCheckError), match=r"descriptors|coefficients"):
+        DescriptorPair.project(f, g[:, :2], x, y)
+    swapped = DescriptorPair.project(g, f, y, x)
+    solution = RegularizedLeastSquares(descriptors=swapped, descriptor_preservation=1.0)
+    with pytest.raises(ValueError, match=f"bases of {K_Y} and {K_X} eigenvectors"):
+        refine(x, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
 
 
 def test_descriptors_in_the_eigenbases(pair):

@@ -43,9 +43,25 @@ class FilterBank(eqx.Module):
         """
 
 
+def sample_bank(
+    bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
+) -> Float[Array, "filters p"]:
+    """The responses of a bank; its own, or someone else's, who may have overlooked what shape they need.
+
+    **Raises:** `ValueError` if they have another shape.
+    """
+    responses = bank(points, eigenvalues)
+    if responses.ndim != 2 or responses.shape[1] != points.shape[0]:
+        raise ValueError(
+            f"the bank {type(bank).__name__} gave responses of shape {responses.shape} at {points.shape[0]} "
+            f"points, where (filters, {points.shape[0]}) is needed"
+        )
+    return responses
+
+
 def _require_filters(bank: FilterBank, filters: int, least: int) -> None:
     if filters < least:
-        raise ValueError(f"a {type(bank).__name__} bank needs at least {least} filters, not {filters}")
+        raise ValueError(f"{type(bank).__name__} needs at least {least} filters, not {filters}")
 
 
 # Partitions of unity made of transitions
@@ -479,7 +495,8 @@ class LowPass(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
-        return jnp.cos(jnp.pi / 2 * _meyer_polynomial(jnp.clip(points / edge - 1, 0, 1)))[None, :]
+        # The sine of what is left, because the cosine of pi/2 is not quite zero.
+        return jnp.sin(jnp.pi / 2 * (1 - _meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
 
 
 class Identity(FilterBank):

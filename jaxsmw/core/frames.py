@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.filters import FilterBank
+from jaxsmw.core.filters import FilterBank, sample_bank
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
@@ -47,7 +47,8 @@ def frame_bounds(
       `h max|G'| / 2` at a kink of G. For the banks here with up to 8 filters that is below 1e-5 of G at the
       default.
 
-    **Raises:** `ValueError` if `over` is neither, or the resolution is below 2.
+    **Raises:** `ValueError` if `over` is neither, the resolution is below 2, or the bank's responses have
+    another shape than (filters, points).
     """
     check_choice("over", over, ("eigenvalues", "interval"))
     points = eigenvalues
@@ -55,7 +56,7 @@ def frame_bounds(
         if resolution < 2:
             raise ValueError(f"an interval needs a resolution of at least 2 points, not {resolution}")
         points = jnp.linspace(0, eigenvalues[-1], resolution, dtype=eigenvalues.dtype)
-    covered = frame_function(bank(points, eigenvalues))
+    covered = frame_function(sample_bank(bank, points, eigenvalues))
     return FrameBounds(jnp.min(covered), jnp.max(covered))
 
 
@@ -70,7 +71,8 @@ class Tightened(FilterBank):
         responses = self.bank(points, eigenvalues)
         # The largest response cancels from the ratio; without it the squares could underflow.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
-        covered = largest >= jnp.finfo(points.dtype).tiny
+        # Not `>=`: what is NaN has to stay NaN.
+        covered = ~(largest < jnp.finfo(points.dtype).tiny)
         scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
         frame = jnp.where(covered, frame_function(scaled)[None, :], 1)
         return scaled / jnp.sqrt(frame)

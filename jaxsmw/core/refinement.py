@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.filters import FilterBank, Meyer
+from jaxsmw.core.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import decode, matching_objective
 from jaxsmw.core.results import RESULTS, where
@@ -130,6 +130,9 @@ class WaveletPreservation(Refiner):
     lambda_max: Literal["own", "common"] = eqx.field(static=True, default="own")
 
     def __check_init__(self) -> None:
+        for name, kind in (("bank", FilterBank), ("solution", Solution)):
+            if not isinstance(getattr(self, name), kind):
+                raise TypeError(f"the {name} is {getattr(self, name)!r}, but a {kind.__name__} is needed")
         check_choice("convention", self.convention, get_args(Convention))
         check_choice("lambda_max", self.lambda_max, ("own", "common"))
 
@@ -142,8 +145,8 @@ class WaveletPreservation(Refiner):
         return WaveletProblem(
             spectrum_x,
             spectrum_y,
-            self.bank(eigenvalues_x, layout_x),
-            self.bank(eigenvalues_y, layout_y),
+            sample_bank(self.bank, eigenvalues_x, layout_x),
+            sample_bank(self.bank, eigenvalues_y, layout_y),
             self.convention,
             sampled,
         )
@@ -218,8 +221,8 @@ def refine(
 
     **Returns:** A `Refinement`. Nothing is raised for bad numbers: check its `result`.
 
-    **Raises:** `ValueError` for fewer than one iteration, samples on one side only, or an initial map that is
-    not one vertex per vertex of X.
+    **Raises:** `ValueError` for fewer than one iteration, samples on one side only, an initial map that is
+    not one vertex per vertex of X, or spectra of two float types.
     """
     if iterations < 1:
         raise ValueError(f"refine needs at least 1 iteration, not {iterations}")
@@ -230,12 +233,18 @@ def refine(
             f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"
         )
 
+    dtype = spectrum_x.eigenvectors.dtype
+    if spectrum_y.eigenvectors.dtype != dtype:
+        raise ValueError(
+            f"the spectrum of X is {dtype} and that of Y {spectrum_y.eigenvectors.dtype}: compute both with "
+            "the same jax_enable_x64"
+        )
+
     whole = working = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
     working_map = pointwise_map = pointwise_map.astype(jnp.int32)
     if samples_x is not None and samples_y is not None:
         working = refiner.prepare(spectrum_x.sample(samples_x), spectrum_y.sample(samples_y), sampled=True)
         working_map = jnp.full(samples_x.shape, -1, jnp.int32)
-    dtype = spectrum_x.eigenvectors.dtype
     undefined = jnp.asarray(jnp.nan, dtype)
     keeps_maps = history and samples_x is None
 
@@ -319,8 +328,10 @@ _Record = tuple[Array, Array, Array, Array | None]
 
 def _checked(functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
     """How a functional map came out: a failure that its computation reported says more than a NaN."""
-    finite = jnp.all(jnp.isfinite(functional_map)) | (result != RESULTS.successful)
-    return where(finite, result, RESULTS.nonfinite_functional_map)
+    went_well = result == RESULTS.successful
+    finite, zero = jnp.all(jnp.isfinite(functional_map)), jnp.all(functional_map == 0)
+    result = where(went_well & zero, RESULTS.undetermined_functional_map, result)
+    return where(went_well & ~finite, RESULTS.nonfinite_functional_map, result)
 
 
 def _diagnose(

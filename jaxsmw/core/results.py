@@ -20,7 +20,8 @@ class RESULTS(eqx.Enumeration):
         "needs one index from 0 to n - 1 per source vertex."
     )
     nonfinite_functional_map = (
-        "The functional map became NaN or infinite. In float32 this can be overflow (scale the surfaces to "
+        "The functional map, or what determines it, became NaN or infinite: look at the filter bank's "
+        "responses, the weights and the descriptors. In float32 it can be overflow (scale the surfaces to "
         "area 1, or use float64); with the least-squares pseudo-inverse it can be that there are fewer "
         "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
     )

@@ -185,6 +185,14 @@ class DescriptorPair(eqx.Module):
     operators_x: Float[Array, "d k_x k_x"] | None = None
     operators_y: Float[Array, "d k_y k_y"] | None = None
 
+    def __check_init__(self) -> None:
+        shapes = self.coefficients_x.shape, self.coefficients_y.shape
+        if len(shapes[0]) != 2 or len(shapes[1]) != 2 or shapes[0][1] != shapes[1][1]:
+            raise ValueError(
+                f"descriptors with coefficients of shapes {shapes[0]} on X and {shapes[1]} on Y are not "
+                "(k_x, d) and (k_y, d) of the same d functions"
+            )
+
     @classmethod
     def project(
         cls,
@@ -201,7 +209,13 @@ class DescriptorPair(eqx.Module):
 
         - `descriptors_x`, `descriptors_y`: values of the same d functions on X and on Y.
         - `operators`: whether to make the operators, too: d matrices of size k x k per shape.
+
+        **Raises:** `ValueError` if the values are not one row per vertex and one column per function.
         """
+        for name, values, spectrum in (("X", descriptors_x, spectrum_x), ("Y", descriptors_y, spectrum_y)):
+            n = spectrum.mask.shape[0]
+            if values.ndim != 2 or values.shape[0] != n:
+                raise ValueError(f"descriptors of {name} have shape {values.shape}, where ({n}, d) is needed")
         sides = []
         for values, spectrum in ((descriptors_x, spectrum_x), (descriptors_y, spectrum_y)):
             dual = dual_eigenvectors(spectrum, "area")
@@ -350,6 +364,11 @@ class RegularizedLeastSquares(Solution):
             columns += self.wavelet_preservation.astype(dtype) * energy
         if self.descriptors is not None and self.descriptor_preservation is not None:
             f_out, f_in = self.descriptors.coefficients(convention)
+            if (f_out.shape[0], f_in.shape[0]) != (k_out, k_in):
+                raise ValueError(
+                    f"the descriptors are in bases of {f_out.shape[0]} and {f_in.shape[0]} eigenvectors, the "
+                    f"functional map is {k_out} x {k_in}: project them on the same spectra, in the same order"
+                )
             size = jnp.sum(f_out**2)
             weight = self.descriptor_preservation.astype(dtype) * k_out / size
             columns += weight * QuadraticEnergy(f_in @ f_in.T, f_out @ f_in.T, size)
@@ -382,7 +401,8 @@ class RegularizedLeastSquares(Solution):
 
         # In units in which the quadratic terms curve the same everywhere, conjugate gradients take few steps.
         determined = curvature > ridge
-        solvable = jnp.all(determined)
+        finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(columns.cross))
+        solvable = finite & jnp.all(determined)
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if start is None:
             start = columns.cross * unit**2
@@ -404,4 +424,8 @@ class RegularizedLeastSquares(Solution):
         )
         if len(terms) == 1:
             result = where(columns.is_regular(), result, RESULTS.singular_system)
-        return solution.value * unit, where(solvable, result, RESULTS.undetermined_functional_map)
+        # A NaN that is not in the quadratic terms, such as that of a negative weight, shows in the residuals.
+        functional_map = solution.value * unit
+        finite &= jnp.all(jnp.isfinite(jnp.stack([jnp.sum(term(functional_map)) for term in terms])))
+        result = where(solvable, result, RESULTS.undetermined_functional_map)
+        return functional_map, where(finite, result, RESULTS.nonfinite_functional_map)

@@ -86,6 +86,12 @@ def eigenpairs(
 def _solve(stiffness: sp.csc_matrix, areas: np.ndarray, k: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The k smallest eigenpairs over all connected components."""
     number_of_components, component = connected_components(stiffness, directed=False)
+    if k > 1 and number_of_components >= k:
+        raise InputError(
+            f"{name}: has {number_of_components} separate parts, so its first {k} eigenvectors say nothing "
+            "but which part a vertex belongs to: join vertices at the same position (weld=True, on the "
+            "command line --weld), keep the largest part, or ask for more eigenvectors than parts."
+        )
     values, members, vectors = [], [], []
     for label in range(number_of_components):
         vertices = np.flatnonzero(component == label)

@@ -142,9 +142,11 @@ class Study:
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
         """The mean of E(C) / E(0), which makes frames of different height comparable."""
-        ratios = self.numbers(variant, data_set, "energy") / self.numbers(variant, data_set, "energy_of_zero")
         succeeded = np.isfinite(self.errors(variant, data_set))
-        return float(ratios[succeeded].mean()) if succeeded.any() else np.nan
+        energies, of_zero = (
+            self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")
+        )
+        return float(np.mean(energies / of_zero)) if succeeded.any() else np.nan
 
     def milliseconds(self, variant: Variant) -> float:
         return float(np.median(self._times[self.twins.get(variant, variant)]))
