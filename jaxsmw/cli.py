@@ -366,8 +366,8 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
     from jaxsmw.matching import match
 
     with jax.enable_x64(options.precision == "float64"):
-        # Laid out on evenly spaced eigenvalues, as those of a surface nearly are.
-        lower, upper = frame_bounds(_bank(options), jax.numpy.arange(options.eigenvectors + 1.0))
+        # On evenly spaced eigenvalues, as those of a surface nearly are.
+        lower, upper = frame_bounds(_bank(options), jax.numpy.arange(101.0), over="interval")
         if options.solution == "filtering" and not 0.99 < lower <= upper < 1.01:
             _say(
                 f"note: {options.bank} is no tight frame (bounds {lower:.2g} and {upper:.2g}), and filtering "

@@ -134,6 +134,13 @@ def match(
         spectrum_x, spectrum_y = (
             compute_spectrum(mesh, number_of_eigenvectors, laplacian=laplacian) for mesh in (mesh_x, mesh_y)
         )
+    for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
+        if spectrum.eigenvalues[-1] == 0:
+            raise InputError(
+                f"{mesh.name}: with {number_of_eigenvectors} eigenvectors nothing is known of it but which "
+                "of its separate parts a vertex belongs to; ask for more of them than it has parts, or join "
+                "vertices at the same position (weld=True, on the command line --weld)."
+            )
     with _stage("initial map", seconds):
         start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init)
     samples: dict[str, Int[Array, " s"]] = {}

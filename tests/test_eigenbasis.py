@@ -201,8 +201,8 @@ def test_equals_the_reference_program(shared):
     np.testing.assert_allclose(np.abs(overlap), 1, atol=1e-6)
 
 
-def test_a_soup_of_triangles_is_named():
-    vertices, faces = sphere_mesh(2)
-    soup = make_mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3))
-    with pytest.raises(InputError, match=r"320 separate parts.*--weld"):
-        compute_spectrum(soup, 30)
+def test_the_first_eigenvalue_of_every_part_is_exactly_zero():
+    one, two = make_mesh(*sphere_mesh(1)), make_mesh(*grid_mesh(6, 7))
+    assert eigenpairs(one, 3)[0][0] == eigenpairs(two, 1)[0][0] == 0
+    eigenvalues = eigenpairs(joined(one, two), 6)[0]
+    assert (eigenvalues[:2] == 0).all() and eigenvalues[2] > 0.1

@@ -203,3 +203,10 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
 def test_a_bank_is_no_refiner(pair):
     with pytest.raises((InputError, TypeCheckError), match="refiner"):
         match(*pair[:2], refiner=Meyer())
+
+
+def test_a_soup_of_triangles_is_named(pair):
+    mesh = pair[0]
+    soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
+    with pytest.raises(InputError, match=r"with 30 eigenvectors nothing is known of it .* --weld"):
+        match(soup, mesh, number_of_eigenvectors=30)

@@ -86,12 +86,6 @@ def eigenpairs(
 def _solve(stiffness: sp.csc_matrix, areas: np.ndarray, k: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The k smallest eigenpairs over all connected components."""
     number_of_components, component = connected_components(stiffness, directed=False)
-    if k > 1 and number_of_components >= k:
-        raise InputError(
-            f"{name}: has {number_of_components} separate parts, so its first {k} eigenvectors say nothing "
-            "but which part a vertex belongs to: join vertices at the same position (weld=True, on the "
-            "command line --weld), keep the largest part, or ask for more eigenvectors than parts."
-        )
     values, members, vectors = [], [], []
     for label in range(number_of_components):
         vertices = np.flatnonzero(component == label)
@@ -132,7 +126,10 @@ def _solve_component(
             continue
         residual, deviation = _check(stiffness, areas, eigenvalues, eigenvectors)
         if residual <= _RESIDUAL_TOLERANCE and deviation <= _ORTHONORMALITY_TOLERANCE:
-            return np.maximum(eigenvalues, 0), eigenvectors
+            # Of a connected surface the first is zero, whatever rounding made of it.
+            eigenvalues = np.maximum(eigenvalues, 0)
+            eigenvalues[0] = 0
+            return eigenvalues, eigenvectors
         failure = f"relative residual {residual:.1e}, deviation from orthonormality {deviation:.1e}"
     raise InputError(
         f"{name}: its first {k} eigenvectors could not be computed accurately ({failure}); the mesh is "
