@@ -39,6 +39,21 @@ class Spectrum(eqx.Module):
             self.mask,
         )
 
+    def pad(self, number_of_vertices: int) -> Spectrum:
+        """The same shape with masked vertices up to a given number.
+
+        **Raises:** `ValueError` if it has more vertices already.
+        """
+        rows = number_of_vertices - self.mask.shape[0]
+        if rows < 0:
+            raise ValueError(f"a shape of {self.mask.shape[0]} vertices does not fit {number_of_vertices}")
+        return Spectrum(
+            self.eigenvalues,
+            jnp.pad(self.eigenvectors, ((0, rows), (0, 0))),
+            jnp.pad(self.vertex_areas, (0, rows)),
+            jnp.pad(self.mask, (0, rows)),
+        )
+
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
         """The shape seen at some evenly spread vertices only, each standing for the same share of the area.
 

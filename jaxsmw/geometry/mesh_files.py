@@ -8,6 +8,7 @@ trimesh splits and drops vertices of OBJ files and cannot read polygons of mixed
 from __future__ import annotations
 
 import codecs
+import io
 import os
 import re
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.io
 from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import ArrayLike
 
@@ -27,7 +29,7 @@ LARGEST_FILE = 2**30
 
 
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
-    """Read a triangle mesh from an OFF, OBJ, PLY or STL file.
+    """Read a triangle mesh from an OFF, OBJ, PLY, STL or MAT file.
 
     Vertex i is the i-th vertex of the file. STL files know no vertices, only corners: those at exactly the
     same position become one vertex, numbered by first appearance. Faces with more than three corners are
@@ -37,6 +39,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
     - `path`: the file; its suffix, in either case, tells the format. OFF: text, also with colours or normals
         (COFF, NOFF). OBJ: `v` and `f` lines. PLY: text and binary, either byte order. STL: text and binary.
+        MAT: a struct `surface` with X, Y, Z and TRIV, counted from 1, as TOSCA comes.
     - `weld`: as in `make_mesh`.
 
     **Returns:**
@@ -395,12 +398,31 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
     return spans, offset
 
 
+def _parse_mat(data: bytes) -> _Polygons:
+    """MATLAB's format as the TOSCA shapes use it: a struct `surface` with columns X, Y, Z and faces TRIV."""
+    try:
+        # SciPy answers damaged files with whatever goes wrong first.
+        surface = scipy.io.loadmat(io.BytesIO(data), squeeze_me=True)["surface"]
+        vertices = np.stack([surface[axis].item() for axis in "XYZ"], axis=-1).astype(np.float64)
+        faces = surface["TRIV"].item().astype(np.float64)
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+            raise ValueError
+    except Exception:
+        raise InputError(
+            "holds no struct 'surface' with X, Y, Z and TRIV, as the TOSCA shapes do, in a version of MATLAB's "
+            "format before 7.3: save it so, or export the mesh as OFF or PLY."
+        ) from None
+    return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
+
+
 _PARSERS: dict[str, Callable[[bytes], _Polygons]] = {
     ".off": _parse_off,
     ".obj": _parse_obj,
     ".ply": _parse_ply,
     ".stl": _parse_stl,
+    ".mat": _parse_mat,
 }
+MESH_SUFFIXES = tuple(_PARSERS)
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None) -> None:
