@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from frame_study import measurement, variants
 from frame_study.drawing import draw_figures
-from frame_study.journal import Journal, Row, claim_directory, code_digest
+from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
 from frame_study.measurement import (
     DATA_SETS,
     INVARIANCE_FRAMES,

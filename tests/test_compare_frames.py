@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import compare_frames
 from frame_study import measurement, summary, variants
-from frame_study.journal import Journal, claim_directory, code_digest
+from jaxsmw.evaluation.journal import Journal, claim_directory, code_digest
 from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 

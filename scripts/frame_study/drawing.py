@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from frame_study.journal import Row
+from jaxsmw.evaluation.journal import Row
 from frame_study.measurement import DATA_SETS, INVARIANCE_FRAMES, PairName, Settings, read_pair, wavelets
 from frame_study.summary import Study
 from frame_study.variants import ABLATIONS, CONVENTIONS, UPDATES, Variant, frames

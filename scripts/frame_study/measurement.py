@@ -21,7 +21,7 @@ import numpy as np
 from benchmark_speed import medians
 from jaxtyping import Array, Float, Float64, Int, Int32, Int64
 
-from frame_study.journal import Row
+from jaxsmw.evaluation.journal import Row
 from frame_study.variants import (
     DEFAULT,
     TabulatedPreservation,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import bootstrap
 
-from frame_study.journal import Row
+from jaxsmw.evaluation.journal import Row
 from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, Settings
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.core.functional_map import Convention

@@ -1,0 +1,221 @@
+"""Data sets are recognised by the layouts in which they circulate, and what is missing is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from synthetic import grid_mesh
+
+from jaxsmw import InputError, read_mesh
+from jaxsmw.evaluation.datasets import DataSet, open_data_set, read_pairs
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.mesh_files import write_mesh
+
+VERTICES, FACES = grid_mesh(4, 5)
+
+
+def put(path: Path, contents: str | None = None) -> None:
+    """A file with such contents, or a mesh of twenty vertices."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if contents is not None:
+        path.write_text(contents)
+    elif path.suffix == ".obj":
+        lines = ["v {} {} {}".format(*v) for v in VERTICES] + ["f {} {} {}".format(*(f + 1)) for f in FACES]
+        path.write_text("\n".join(lines))
+    elif path.suffix == ".mat":
+        surface = dict(zip("XYZ", VERTICES.T[:, :, None], strict=True), TRIV=FACES + 1)
+        scipy.io.savemat(path, {"surface": surface})
+    else:
+        write_mesh(path, make_mesh(VERTICES, FACES))
+
+
+def column(numbers) -> str:
+    return "".join(f"{number}\n" for number in numbers)
+
+
+def remeshed(directory: Path) -> None:
+    for name in ("cat1", "cat2", "cat10", "dog0"):
+        put(directory / "off" / f"{name}.off")
+        put(directory / "corres" / f"{name}.vts", column(range(1, 11)))
+        put(directory / "corres" / f"{name}.sym.vts", column(range(10, 0, -1)))
+
+
+def shrec19(directory: Path) -> None:
+    for name in ("1", "2", "10"):
+        put(directory / "obj" / f"{name}.obj")
+    for name in ("1_2", "2_10"):
+        put(directory / "matches" / "FARMgt_txt" / f"{name}.txt", column(range(20, 0, -1)))
+
+
+def partial(directory: Path) -> None:
+    put(directory / "null" / "cat.off")
+    for kind in ("cuts", "holes"):
+        put(directory / kind / f"{kind}_cat_shape_1.off")
+        put(directory / kind / f"{kind}_cat_shape_1.baryc_gt", "2 0.5 0.5 0\n" * 20)
+    put(directory / "cuts" / "cuts_cat_shape_1.baryc_gt_sym", "3 0.5 0.5 0\n" * 20)
+
+
+def topology(directory: Path) -> None:
+    for number in range(3):
+        put(directory / f"kid{number:02}.off")
+        if number:
+            put(directory / f"kid{number:02}_ref.txt", "1 3\n2 4\n")
+
+
+def faust(directory: Path) -> None:
+    for number in (0, 2, 11):
+        put(directory / "training" / "registrations" / f"tr_reg_{number:03}.ply")
+
+
+def scape(directory: Path) -> None:
+    for number in range(3):
+        put(directory / f"mesh{number:03}.off")
+
+
+def tosca(directory: Path) -> None:
+    for name in ("cat0", "cat1", "wolf0", "wolf2"):
+        put(directory / f"{name}.mat")
+
+
+LAYOUTS = {
+    "a remeshed set": (remeshed, [("cat1", "cat2"), ("cat1", "cat10"), ("cat2", "cat1"), ("cat2", "cat10")]),
+    "SHREC'19 humans": (shrec19, [("1", "2"), ("2", "10")]),
+    "SHREC'16 partial": (partial, [("cuts_cat_shape_1", "cat"), ("holes_cat_shape_1", "cat")]),
+    "SHREC'16 topology": (topology, [("kid01", "kid00"), ("kid02", "kid00")]),
+    "FAUST registrations": (faust, [("tr_reg_000", "tr_reg_002"), ("tr_reg_000", "tr_reg_011")]),
+    "SCAPE": (scape, [("mesh000", "mesh001"), ("mesh000", "mesh002"), ("mesh001", "mesh000")]),
+    "TOSCA": (tosca, [("cat0", "cat1"), ("cat1", "cat0"), ("wolf0", "wolf2"), ("wolf2", "wolf0")]),
+}
+
+
+def names(data_set: DataSet) -> list[tuple[str, str]]:
+    return [(pair.source, pair.target) for pair in data_set.pairs]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layouts_are_recognised_and_their_truth_is_read(tmp_path, layout):
+    build, first = LAYOUTS[layout]
+    build(tmp_path / "set")
+    data_set = open_data_set(tmp_path / "set")
+    assert (data_set.layout, data_set.name) == (layout, "set")
+    assert names(data_set)[: len(first)] == first
+    assert set(data_set.shapes) == {name for pair in names(data_set) for name in pair}
+    for pair in data_set.pairs:
+        assert all(file.is_file() for file in pair.files)
+        meshes = [read_mesh(file) for file in (pair.source_file, pair.target_file)]
+        truth = pair.ground_truth(*meshes)
+        if layout == "a remeshed set":
+            assert truth.source_vertices.tolist() == truth.targets.tolist() == list(range(10))
+            mirrored = pair.ground_truth(*meshes, mirrored=True)
+            assert mirrored.source_vertices.tolist() == list(range(9, -1, -1))
+            assert mirrored.targets.tolist() == list(range(10))
+        elif layout == "SHREC'19 humans":
+            assert truth.targets.tolist() == list(range(19, -1, -1))
+        elif layout == "SHREC'16 partial":
+            assert isinstance(truth.targets, SurfacePoints) and set(truth.targets.faces.tolist()) == {1}
+        elif layout == "SHREC'16 topology":
+            assert (truth.source_vertices.tolist(), truth.targets.tolist()) == ([0, 1], [2, 3])
+        else:
+            assert truth.targets.tolist() == truth.source_vertices.tolist() == list(range(20))
+    if layout in ("SCAPE", "SHREC'19 humans"):
+        with pytest.raises(InputError, match="no mirrored ground truth"):
+            pair.ground_truth(*meshes, mirrored=True)
+
+
+def test_lists_of_pairs_come_first(tmp_path):
+    remeshed(tmp_path)
+    put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
+    assert names(open_data_set(tmp_path)) == [("dog0", "cat1"), ("cat2", "dog0")]
+    shrec19(tmp_path / "other")
+    put(tmp_path / "other" / "PAIRS_list_SHREC19_connectivity.txt", "2,10\n")
+    assert names(open_data_set(tmp_path / "other")) == [("2", "10")]
+    put(tmp_path / "list.txt", "cat1 cat2\ncat1 horse\n")
+    with pytest.raises(InputError, match="line 2: 'horse' is none of the shapes"):
+        read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
+    put(tmp_path / "list.txt", "cat1 cat2 cat1\n")
+    with pytest.raises(InputError, match="line 1: does not name two"):
+        read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_pairs(tmp_path / "none.txt", [])
+
+
+def test_one_shape_in_two_formats_is_one_shape(tmp_path):
+    scape(tmp_path)
+    put(tmp_path / "mesh000.ply")
+    data_set = open_data_set(tmp_path)
+    assert len(data_set.shapes) == 3 and data_set.shapes["mesh000"].suffix == ".off"
+
+
+BREAKAGES = {
+    "no directory": (lambda d: None, "is not a directory"),
+    "empty": (lambda d: d.mkdir(), "not laid out like a data set"),
+    "only text": (lambda d: put(d / "readme.txt", "x"), "remeshed sets: off/NAME.off"),
+    "no meshes": (lambda d: put(d / "corres" / "a.vts", "1\n"), "no folder with the meshes"),
+    "no truth": (lambda d: (remeshed(d), (d / "corres" / "cat2.vts").unlink()), "cat2.vts: is missing"),
+    "no null": (lambda d: put(d / "cuts" / "cuts_cat_shape_1.off"), "no null/"),
+    "no parts": (lambda d: put(d / "null" / "cat.off"), "no cuts/ or holes/"),
+    "a part of nothing": (lambda d: (partial(d), put(d / "cuts" / "cuts_dog_shape_1.off")), "no full shape"),
+    "a part without truth": (
+        lambda d: (partial(d), (d / "cuts" / "cuts_cat_shape_1.baryc_gt").unlink()),
+        "cuts_cat_shape_1.baryc_gt: is missing",
+    ),
+    "no kid00": (lambda d: (topology(d), (d / "kid00.off").unlink()), "no kid00"),
+    "one shape": (lambda d: put(d / "cat0.off"), "no two of its shapes make a pair"),
+    "a listed pair without truth": (
+        lambda d: (shrec19(d), put(d / "PAIRS_list_x.txt", "1,10")), "ground truth 1_10 of a listed pair"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BREAKAGES)
+def test_what_is_missing_is_named(tmp_path, case):
+    damage, message = BREAKAGES[case]
+    damage(tmp_path / "set")
+    with pytest.raises(InputError, match=message) as caught:
+        open_data_set(tmp_path / "set")
+    assert str(tmp_path / "set") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_shapes_that_should_share_vertices(tmp_path):
+    put(tmp_path / "cat0.off")
+    write_mesh(tmp_path / "cat1.off", make_mesh(*grid_mesh(5, 5)))
+    pair = open_data_set(tmp_path).pairs[0]
+    with pytest.raises(InputError, match="25 vertices where .* has 20"):
+        pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
+
+
+def test_tosca_in_matlab_files(tmp_path):
+    put(tmp_path / "cat0.mat")
+    mesh = read_mesh(tmp_path / "cat0.mat")
+    np.testing.assert_array_equal(mesh.vertices, VERTICES)
+    np.testing.assert_array_equal(mesh.faces, FACES)
+    scipy.io.savemat(tmp_path / "other.mat", {"shape": 1})
+    (tmp_path / "damaged.mat").write_bytes((tmp_path / "cat0.mat").read_bytes()[:200])
+    (tmp_path / "text.mat").write_text("no MATLAB at all")
+    for name in ("other", "damaged", "text"):
+        with pytest.raises(InputError, match=f"{name}.mat: holds no struct 'surface'"):
+            read_mesh(tmp_path / f"{name}.mat")
+
+
+REAL = {
+    "faust_r": ("a remeshed set", 165),
+    "tosca_r": ("a remeshed set", 127),
+    "tosca_nonisometric": ("a remeshed set", 45),
+    "tosca": ("TOSCA", None),
+    "shrec16_partial": ("SHREC'16 partial", 56),
+    "shrec16_topology": ("SHREC'16 topology", 15),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_sets(shared, name):
+    layout, pairs = REAL[name]
+    data_set = open_data_set(shared / "data" / name)
+    assert data_set.layout == layout
+    assert pairs is None or len(data_set.pairs) == pairs
+    for pair in data_set.pairs[:1] + data_set.pairs[-1:]:
+        truth = pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
+        assert len(truth.source_vertices) > 500
