@@ -17,19 +17,18 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import multiprocessing
 import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
+import jax
 import numpy as np
 from frame_study import measurement, variants
 from frame_study.drawing import draw_figures
-from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
 from frame_study.measurement import (
     DATA_SETS,
     INVARIANCE_FRAMES,
@@ -39,8 +38,6 @@ from frame_study.measurement import (
     files_of,
     measure,
     measure_times,
-    start_worker,
-    use_one_core,
 )
 from frame_study.summary import Study, write_summary
 from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
@@ -48,6 +45,8 @@ from tqdm import tqdm
 
 import jaxsmw
 from jaxsmw import InputError
+from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
+from jaxsmw.evaluation.workers import Workers, run_tasks
 from jaxsmw.files import atomic_write
 from jaxsmw.report.figures import check_drawable
 from jaxsmw.report.summary import make_directory, provenance
@@ -159,31 +158,19 @@ def run(data: Path, journals: Journals, workers: int) -> None:
     )
     failed: list[str] = []
     with progress, Workers(min(workers, len(tasks))) as executor:
-        futures = {executor.submit(measure, data, task, journals.settings): task for task in tasks}
-        for future in as_completed(futures):
-            if (error := future.exception()) is None:
-                journals.append(*future.result())
-            else:
-                failed.append(f"{' '.join(futures[future].name)} ({error})")
-            progress.update()
+        run_tasks(
+            partial(measure, data, settings=journals.settings),
+            tasks,
+            executor,
+            keep=lambda _, rows: journals.append(*rows),
+            failed=lambda task, error: failed.append(f"{' '.join(task.name)} ({error})"),
+            advance=progress.update,
+        )
     if failed:
         raise InputError(
             f"{len(failed)} pairs could not be measured, the others are kept: {'; '.join(failed)}. Mend "
             "them and start again."
         )
-
-
-class Workers(ProcessPoolExecutor):
-    """Worker processes that end at once when the work is given up."""
-
-    def __init__(self, count: int):
-        super().__init__(count, multiprocessing.get_context("spawn"), initializer=start_worker)
-
-    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
-        if kind is not None:
-            for process in multiprocessing.active_children():
-                process.terminate()
-        self.shutdown(wait=True, cancel_futures=True)
 
 
 def measured_times(
@@ -234,7 +221,7 @@ def main() -> None:
 def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
     """Measure, summarise and draw."""
     check_drawable()
-    use_one_core()
+    jax.config.update("jax_platforms", "cpu")
     pairs = select_pairs(data, settings.pairs)
     library = Path(jaxsmw.__file__).parent
     code = [

@@ -84,7 +84,9 @@ def test_samples_and_early_stop():
 def test_a_failing_pair_does_not_touch_the_others():
     spectra, starts = make_problem()
     starts[3] = starts[3].at[5].set(-1)
-    spectra[2] = eqx.tree_at(lambda s: s.eigenvectors, spectra[2], spectra[2].eigenvectors.at[0, 0].set(jnp.nan))
+    spectra[2] = eqx.tree_at(
+        lambda s: s.eigenvectors, spectra[2], spectra[2].eigenvectors.at[0, 0].set(jnp.nan)
+    )
     found = dict(refine_pairs(spectra, PAIRS, starts, batch_size=7))
     results = [found[position].result for position in range(len(PAIRS))]
     bad = {3: RESULTS.invalid_initial_map, 2: RESULTS.nonfinite_spectrum, 6: RESULTS.nonfinite_spectrum}
@@ -144,7 +146,9 @@ def test_memory_of_a_pair_is_about_what_the_compiler_says(m, n, k):
     x, y = (random_spectrum(size, k, seed=size, dtype=np.float32) for size in (m, n))
     start = jnp.zeros(m, jnp.int32)
     batch_size = 4
-    shapes = jax.eval_shape(lambda: (stack([x] * batch_size), stack([y] * batch_size), jnp.stack([start] * batch_size)))
+    shapes = jax.eval_shape(
+        lambda: (stack([x] * batch_size), stack([y] * batch_size), jnp.stack([start] * batch_size))
+    )
     stats = jax.jit(jax.vmap(lambda x, y, t: refine(x, y, t).pointwise_map)).lower(*shapes).compile()
     analysis = stats.memory_analysis()
     used = (analysis.temp_size_in_bytes + analysis.argument_size_in_bytes) / batch_size

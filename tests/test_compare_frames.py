@@ -19,7 +19,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import compare_frames
 from frame_study import measurement, summary, variants
-from jaxsmw.evaluation.journal import Journal, claim_directory, code_digest
 from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
@@ -31,6 +30,7 @@ from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
+from jaxsmw.evaluation.journal import Journal, claim_directory, code_digest
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
 

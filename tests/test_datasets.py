@@ -183,7 +183,7 @@ def test_shapes_that_should_share_vertices(tmp_path):
     put(tmp_path / "cat0.off")
     write_mesh(tmp_path / "cat1.off", make_mesh(*grid_mesh(5, 5)))
     pair = open_data_set(tmp_path).pairs[0]
-    with pytest.raises(InputError, match="25 vertices where .* has 20"):
+    with pytest.raises(InputError, match=r"25 vertices where .* has 20"):
         pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
 
 

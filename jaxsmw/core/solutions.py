@@ -135,6 +135,31 @@ class Filtering(Solution):
         return unfiltered * kernel, RESULTS.successful  # type: ignore[return-value]
 
 
+class NearestOrthogonal(Solution):
+    """The matrix of orthonormal rows or columns nearest to another solution.
+
+    With `Filtering` and the bank `Identity` this is the update of spectral ICP (Ovsjanikov et al. 2012).
+    """
+
+    solution: Solution = Filtering()
+
+    def prepare(self, problem: WaveletProblem) -> Any:
+        """What the other solution prepares."""
+        return self.solution.prepare(problem)
+
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: Any,
+        pointwise_map: Int[Array, " m"],
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """The polar factor, by a singular value decomposition."""
+        functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
+        left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
+        return left @ right, result
+
+
 class LeastSquares(Solution):
     """The minimiser of the wavelet-preservation energy, for any frame: one Cholesky factorisation.
 

@@ -66,8 +66,8 @@ class DataPair:
         m, n = len(mesh_x.vertices), len(mesh_y.vertices)
         if m != n:
             raise InputError(
-                f"{self.target_file}: has {n} vertices where {self.source_file} has {m}, but in this data set "
-                "vertex i of one is vertex i of the other: give the original files."
+                f"{self.target_file}: has {n} vertices where {self.source_file} has {m}, but in this data "
+                "set vertex i of one is vertex i of the other: give the original files."
             )
         return GroundTruth.of_all_vertices(np.arange(m))
 
@@ -269,10 +269,8 @@ def _partial(directory: Path) -> list[DataPair] | None:
     if not nulls and not parts:
         return None
     if not nulls or not parts:
-        raise InputError(
-            f"{directory}: has {'cuts/ or holes/ but no null/' if parts else 'null/ but no cuts/ or holes/'}: "
-            "put all of them there."
-        )
+        found = "cuts/ or holes/ but no null/" if parts else "null/ but no cuts/ or holes/"
+        raise InputError(f"{directory}: has {found}: put all of them there.")
     pairs = []
     for name, file in parts.items():
         match = re.fullmatch(r"(?:cuts|holes)_(.+)_shape_\d+", name)

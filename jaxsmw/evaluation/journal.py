@@ -51,6 +51,9 @@ class Journal:
     def __contains__(self, key: Sequence[Any]) -> bool:
         return tuple(map(str, key)) in self._rows
 
+    def __getitem__(self, key: Sequence[Any]) -> Row:
+        return self._rows[tuple(map(str, key))]
+
     def append(self, rows: Sequence[Row]) -> None:
         """Add rows, all with the same columns, and return when they are on the disk."""
         if not rows:

@@ -28,14 +28,13 @@ class SpectralPair:
 
     - `spectrum_x`, `spectrum_y`: with at least as many eigenvectors as any method asks for.
     - `start`: the initial T: X -> Y (m,).
-    - `samples_x`, `samples_y`: vertices in farthest-point order, for methods that iterate on samples.
+    - `samples`: vertices of X and of Y in farthest-point order, for methods that iterate on samples.
     """
 
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     start: Int[Array, " m"]
-    samples_x: Int[Array, " s"]
-    samples_y: Int[Array, " s"]
+    samples: tuple[Int[Array, " s"], Int[Array, " s"]]
 
 
 class Method(abc.ABC):
@@ -77,16 +76,16 @@ class Refined(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
-        samples = {}
+        samples = (None, None)
         if self.number_of_samples is not None:
-            samples["samples_x"] = pair.samples_x[: self.number_of_samples]
-            samples["samples_y"] = pair.samples_y[: self.number_of_samples]
+            samples = tuple(vertices[: self.number_of_samples] for vertices in pair.samples)
         refined = refine(
             *_truncated(pair, self.number_of_eigenvectors),
             pair.start,
             refiner=self.refiner,
             iterations=self.iterations,
-            **samples,
+            samples_x=samples[0],
+            samples_y=samples[1],
         )
         return refined.pointwise_map, refined.result
 
@@ -112,8 +111,7 @@ class ZoomOut(Method):
     def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
         x, y, pointwise_map, refiner = pair.spectrum_x, pair.spectrum_y, pair.start, _UNFILTERED
         if self.number_of_samples is not None:
-            samples_x = pair.samples_x[: self.number_of_samples]
-            samples_y = pair.samples_y[: self.number_of_samples]
+            samples_x, samples_y = (vertices[: self.number_of_samples] for vertices in pair.samples)
             x, y, refiner = x.sample(samples_x), y.sample(samples_y), _UNFILTERED_ON_SAMPLES
             first = _encode(pair.start, *_truncated(pair, self.first))
             pointwise_map = _decode(first, x.truncate(self.first), y.truncate(self.first))
@@ -130,3 +128,21 @@ _encode, _decode = eqx.filter_jit(encode), eqx.filter_jit(decode)
 
 def _truncated(pair: SpectralPair, k: int) -> tuple[Spectrum, Spectrum]:
     return pair.spectrum_x.truncate(k), pair.spectrum_y.truncate(k)
+
+
+MOST_SAMPLES = 1000
+METHODS: dict[str, Method] = {
+    "start": Start("nearest neighbours of the descriptors, from which all others start"),
+    "mwp": Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations"),
+    "mwp-sampled": Refined("Hu, Li, Liu, Liu 2021: the same on 500 samples", number_of_samples=500),
+    "no-filter": Refined("MWP without filters: k = 100, 3 iterations", _UNFILTERED),
+    "icp": Refined(
+        "Ovsjanikov et al. 2012, spectral ICP: k = 100, 10 iterations",
+        WaveletPreservation(Identity(), NearestOrthogonal(Filtering())),
+        iterations=10,
+    ),
+    "zoomout": ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120"),
+    "zoomout-sampled": ZoomOut(
+        "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
+    ),
+}

@@ -11,8 +11,9 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ def cached(
         return compute()
     key = _key(kind, inputs)
     path = Path(place) / f"{kind}-{key}.npz"
-    arrays = _load(path, key)
+    arrays = None if _recomputing.get() else _load(path, key)
     if arrays is None:
         arrays = compute()
         try:
@@ -73,6 +74,19 @@ def cached(
                 stacklevel=1,
             )
     return arrays
+
+
+_recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
+
+
+@contextmanager
+def recomputing() -> Iterator[None]:
+    """Compute everything in the block anew, as if nothing had been kept, but keep it: to measure the time."""
+    token = _recomputing.set(True)
+    try:
+        yield
+    finally:
+        _recomputing.reset(token)
 
 
 def _limit() -> float:

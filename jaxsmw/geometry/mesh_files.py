@@ -409,8 +409,8 @@ def _parse_mat(data: bytes) -> _Polygons:
             raise ValueError
     except Exception:
         raise InputError(
-            "holds no struct 'surface' with X, Y, Z and TRIV, as the TOSCA shapes do, in a version of MATLAB's "
-            "format before 7.3: save it so, or export the mesh as OFF or PLY."
+            "holds no struct 'surface' with X, Y, Z and TRIV, as the TOSCA shapes do, in MATLAB's format "
+            "before version 7.3: save it so, or export the mesh as OFF or PLY."
         ) from None
     return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from jaxsmw.evaluation.journal import Row
 from frame_study.measurement import DATA_SETS, INVARIANCE_FRAMES, PairName, Settings, read_pair, wavelets
 from frame_study.summary import Study
 from frame_study.variants import ABLATIONS, CONVENTIONS, UPDATES, Variant, frames
 from jaxsmw import compute_spectrum
 from jaxsmw.core.functional_map import Convention
+from jaxsmw.evaluation.journal import Row
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps, save_figure
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, stand
 from jaxsmw.report.summary import draw_bank

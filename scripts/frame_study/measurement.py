@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,13 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmark_speed import medians
 from jaxtyping import Array, Float, Float64, Int, Int32, Int64
 
-from jaxsmw.evaluation.journal import Row
 from frame_study.variants import (
     DEFAULT,
     TabulatedPreservation,
@@ -38,6 +32,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
+from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
@@ -369,28 +364,3 @@ def measure_times(data: Path, names: list[PairName], wanted: list[Variant], sett
             for variant, seconds in medians(candidates, _TIMED_RUNS).items()
         ]
     return rows
-
-
-# Worker processes
-
-
-def start_worker() -> None:
-    """Leave Ctrl-C to the parent process, and end with it however it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-def use_one_core() -> None:
-    """Have this process compute on the CPU, and every process started from now on with one core of it."""
-    jax.config.update("jax_platforms", "cpu")
-    os.environ["JAX_PLATFORMS"] = "cpu"
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PJRT_NPROC"):
-        os.environ[variable] = "1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.stats import bootstrap
 
-from jaxsmw.evaluation.journal import Row
 from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, Settings
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.core.functional_map import Convention
+from jaxsmw.evaluation.journal import Row
 
 CONFIDENCE = 0.95
 SETTLED = 0.05

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
@@ -37,7 +36,14 @@ from jaxsmw.core.frames import frame_bounds, frame_function, tighten
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares, Solution, WaveletProblem
+from jaxsmw.core.solutions import (
+    Filtering,
+    LeastSquares,
+    NearestOrthogonal,
+    RegularizedLeastSquares,
+    Solution,
+    WaveletProblem,
+)
 from jaxsmw.core.spectrum import Spectrum
 
 CONVENTIONS: tuple[Convention, ...] = ("pullback", "pushforward")
@@ -178,11 +184,11 @@ class Scaled(FilterBank):
         return self.bank(points, eigenvalues) / jnp.sqrt(height)
 
 
-class Modified(Solution):
-    """Another solution with something done to its functional map."""
+class Amplified(Solution):
+    """Another solution times a number."""
 
     solution: Solution
-    modify: Callable[[Array], Array]
+    gain: Float[Array, ""]
 
     def prepare(self, problem: WaveletProblem) -> Any:
         return self.solution.prepare(problem)
@@ -195,13 +201,7 @@ class Modified(Solution):
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
-        return self.modify(functional_map), result
-
-
-def nearest_orthogonal(matrix: Float[Array, "k_out k_in"]) -> Float[Array, "k_out k_in"]:
-    """The matrix of orthonormal rows or columns nearest to another one, as in spectral ICP."""
-    left, _, right = jnp.linalg.svd(matrix, full_matrices=False)
-    return left @ right
+        return self.gain * functional_map, result
 
 
 def refiner(
@@ -215,11 +215,9 @@ def refiner(
     """The refiner of a variant on a pair; filters that a bank has less than `number_of_filters` are zero."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
-        solution: Solution = Modified(Filtering(), nearest_orthogonal)
+        solution: Solution = NearestOrthogonal(Filtering())
     elif variant.update in GAINS:
-        # The gain as an array of a pytree: one compiled program serves all gains.
-        gain = jnp.asarray(GAINS[variant.update], tables[0].dtype)
-        solution = Modified(Filtering(), jax.tree_util.Partial(jnp.multiply, gain))
+        solution = Amplified(Filtering(), jnp.asarray(GAINS[variant.update], tables[0].dtype))
     elif variant.update == "band mask":
         spectrum_out, spectrum_in = spectrum_x, spectrum_y
         kernel = multiscale_kernel(*tables)

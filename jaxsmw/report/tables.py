@@ -1,0 +1,157 @@
+"""The results of a benchmark as people publish them: a table, curves, and a columnar file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxsmw.evaluation.benchmark import CURVE, FIGURES
+from jaxsmw.evaluation.journal import Row
+from jaxsmw.evaluation.opponents import METHODS
+from jaxsmw.files import atomic_write
+from jaxsmw.report.figures import draw_quality_curves, save_figure
+
+
+class MethodSummary(NamedTuple):
+    """One method over all pairs on which it did not fail.
+
+    **Attributes:**
+
+    - `mean`, `median`: of the pairs' mean errors, x 10^-3 of the square root of the area.
+    - `within`: the mean share of points within 0.05.
+    - `area_under_curve`: its mean.
+    - `coverage`: its mean.
+    - `seconds`: the median time from start to map.
+    - `pipeline_seconds`: the median time with both shapes' precomputation.
+    - `failures`: how many pairs failed.
+    - `curve`: the mean correspondence quality curve at `CURVE`.
+    """
+
+    mean: float
+    median: float
+    within: float
+    area_under_curve: float
+    coverage: float
+    seconds: float
+    pipeline_seconds: float
+    failures: int
+    curve: Float64[np.ndarray, " t"]
+
+
+def summarize_methods(rows: Sequence[Row], shapes: Mapping[str, Row]) -> dict[str, MethodSummary]:
+    """The rows of `jaxsmw.evaluation.benchmark.run_benchmark`, by method."""
+    found = {}
+    for name in dict.fromkeys(row["method"] for row in rows):
+        own = [row for row in rows if row["method"] == name]
+        good = [row for row in own if row["result"] == "successful"]
+        means = 1e3 * _column(good, "mean")
+        precomputing = np.array([_precomputing(row, shapes) for row in good])
+        seconds = _column(good, "seconds")
+        curves = np.array([np.array(row["curve"].split(), float) for row in good]).reshape(-1, len(CURVE))
+        found[name] = MethodSummary(
+            *(
+                float(reduce(values)) if len(good) else np.nan
+                for reduce, values in (
+                    (np.mean, means),
+                    (np.median, means),
+                    (np.mean, _column(good, "within_0.05")),
+                    (np.mean, _column(good, "area_under_curve")),
+                    (np.mean, _column(good, "coverage")),
+                    (np.median, seconds),
+                    (np.median, seconds + precomputing),
+                )
+            ),
+            len(own) - len(good),
+            curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
+        )
+    return found
+
+
+def _column(rows: Sequence[Row], name: str) -> Float64[np.ndarray, " r"]:
+    return np.array([float(row[name]) for row in rows])
+
+
+def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
+    sides = {row["source"], row["target"]}
+    return sum(
+        float(shapes[side][column])
+        for side in sides
+        for column in ("seconds_spectrum", "seconds_descriptors")
+    )
+
+
+_COLUMNS = (
+    ("mean error", lambda s: f"{s.mean:.1f}"),
+    ("median", lambda s: f"{s.median:.1f}"),
+    ("within 0.05", lambda s: f"{s.within:.1%}"),
+    ("area under curve", lambda s: f"{s.area_under_curve:.3f}"),
+    ("coverage", lambda s: f"{s.coverage:.1%}"),
+    ("refinement, s", lambda s: f"{s.seconds:.3f}"),
+    ("with precomputation, s", lambda s: f"{s.pipeline_seconds:.2f}"),
+    ("failed", lambda s: str(s.failures)),
+)
+
+
+def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
+    """One row for each method."""
+    header = ["method", *(title for title, _ in _COLUMNS)]
+    rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
+    return (
+        "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows)) + "\n"
+    )
+
+
+def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
+    """The same with booktabs rules, the smallest mean error in bold."""
+    best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
+    lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
+    lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
+    for name, summary in summaries.items():
+        cells = [text(summary) for _, text in _COLUMNS]
+        if summary.mean == best:
+            cells[0] = rf"\textbf{{{cells[0]}}}"
+        lines.append(" & ".join([name, *cells]).replace("%", r"\%") + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def write_tables(
+    directory: Path, title: str, rows: Sequence[Row], shapes: Mapping[str, Row], facts: Sequence[str]
+) -> None:
+    """Write `summary.md`, `table.tex`, `curves.png` and, where pyarrow is installed, `results.parquet`."""
+    summaries = summarize_methods(rows, shapes)
+    methods = "\n".join(f"- **{name}**: {METHODS[name].reference}" for name in summaries)
+    parts = [f"# {title}", "\n".join(f"- {fact}" for fact in facts), markdown_table(summaries), methods]
+    _write(directory / "summary.md", "\n\n".join(parts) + "\n")
+    _write(directory / "table.tex", latex_table(summaries))
+    curves = {name: (CURVE, summary.curve) for name, summary in summaries.items()}
+    means = {name: summary.mean / 1e3 for name, summary in summaries.items()}
+    save_figure(directory / "curves.png", draw_quality_curves(curves, mean_errors=means))
+    write_parquet(directory / "results.parquet", rows)
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
+    """All rows with their types, for pandas and polars; `curve` is a list of shares."""
+    import pyarrow
+    import pyarrow.parquet
+
+    numbers = {"seconds", *FIGURES}
+
+    def value(name: str, text: str) -> Any:
+        if name == "curve":
+            return [float(share) for share in text.split()]
+        return float(text) if name in numbers else text
+
+    table = pyarrow.Table.from_pylist(
+        [{name: value(name, text) for name, text in row.items()} for row in rows]
+    )
+    with atomic_write(path) as temporary:
+        pyarrow.parquet.write_table(table, temporary)
