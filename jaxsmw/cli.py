@@ -152,6 +152,41 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluation(evaluate)
     _add_common(evaluate, _evaluate)
 
+    benchmark = commands.add_parser(
+        "benchmark", help="match and measure many pairs of a data set; goes on where it was interrupted"
+    )
+    benchmark.add_argument(
+        "data", metavar="DATASET_DIRECTORY", help="FAUST, SCAPE, TOSCA, SHREC or a remeshed set, as published"
+    )
+    benchmark.add_argument(
+        "--methods",
+        metavar="METHOD",
+        nargs="+",
+        default=["start", "mwp", "mwp-sampled", "no-filter", "icp", "zoomout", "zoomout-sampled"],
+        help="which (default: %(default)s)",
+    )
+    benchmark.add_argument(
+        "--pairs", metavar="N|FILE", help="so many at random, or those of a list (default: all)"
+    )
+    benchmark.add_argument(
+        "--init", choices=("shot", "wks", "hks", "wavelet", "functional"), default="shot",
+        help="where all methods start (default: %(default)s)",
+    )  # fmt: skip
+    benchmark.add_argument(
+        "--evaluation-samples", metavar="N", type=_integer(1), help="measure at N random points only"
+    )
+    benchmark.add_argument("--seed", type=_integer(0), default=0, help="of both draws (default: %(default)s)")
+    benchmark.add_argument(
+        "--output", metavar="DIR", help="gets tables and figures (default: jaxsmw-benchmark-NAME)"
+    )
+    where = benchmark.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=_integer(1), default=os.cpu_count() or 1,
+        help="processes of one core each; times are cleanest with one (default: %(default)s)",
+    )  # fmt: skip
+    where.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of a Dask cluster")
+    _add_common(benchmark, _benchmark)
+
     spectrum = commands.add_parser("spectrum", help="inspect a mesh and its eigenbasis")
     spectrum.add_argument("mesh", metavar="MESH")
     spectrum.add_argument(
@@ -312,6 +347,31 @@ def _add_up(parser: argparse.ArgumentParser) -> None:
 def _add_common(parser: argparse.ArgumentParser, run: Any) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress messages")
     parser.set_defaults(run=run)
+
+
+def _benchmark(options: argparse.Namespace) -> None:
+    from jaxsmw.report.figures import check_drawable
+
+    check_drawable()
+    from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+    from jaxsmw.evaluation.datasets import open_data_set
+    from jaxsmw.evaluation.workers import open_executor
+    from jaxsmw.report.summary import make_directory
+    from jaxsmw.report.tables import markdown_table, summarize_methods, write_tables
+
+    data_set = open_data_set(options.data)
+    pairs = choose_pairs(data_set, options.pairs, options.seed)
+    settings = Settings(options.init, options.evaluation_samples, options.seed)
+    output = make_directory(options.output or f"jaxsmw-benchmark-{data_set.name}")
+    logging.getLogger("jaxsmw").info(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
+    try:
+        with open_executor(options.workers, options.scheduler) as executor:
+            results = run_benchmark(pairs, output, options.methods, settings, executor)
+    except KeyboardInterrupt:
+        _say(f"what is finished is kept in {output}; the same command goes on from there.")
+        raise
+    write_tables(output, data_set, results, settings)
+    print(markdown_table(summarize_methods(*results)), end="")
 
 
 def _demo(options: argparse.Namespace) -> None:

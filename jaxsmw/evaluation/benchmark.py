@@ -5,13 +5,14 @@ Whatever interrupts it, what is finished is on the disk, and the same command go
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ import jaxsmw
 from jaxsmw.core.batch import padded_size
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.datasets import DataPair, DataSet
+from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
@@ -62,7 +63,7 @@ class Settings:
     """
 
     init: Start = "shot"
-    evaluated_points: int | None = 1000
+    evaluated_points: int | None = None
     seed: int = 0
 
 
@@ -74,15 +75,49 @@ class Task:
     methods: tuple[str, ...]
 
 
-def choose_pairs(data_set: DataSet, count: int | None, seed: int) -> list[DataPair]:
-    """So many pairs, drawn without replacement, in the set's order; all if there are no more or None."""
-    pairs = data_set.pairs
-    if count is None or count >= len(pairs):
-        return list(pairs)
-    if count < 1:
-        raise InputError(f"{count} pairs cannot be measured: ask for at least 1.")
-    rows = np.sort(np.random.default_rng(seed).permutation(len(pairs))[:count])
-    return [pairs[row] for row in rows]
+def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataPair]:
+    """The pairs of a data set that are wanted, in the set's order.
+
+    **Arguments:**
+
+    - `wanted`: how many, drawn without replacement (all if there are no more), or a file that lists them (see
+      `read_pairs`); all if None.
+    - `seed`: of the draw.
+
+    **Raises:** `InputError` if the number is not positive, or the file names pairs that the set has not.
+    """
+    pairs = list(data_set.pairs)
+    if wanted is None:
+        return pairs
+    if re.fullmatch(r"[+-]?\d+", wanted):
+        count = int(wanted)
+        if count < 1:
+            raise InputError(f"{count} pairs cannot be measured: ask for at least 1.")
+        rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
+        return [pairs[row] for row in np.sort(rows)]
+    known = {(pair.source, pair.target): pair for pair in pairs}
+    listed = read_pairs(wanted, data_set.shapes)
+    if unknown := [names for names in listed if names not in known]:
+        raise InputError(
+            f"{wanted}: {' to '.join(unknown[0])} is not a pair of {data_set.directory}, which has "
+            f"{len(pairs)}: remove it from the list."
+        )
+    return [known[names] for names in dict.fromkeys(listed)]
+
+
+class Results(NamedTuple):
+    """What a benchmark found, every value as text.
+
+    **Attributes:**
+
+    - `rows`: one for each pair and method, in this order: `source`, `target`, `method`, `result`, `seconds`
+      (from the start to the map, without compilation), `FIGURES`, and `curve`, the shares of points with an
+      error of at most `CURVE`.
+    - `shapes`: for each shape its number of `vertices` and how long its spectrum and descriptors took.
+    """
+
+    rows: list[Row]
+    shapes: dict[str, Row]
 
 
 def run_benchmark(
@@ -91,7 +126,7 @@ def run_benchmark(
     methods: Sequence[str],
     settings: Settings,
     executor: Executor,
-) -> list[Row]:
+) -> Results:
     """Measure what is missing of some pairs; keep each as it comes.
 
     **Arguments:**
@@ -101,8 +136,6 @@ def run_benchmark(
     - `methods`: keys of `jaxsmw.evaluation.opponents.METHODS`.
     - `settings`: must be those of results that are there already.
     - `executor`: what works.
-
-    **Returns:** A row for every pair and method, in this order.
 
     **Raises:** `InputError` if the directory holds results of something else, or pairs could not be measured
     (all others are kept).
@@ -134,7 +167,10 @@ def run_benchmark(
             f"{len(failed)} could not be measured, the others are kept in {output}: {'; '.join(failed)}. "
             "Mend them and start again."
         )
-    return [results[pair.source, pair.target, name] for pair in pairs for name in methods]
+    return Results(
+        [results[pair.source, pair.target, name] for pair in pairs for name in methods],
+        {name: shapes[(name,)] for pair in pairs for name in (pair.source, pair.target)},
+    )
 
 
 def _run(
@@ -204,12 +240,12 @@ def _spectral_pair(mesh_x: Mesh, mesh_y: Mesh, k: int, init: Start) -> SpectralP
     spectrum_x, spectrum_y = (compute_spectrum(mesh, k) for mesh in (mesh_x, mesh_y))
     start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init)
     sizes = [padded_size(len(mesh.vertices)) for mesh in (mesh_x, mesh_y)]
-    samples = tuple(jnp.asarray(farthest_point_samples(mesh, MOST_SAMPLES)) for mesh in (mesh_x, mesh_y))
+    samples_x, samples_y = (farthest_point_samples(mesh, MOST_SAMPLES) for mesh in (mesh_x, mesh_y))
     return SpectralPair(
         spectrum_x.pad(sizes[0]),
         spectrum_y.pad(sizes[1]),
         jnp.asarray(np.pad(start, (0, sizes[0] - len(start))), jnp.int32),
-        samples,
+        (jnp.asarray(samples_x), jnp.asarray(samples_y)),
     )
 
 

@@ -76,16 +76,17 @@ class Refined(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
-        samples = (None, None)
-        if self.number_of_samples is not None:
-            samples = tuple(vertices[: self.number_of_samples] for vertices in pair.samples)
+        samples_x, samples_y = (
+            None if self.number_of_samples is None else vertices[: self.number_of_samples]
+            for vertices in pair.samples
+        )
         refined = refine(
             *_truncated(pair, self.number_of_eigenvectors),
             pair.start,
             refiner=self.refiner,
             iterations=self.iterations,
-            samples_x=samples[0],
-            samples_y=samples[1],
+            samples_x=samples_x,
+            samples_y=samples_y,
         )
         return refined.pointwise_map, refined.result
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from jaxsmw.evaluation.benchmark import CURVE, FIGURES
+from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings
+from jaxsmw.evaluation.datasets import DataSet
 from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.opponents import METHODS
 from jaxsmw.files import atomic_write
@@ -53,26 +54,29 @@ def summarize_methods(rows: Sequence[Row], shapes: Mapping[str, Row]) -> dict[st
         seconds = _column(good, "seconds")
         curves = np.array([np.array(row["curve"].split(), float) for row in good]).reshape(-1, len(CURVE))
         found[name] = MethodSummary(
-            *(
-                float(reduce(values)) if len(good) else np.nan
-                for reduce, values in (
-                    (np.mean, means),
-                    (np.median, means),
-                    (np.mean, _column(good, "within_0.05")),
-                    (np.mean, _column(good, "area_under_curve")),
-                    (np.mean, _column(good, "coverage")),
-                    (np.median, seconds),
-                    (np.median, seconds + precomputing),
-                )
-            ),
-            len(own) - len(good),
-            curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
+            mean=_mean(means),
+            median=_median(means),
+            within=_mean(_column(good, "within_0.05")),
+            area_under_curve=_mean(_column(good, "area_under_curve")),
+            coverage=_mean(_column(good, "coverage")),
+            seconds=_median(seconds),
+            pipeline_seconds=_median(seconds + precomputing),
+            failures=len(own) - len(good),
+            curve=curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
         )
     return found
 
 
 def _column(rows: Sequence[Row], name: str) -> Float64[np.ndarray, " r"]:
     return np.array([float(row[name]) for row in rows])
+
+
+def _mean(values: Float64[np.ndarray, " r"]) -> float:
+    return float(values.mean()) if len(values) else np.nan
+
+
+def _median(values: Float64[np.ndarray, " r"]) -> float:
+    return float(np.median(values)) if len(values) else np.nan
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
@@ -118,19 +122,27 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
-def write_tables(
-    directory: Path, title: str, rows: Sequence[Row], shapes: Mapping[str, Row], facts: Sequence[str]
-) -> None:
-    """Write `summary.md`, `table.tex`, `curves.png` and, where pyarrow is installed, `results.parquet`."""
-    summaries = summarize_methods(rows, shapes)
-    methods = "\n".join(f"- **{name}**: {METHODS[name].reference}" for name in summaries)
-    parts = [f"# {title}", "\n".join(f"- {fact}" for fact in facts), markdown_table(summaries), methods]
+def write_tables(directory: Path, data_set: DataSet, results: Results, settings: Settings) -> None:
+    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`."""
+    summaries = summarize_methods(*results)
+    pairs = len({(row["source"], row["target"]) for row in results.rows})
+    points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
+    parts = [
+        f"# {data_set.name}",
+        f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}), all methods from the same start "
+        f"({settings.init}). Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, "
+        f"at {points} of the ground truth; their mean and median are over the pairs. Times are medians over "
+        "the pairs, on one core each.",
+        markdown_table(summaries),
+        "\n".join(f"- **{name}**: {METHODS[name].reference}" for name in summaries),
+        "Pair by pair: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
+    ]
     _write(directory / "summary.md", "\n\n".join(parts) + "\n")
     _write(directory / "table.tex", latex_table(summaries))
     curves = {name: (CURVE, summary.curve) for name, summary in summaries.items()}
     means = {name: summary.mean / 1e3 for name, summary in summaries.items()}
     save_figure(directory / "curves.png", draw_quality_curves(curves, mean_errors=means))
-    write_parquet(directory / "results.parquet", rows)
+    write_parquet(directory / "results.parquet", results.rows)
 
 
 def _write(path: Path, text: str) -> None:
