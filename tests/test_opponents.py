@@ -1,0 +1,82 @@
+"""The opponents do what their papers say: against plain NumPy, and on cases with a known answer."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from synthetic import random_spectrum
+
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.evaluation.opponents import METHODS, Refined, SpectralPair, Start, ZoomOut
+
+M, N, K = 200, 180, 40
+
+
+@pytest.fixture
+def pair() -> SpectralPair:
+    generator = np.random.default_rng(0)
+    x, y = random_spectrum(M, K, seed=1), random_spectrum(N, K, seed=2)
+    samples = tuple(jnp.asarray(generator.choice(n, 80, replace=False)) for n in (M, N))
+    return SpectralPair(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
+
+
+def nearest(queries, database) -> np.ndarray:
+    return cdist(queries, database).argmin(axis=1)
+
+
+def test_zoomout_is_iterative_upsampling(pair):
+    x, y = pair.spectrum_x, pair.spectrum_y
+    t = np.asarray(pair.start)
+    for k in (10, 15, 20, 25):
+        a, b = np.asarray(x.eigenvectors[:, :k]), np.asarray(y.eigenvectors[:, :k])
+        c = (a * np.asarray(x.vertex_areas)[:, None]).T @ b[t]
+        t = nearest(a, b @ c.T)
+    found, result = ZoomOut("", first=10, step=5, number_of_eigenvectors=25)(pair)
+    assert result == RESULTS.successful
+    np.testing.assert_array_equal(found, t)
+
+
+def test_zoomout_on_samples_searches_all_at_the_end(pair):
+    x, y = pair.spectrum_x, pair.spectrum_y
+    s_x, s_y = (np.asarray(vertices[:60]) for vertices in pair.samples)
+    phi, psi = np.asarray(x.eigenvectors), np.asarray(y.eigenvectors)
+    c = (phi[:, :10] * np.asarray(x.vertex_areas)[:, None]).T @ psi[np.asarray(pair.start), :10]
+    t = nearest(phi[s_x, :10], psi[s_y, :10] @ c.T)
+    for k in (10, 15, 20):
+        c = np.linalg.lstsq(phi[s_x, :k], psi[s_y[t], :k])[0]
+        t = nearest(phi[s_x, :k], psi[s_y, :k] @ c.T)
+    found, result = ZoomOut("", first=10, step=5, number_of_eigenvectors=20, number_of_samples=60)(pair)
+    assert result == RESULTS.successful
+    np.testing.assert_array_equal(found, nearest(phi[:, :20], psi[:, :20] @ c.T))
+
+
+def test_spectral_icp_takes_the_nearest_rotation(pair):
+    icp = METHODS["icp"]
+    x, y, t = pair.spectrum_x, pair.spectrum_y, np.asarray(pair.start)
+    for _ in range(4):
+        c = (np.asarray(x.eigenvectors) * np.asarray(x.vertex_areas)[:, None]).T @ np.asarray(y.eigenvectors)[
+            t
+        ]
+        u, _, v = np.linalg.svd(c)
+        t = nearest(np.asarray(x.eigenvectors), np.asarray(y.eigenvectors) @ (u @ v).T)
+    found, _ = Refined("", icp.refiner, number_of_eigenvectors=K, iterations=4)(pair)
+    np.testing.assert_array_equal(found, t)
+
+
+def test_all_methods_mend_a_noisy_copy():
+    """X is Y with its vertices in another order, and a tenth of the start is wrong."""
+    generator = np.random.default_rng(0)
+    y = random_spectrum(600, 120, seed=3)
+    order = generator.permutation(600)
+    x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
+    start = np.where(generator.random(600) < 0.1, generator.integers(0, 600, 600), order)
+    samples = generator.choice(600, 550, replace=False)
+    pair = SpectralPair(
+        x, y, jnp.asarray(start), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
+    )
+    for name, method in METHODS.items():
+        found, result = method(pair)
+        assert result == RESULTS.successful
+        wrong = np.mean(np.asarray(found) != order)
+        assert wrong > 0.08 if isinstance(method, Start) else wrong < 0.02, name
