@@ -1,3 +1,4 @@
+from .core.batch import refine_pairs, stack
 from .core.filters import (
     ControlPoints,
     CubicSpline,
@@ -32,12 +33,14 @@ from .core.solutions import (
     DescriptorPair,
     Filtering,
     LeastSquares,
+    NearestOrthogonal,
     RegularizedLeastSquares,
     Solution,
     WaveletProblem,
 )
 from .core.spectrum import Spectrum
 from .errors import InputError
+from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
 from .geometry.creature import CreaturePair, creature_pair
@@ -47,7 +50,7 @@ from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.mesh_files import read_mesh, write_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
-from .matching import Correspondence, initial_map, match
+from .matching import Correspondence, initial_map, match, paired_spectra
 
 __version__: str
 __all__ = [
@@ -56,6 +59,8 @@ __all__ = [
     "Correspondence",
     "CreaturePair",
     "CubicSpline",
+    "DataPair",
+    "DataSet",
     "DescriptorPair",
     "ExponentialWindow",
     "FilterBank",
@@ -77,6 +82,7 @@ __all__ = [
     "Mesh",
     "MexicanHat",
     "Meyer",
+    "NearestOrthogonal",
     "Papadakis",
     "Power",
     "QuadraticEnergy",
@@ -111,11 +117,15 @@ __all__ = [
     "match",
     "multiscale_kernel",
     "nearest_neighbor",
+    "open_data_set",
+    "paired_spectra",
     "read_ground_truth",
     "read_mesh",
     "read_pointwise_map",
     "refine",
+    "refine_pairs",
     "shot_descriptors",
+    "stack",
     "tighten",
     "wave_kernel_signature",
     "wavelet_energy",

@@ -110,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         "--vertices", type=_integer(1), default=5000, help="size of the meshes (default: %(default)s)"
     )
     demo.add_argument("--seed", type=_integer(0), default=0, help="another creature (default: %(default)s)")
+    demo.set_defaults(partial=False)
     _add_method(demo)
     _add_common(demo, _demo)
 
@@ -129,6 +130,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         nargs="+",
         help="the true map; the error is printed before and after",
+    )
+    match.add_argument(
+        "--partial",
+        action="store_true",
+        help="one mesh shows only a part of the other's body, in the same unit of length",
     )
     _add_method(match)
     _add_reading(match)
@@ -162,16 +168,21 @@ def _parser() -> argparse.ArgumentParser:
         "--methods",
         metavar="METHOD",
         nargs="+",
-        default=["start", "mwp", "mwp-sampled", "no-filter", "icp", "zoomout", "zoomout-sampled"],
-        help="which (default: %(default)s)",
+        help="which of them (default: all); or directories with maps X_Y.map made elsewhere",
     )
     benchmark.add_argument(
         "--pairs", metavar="N|FILE", help="so many at random, or those of a list (default: all)"
     )
     benchmark.add_argument(
-        "--init", choices=("shot", "wks", "hks", "wavelet", "functional"), default="shot",
-        help="where all methods start (default: %(default)s)",
-    )  # fmt: skip
+        "--init",
+        metavar="START",
+        default="shot",
+        help="where all methods start: shot, wks, hks, wavelet, functional, or a directory with maps X_Y.map "
+        "(default: %(default)s)",
+    )
+    benchmark.add_argument(
+        "--mirrored", action="store_true", help="take the mirrored truth where a map is nearer to it"
+    )
     benchmark.add_argument(
         "--evaluation-samples", metavar="N", type=_integer(1), help="measure at N random points only"
     )
@@ -355,23 +366,25 @@ def _benchmark(options: argparse.Namespace) -> None:
     check_drawable()
     from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
     from jaxsmw.evaluation.datasets import open_data_set
+    from jaxsmw.evaluation.opponents import METHODS, find_method
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.summary import make_directory
     from jaxsmw.report.tables import markdown_table, summarize_methods, write_tables
 
     data_set = open_data_set(options.data)
     pairs = choose_pairs(data_set, options.pairs, options.seed)
-    settings = Settings(options.init, options.evaluation_samples, options.seed)
+    settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
+    methods = dict(map(find_method, options.methods or METHODS))
     output = make_directory(options.output or f"jaxsmw-benchmark-{data_set.name}")
     logging.getLogger("jaxsmw").info(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
     try:
         with open_executor(options.workers, options.scheduler) as executor:
-            results = run_benchmark(pairs, output, options.methods, settings, executor)
+            results = run_benchmark(pairs, output, methods, settings, executor)
     except KeyboardInterrupt:
         _say(f"what is finished is kept in {output}; the same command goes on from there.")
         raise
-    write_tables(output, data_set, results, settings)
-    print(markdown_table(summarize_methods(*results)), end="")
+    write_tables(output, data_set, results, settings, methods)
+    print(markdown_table(summarize_methods(results, seed=options.seed)), end="")
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -442,6 +455,7 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
             iterations=options.iterations,
             number_of_samples=options.samples,
             laplacian=options.laplacian,
+            partial=options.partial,
             stop_when_unchanged=options.stop_when_unchanged,
         )
 

@@ -28,7 +28,7 @@ from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 
 logger = logging.getLogger("jaxsmw")
 
@@ -87,6 +87,7 @@ def match(
     iterations: int = 3,
     number_of_samples: int | None = None,
     laplacian: Laplacian = "auto",
+    partial: bool = False,
     stop_when_unchanged: bool = False,
     history: bool = False,
 ) -> Correspondence:
@@ -110,6 +111,7 @@ def match(
     - `number_of_samples`: iterate on so many farthest-point samples of each shape (more than k) and search
       all vertices in the last iteration only.
     - `laplacian`: see `jaxsmw.compute_spectrum`.
+    - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
     - `stop_when_unchanged`, `history`: see `jaxsmw.refine`.
 
     **Returns:** A `Correspondence`. A vertex of X that no face uses gets the match of the nearest one that
@@ -131,8 +133,8 @@ def match(
         )
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
-        spectrum_x, spectrum_y = (
-            compute_spectrum(mesh, number_of_eigenvectors, laplacian=laplacian) for mesh in (mesh_x, mesh_y)
+        spectrum_x, spectrum_y = paired_spectra(
+            mesh_x, mesh_y, number_of_eigenvectors, laplacian=laplacian, partial=partial
         )
     for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
         if spectrum.eigenvalues[-1] == 0:
@@ -142,7 +144,7 @@ def match(
                 "vertices at the same position (weld=True, on the command line --weld)."
             )
     with _stage("initial map", seconds):
-        start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init)
+        start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init, partial=partial)
     samples: dict[str, Int[Array, " s"]] = {}
     if number_of_samples is not None:
         with _stage("samples", seconds):
@@ -178,6 +180,39 @@ def match(
     )
 
 
+def paired_spectra(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    number_of_eigenvectors: int,
+    *,
+    laplacian: Laplacian = "auto",
+    partial: bool = False,
+) -> tuple[Spectrum, Spectrum]:
+    """The spectra of two meshes as they are matched.
+
+    Of two whole bodies each is scaled to area 1, so that a difference in size cancels. Where one is a part of
+    the other the larger is, and the other by the same factor; then both are cut where the first of them
+    ends (`common_range`), so that k_X and k_Y differ.
+
+    **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
+    """
+    spectrum_x, spectrum_y = (
+        compute_spectrum(mesh, number_of_eigenvectors, laplacian=laplacian) for mesh in (mesh_x, mesh_y)
+    )
+    if not partial:
+        return spectrum_x, spectrum_y
+    larger = max(mesh_x.area, mesh_y.area)
+    return common_range(spectrum_x.scale(mesh_x.area / larger), spectrum_y.scale(mesh_y.area / larger))
+
+
+def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
+    """Two spectra cut at the smaller of their largest eigenvalues (MWP paper, partial shapes)."""
+    spectra = spectrum_x, spectrum_y
+    last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
+    cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]
+    return cut[0], cut[1]
+
+
 def initial_map(
     mesh_x: Mesh,
     mesh_y: Mesh,
@@ -185,16 +220,20 @@ def initial_map(
     spectrum_y: Spectrum,
     *,
     init: Start | ArrayLike = "shot",
+    partial: bool = False,
 ) -> Int64[np.ndarray, " m"]:
     """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
+
+    The spectra are those of `paired_spectra`, and `partial` is what was said there.
 
     **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
     """
     if isinstance(init, str):
         if init == "functional":
-            return _extend_to_unused(mesh_x, _functional_start(mesh_x, mesh_y, spectrum_x, spectrum_y))
+            shot = _shot(mesh_x, mesh_y, partial)
+            return _extend_to_unused(mesh_x, _functional_start(mesh_x, mesh_y, spectrum_x, spectrum_y, shot))
         if init == "shot":
-            features_x, features_y = shot_descriptors(mesh_x), shot_descriptors(mesh_y)
+            features_x, features_y = _shot(mesh_x, mesh_y, partial)
         elif init in _SIGNATURES:
             features_x, features_y = (np.asarray(_SIGNATURES[init](s)) for s in (spectrum_x, spectrum_y))
         else:
@@ -208,7 +247,7 @@ def initial_map(
             raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
         if given.ndim == 1:
             return _extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
-        features_x, features_y = _landmark_features(given, mesh_x, mesh_y)
+        features_x, features_y = _landmark_features(given, mesh_x, mesh_y, partial)
     if not np.isfinite(features_x).all() or not np.isfinite(features_y).all():
         raise InputError(
             f"{mesh_x.name} to {mesh_y.name}: {init!r} descriptors are not defined on these meshes with "
@@ -224,12 +263,33 @@ def initial_map(
     return _extend_to_unused(mesh_x, start)
 
 
+def _units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
+    """What descriptors measure lengths in: the square root of each area, of a partial pair the larger's."""
+    areas = mesh_x.area, mesh_y.area
+    return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
+
+
+def _shot(
+    mesh_x: Mesh, mesh_y: Mesh, partial: bool
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+    """SHOT of both meshes at one scale."""
+    unit_x, unit_y = _units_of_length(mesh_x, mesh_y, partial)
+    return (
+        shot_descriptors(mesh_x, radius=SHOT_RADIUS * unit_x / mesh_x.area**0.5),
+        shot_descriptors(mesh_y, radius=SHOT_RADIUS * unit_y / mesh_y.area**0.5),
+    )
+
+
 def _functional_start(
-    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    shot: tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]],
 ) -> Int64[np.ndarray, " m"]:
     """The pointwise map of the descriptor-based functional map."""
     dtype = spectrum_x.eigenvectors.dtype
-    shot_x, shot_y = (jnp.asarray(shot_descriptors(mesh), dtype) for mesh in (mesh_x, mesh_y))
+    shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in shot)
     solution = RegularizedLeastSquares(
         wavelet_preservation=None,
         orthogonality=None,
@@ -262,16 +322,18 @@ def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndar
 
 
 def _landmark_features(
-    landmarks: np.ndarray, mesh_x: Mesh, mesh_y: Mesh
+    landmarks: np.ndarray, mesh_x: Mesh, mesh_y: Mesh, partial: bool
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """SHOT, and geodesic distances to each landmark in units of the square root of the area."""
+    """SHOT, and geodesic distances to each landmark."""
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
             f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) "
             "for landmarks."
         )
     features = []
-    for mesh, vertices in ((mesh_x, landmarks[:, 0]), (mesh_y, landmarks[:, 1])):
+    sides = zip((mesh_x, mesh_y), landmarks.T, _units_of_length(mesh_x, mesh_y, partial), strict=True)
+    shot = _shot(mesh_x, mesh_y, partial)
+    for (mesh, vertices, unit), described in zip(sides, shot, strict=True):
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))
         if outside.any() or not mesh.used_vertices[vertices].all():
             wrong = vertices[outside] if outside.any() else vertices[~mesh.used_vertices[vertices]]
@@ -279,10 +341,10 @@ def _landmark_features(
                 f"landmark {wrong[0]} is no vertex of the surface of {mesh.name}, whose vertices are 0 to "
                 f"{len(mesh.vertices) - 1}."
             )
-        distances = geodesic_distances(mesh, vertices.astype(np.int64)).T / np.sqrt(mesh.area)
+        distances = geodesic_distances(mesh, vertices.astype(np.int64)).T / unit
         # Another component is farther than anything on the landmark's own.
         distances = np.where(np.isfinite(distances), distances, 100.0)
-        features.append(np.hstack([shot_descriptors(mesh), _LANDMARK_WEIGHT * distances]))
+        features.append(np.hstack([described, _LANDMARK_WEIGHT * distances]))
     return features[0], features[1]
 
 

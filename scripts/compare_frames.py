@@ -43,11 +43,11 @@ from frame_study.summary import Study, write_summary
 from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
 from tqdm import tqdm
 
-import jaxsmw
 from jaxsmw import InputError
-from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
+from jaxsmw.evaluation.journal import Journal, Row, claim_directory
 from jaxsmw.evaluation.workers import Workers, run_tasks
 from jaxsmw.files import atomic_write
+from jaxsmw.provenance import code_digest, measured_code
 from jaxsmw.report.figures import check_drawable
 from jaxsmw.report.summary import make_directory, provenance
 
@@ -157,15 +157,14 @@ def run(data: Path, journals: Journals, workers: int) -> None:
         smoothing=0,
     )
     failed: list[str] = []
+    named = {" ".join(task.name): task for task in tasks}
     with progress, Workers(min(workers, len(tasks))) as executor:
-        run_tasks(
-            partial(measure, data, settings=journals.settings),
-            tasks,
-            executor,
-            keep=lambda _, rows: journals.append(*rows),
-            failed=lambda task, error: failed.append(f"{' '.join(task.name)} ({error})"),
-            advance=progress.update,
-        )
+        for name, result in run_tasks(partial(measure, data, settings=journals.settings), named, executor):
+            if isinstance(result, BaseException):
+                failed.append(f"{name} ({result})")
+            else:
+                journals.append(*result)
+            progress.update()
     if failed:
         raise InputError(
             f"{len(failed)} pairs could not be measured, the others are kept: {'; '.join(failed)}. Mend "
@@ -223,15 +222,7 @@ def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
     check_drawable()
     jax.config.update("jax_platforms", "cpu")
     pairs = select_pairs(data, settings.pairs)
-    library = Path(jaxsmw.__file__).parent
-    code = [
-        *sorted(
-            path for part in ("core", "geometry", "evaluation") for path in (library / part).glob("*.py")
-        ),
-        library / "matching.py",
-        Path(variants.__file__),
-        Path(measurement.__file__),
-    ]
+    code = [*measured_code(), Path(variants.__file__), Path(measurement.__file__)]
     origin = {
         "settings": asdict(settings),
         "versions": {**provenance(), "code": code_digest(code)},

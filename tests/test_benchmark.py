@@ -3,22 +3,28 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Executor, Future
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet
 import pytest
-from synthetic import bumpy_mesh
+from scipy.spatial import KDTree
+from synthetic import bumpy_mesh, sphere_mesh
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import open_data_set
+from jaxsmw.evaluation.opponents import find_method
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import write_mesh
+from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +61,7 @@ def test_one_command_finishes_what_a_killed_one_began(scape, tmp_path):
 
     second = subprocess.run(call, check=True, capture_output=True, text=True)
     lines = results.read_text().splitlines()
-    assert lines[: len(kept)] == kept
+    assert lines[: len(kept)] == kept  # not measured again: times would differ
     assert len(lines) == len(set(lines)) == 1 + 6 * 3
     assert second.stdout.startswith("| method | mean error |")
     third = subprocess.run(call, check=True, capture_output=True, text=True)
@@ -145,6 +151,150 @@ def test_pairs_are_chosen(scape, tmp_path):
         choose_pairs(data_set, str(tmp_path / "list.txt"), 0)
 
 
-def test_unknown_methods_are_refused(scape, tmp_path):
+def test_unknown_methods_and_starts_are_refused(scape, tmp_path):
     with pytest.raises(InputError, match=r"'magic' is no method: choose from start, mwp"):
-        run_benchmark([], tmp_path, ["magic"], Settings(), executor=None)
+        find_method("magic")
+    with pytest.raises(InputError, match=r"'luck' is no start: choose from shot"):
+        run_benchmark([], tmp_path, {}, Settings("luck"), Here())
+
+
+class Here(Executor):
+    """Does its work at once, in this process."""
+
+    def submit(self, function, /, *arguments, **options):
+        future = Future()
+        try:
+            future.set_result(function(*arguments, **options))
+        except InputError as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def measure(scape, tmp_path):
+    """Some methods on some pairs, in this process."""
+
+    def run(names, *, output=tmp_path, data=scape, pairs="2", **settings):
+        methods = dict(map(find_method, names))
+        chosen = choose_pairs(open_data_set(data), pairs, 0)
+        return run_benchmark(chosen, output, methods, Settings(evaluated_points=100, **settings), Here())
+
+    return run
+
+
+def test_maps_made_elsewhere_are_starts_and_methods(measure, tmp_path):
+    generator = np.random.default_rng(0)
+    for kind, wrong in (("rough", 0.3), ("perfect", 0.0)):
+        (tmp_path / kind).mkdir()
+        for x, y in permutations(("mesh000", "mesh001", "mesh002"), 2):
+            truth = np.arange(2562)
+            shuffled = np.where(generator.random(2562) < wrong, generator.permutation(truth), truth)
+            np.savetxt(tmp_path / kind / f"{x}_{y}.map", shuffled + 1, fmt="%d")
+    output = tmp_path / "output"
+    output.mkdir()
+    rows = measure(
+        ["start", "mwp", str(tmp_path / "perfect")], output=output, init=str(tmp_path / "rough")
+    ).rows
+    means = {
+        name: [float(r["mean"]) for r in rows if r["method"] == name] for name in ("start", "mwp", "perfect")
+    }
+    assert means["perfect"] == [0, 0]
+    assert min(means["start"]) > 0.1 and max(means["mwp"]) < 0.02
+    assert [row["seconds"] for row in rows if row["method"] == "perfect"] == ["nan", "nan"]
+    (tmp_path / "perfect" / "mesh000_mesh001.map").unlink()
+    (tmp_path / "perfect" / "mesh002_mesh001.map").write_text("1\n2\n")
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(InputError, match=r"2 shapes or pairs could not be measured.*is missing, the map.*has 2 lines"):
+        measure(
+            ["start", str(tmp_path / "perfect")],
+            output=other,
+            pairs=listed(tmp_path, "mesh000 mesh001\nmesh002 mesh001"),
+        )
+
+
+def listed(directory: Path, pairs: str) -> str:
+    (directory / "pairs.txt").write_text(pairs)
+    return str(directory / "pairs.txt")
+
+
+def test_a_map_that_took_left_for_right_counts_as_mirrored_only_when_asked(measure, tmp_path):
+    """A sphere, its truth the identity and its mirrored truth the reflection; the map is the reflection."""
+    vertices, faces = sphere_mesh(3)
+    reflected = KDTree(vertices).query(vertices * [-1, 1, 1])[1]
+    data = tmp_path / "data"
+    (data / "off").mkdir(parents=True)
+    (data / "corres").mkdir()
+    (tmp_path / "flipped").mkdir()
+    for number in range(2):
+        write_mesh(data / "off" / f"ball{number}.off", make_mesh(vertices, faces))
+        np.savetxt(data / "corres" / f"ball{number}.vts", np.arange(len(vertices)) + 1, fmt="%d")
+        np.savetxt(data / "corres" / f"ball{number}.sym.vts", reflected + 1, fmt="%d")
+        np.savetxt(tmp_path / "flipped" / f"ball{number}_ball{1 - number}.map", reflected + 1, fmt="%d")
+    for mirrored in (False, True):
+        output = tmp_path / f"mirrored-{mirrored}"
+        output.mkdir()
+        (row, _) = measure(
+            ["start"], data=data, output=output, mirrored=mirrored, init=str(tmp_path / "flipped")
+        ).rows
+        assert row["truth"] == ("mirrored" if mirrored else "direct")
+        assert float(row["mean"]) == 0 if mirrored else float(row["mean"]) > 0.2
+
+
+def test_a_shape_that_changed_is_noticed(measure, scape, tmp_path):
+    data, output = tmp_path / "data", tmp_path / "output"
+    shutil.copytree(scape, data)
+    output.mkdir()
+    measure(["start"], data=data, output=output)
+    for file in data.iterdir():
+        file.write_text(file.read_text() + "\n")
+    with pytest.raises(InputError, match="has changed since results"):
+        measure(["start"], data=data, output=output)
+
+
+def test_one_bad_shape_does_not_stop_the_others(measure, scape, tmp_path):
+    data, output = tmp_path / "data", tmp_path / "output"
+    shutil.copytree(scape, data)
+    output.mkdir()
+    whole = (data / "mesh002.off").read_text()
+    (data / "mesh002.off").write_text(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"could not be measured.*mesh002"):
+        measure(["start"], data=data, output=output, pairs="6")
+    assert len((output / "results.csv").read_text().splitlines()) == 1 + 2
+    (data / "mesh002.off").write_text(whole)
+    assert len(measure(["start"], data=data, output=output, pairs="6").rows) == 6
+
+
+def row(
+    source: str, method: str, mean: float, *, result: str = "successful", seconds: float = 1.0
+) -> dict[str, str]:
+    numbers = dict.fromkeys(FIGURES, str(mean)) | {"seconds": str(seconds)}
+    curve = " ".join(["0.5"] * len(CURVE))
+    identity = {"source": source, "target": "y", "method": method, "machine": "m", "truth": "direct"}
+    return identity | {"result": result} | numbers | {"curve": curve}
+
+
+def test_tables_say_what_the_rows_say():
+    rows = [
+        *(row(f"x{i}", "mwp", 0.01 * (i + 1), seconds=i) for i in range(5)),
+        *(row(f"x{i}", "a_b", 0.01 * (i + 1) + 0.02, seconds=np.nan) for i in range(4)),
+        row("x4", "a_b", np.nan, result="it went wrong"),
+    ]
+    seconds = {"seconds_spectrum": "2", "seconds_descriptors": "3"}
+    shapes = {name: seconds for name in ("y", *(f"x{i}" for i in range(5)))}
+    summaries = summarize_methods(Results(rows, shapes))
+    mwp, other = summaries["mwp"], summaries["a_b"]
+    assert mwp.mean == mwp.median == pytest.approx(30) and mwp.difference == (0, 0, 0)
+    assert (mwp.seconds, mwp.pipeline_seconds, mwp.failures) == (2, 12, 0)
+    assert other.mean == pytest.approx(45) and other.failures == 1 and np.isnan(other.seconds)
+    assert other.difference.mean == pytest.approx(20)
+    text = markdown_table(summaries)
+    assert "| a_b | 45.0 | 45.0 | +20.0" in text and "| — | — | 1 |" in text
+    latex = latex_table(summaries)
+    assert r"mwp & \textbf{30.0} &" in latex and r"a\_b & 45.0 &" in latex and "—" not in latex
+    assert all(line.count("&") == 9 for line in latex.splitlines()[2:] if "&" in line)
+
+
+def test_a_table_has_its_first_row_for_a_header():
+    rows = markdown([["a", "b"], ["1", "2"]])
+    assert rows == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"

@@ -30,8 +30,9 @@ from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
-from jaxsmw.evaluation.journal import Journal, claim_directory, code_digest
+from jaxsmw.evaluation.journal import Journal, claim_directory
 from jaxsmw.evaluation.metrics import geodesic_error
+from jaxsmw.provenance import code_digest
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
 
 SCRIPTS = Path(compare_frames.__file__).parent

@@ -103,7 +103,7 @@ def test_layouts_are_recognised_and_their_truth_is_read(tmp_path, layout):
     assert names(data_set)[: len(first)] == first
     assert set(data_set.shapes) == {name for pair in names(data_set) for name in pair}
     for pair in data_set.pairs:
-        assert all(file.is_file() for file in pair.files)
+        assert all(file.is_file() for file in (*pair.meshes, *pair.truth))
         meshes = [read_mesh(file) for file in (pair.source_file, pair.target_file)]
         truth = pair.ground_truth(*meshes)
         if layout == "a remeshed set":

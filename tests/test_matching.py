@@ -15,7 +15,7 @@ from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import initial_map, match
+from jaxsmw.matching import initial_map, match, paired_spectra
 
 OPTIONS = {"number_of_eigenvectors": 30, "refiner": WaveletPreservation(bank=Meyer(4))}
 
@@ -210,3 +210,55 @@ def test_a_soup_of_triangles_is_named(pair):
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
     with pytest.raises(InputError, match=r"with 30 eigenvectors nothing is known of it .* --weld"):
         match(soup, mesh, number_of_eigenvectors=30)
+
+
+@pytest.fixture(scope="module")
+def part(pair):
+    """The upper two thirds of the bumpy body as X, the whole as Y in the same unit, and the true map."""
+    whole = pair[0]
+    kept = whole.vertices[:, 2] > np.quantile(whole.vertices[:, 2], 1 / 3)
+    faces = whole.faces[kept[whole.faces].all(axis=1)]
+    old, faces = np.unique(faces, return_inverse=True)
+    return (
+        make_mesh(5 * whole.vertices[old], faces.reshape(-1, 3)),
+        make_mesh(5 * whole.vertices, whole.faces),
+        old,
+    )
+
+
+def test_spectra_of_a_part_keep_the_unit_of_the_whole(part):
+    mesh_x, mesh_y, _ = part
+    x, y = paired_spectra(mesh_x, mesh_y, 40, partial=True)
+    own = compute_spectrum(mesh_x, 40)
+    k = x.eigenvalues.shape[0]
+    assert 15 < k < 40 == y.eigenvalues.shape[0]
+    np.testing.assert_allclose(x.eigenvalues * mesh_x.area, (own.eigenvalues * mesh_y.area)[:k], rtol=1e-12)
+    np.testing.assert_allclose(x.vertex_areas.sum(), mesh_x.area / mesh_y.area, rtol=1e-12)
+    gram = x.eigenvectors.T @ (x.vertex_areas[:, None] * x.eigenvectors)
+    np.testing.assert_allclose(gram, np.eye(k), atol=1e-9)
+    assert x.eigenvalues[-1] <= y.eigenvalues[-1] < (own.eigenvalues * mesh_y.area / mesh_x.area)[k]
+    # The other way round nothing changes but the names.
+    reverse = paired_spectra(mesh_y, mesh_x, 40, partial=True)
+    np.testing.assert_array_equal(reverse[1].eigenvalues, x.eigenvalues)
+    whole = paired_spectra(mesh_x, mesh_y, 40)
+    np.testing.assert_array_equal(whole[0].eigenvalues, own.eigenvalues)
+
+
+def test_a_part_is_found_in_the_whole(part):
+    mesh_x, mesh_y, truth = part
+    found = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}), partial=True)
+    as_wholes = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}))
+    k_x, k_y = found.functional_map.shape
+    assert k_x < k_y == 40
+    assert mean_error(mesh_y, found.initial_map, truth) < mean_error(mesh_y, as_wholes.initial_map, truth)
+    assert mean_error(mesh_y, found.pointwise_map, truth) < 0.02
+    assert mean_error(mesh_y, as_wholes.pointwise_map, truth) > 0.04
+
+
+@pytest.mark.parametrize("init", ["functional", np.array([[0, 0], [900, 900]])], ids=str)
+def test_other_starts_of_a_part(part, init):
+    mesh_x, mesh_y, truth = part
+    if not isinstance(init, str):
+        init = np.stack([init[:, 0], truth[init[:, 1]]], axis=1)
+    found = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}), partial=True, init=init)
+    assert mean_error(mesh_y, found.initial_map, truth) < 0.15

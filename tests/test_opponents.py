@@ -8,17 +8,17 @@ from synthetic import random_spectrum
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents import METHODS, Refined, SpectralPair, Start, ZoomOut
+from jaxsmw.evaluation.opponents import METHODS, Refined, PreparedPair, Start, ZoomOut
 
 M, N, K = 200, 180, 40
 
 
 @pytest.fixture
-def pair() -> SpectralPair:
+def pair() -> PreparedPair:
     generator = np.random.default_rng(0)
     x, y = random_spectrum(M, K, seed=1), random_spectrum(N, K, seed=2)
     samples = tuple(jnp.asarray(generator.choice(n, 80, replace=False)) for n in (M, N))
-    return SpectralPair(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
+    return PreparedPair(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
 
 
 def nearest(queries, database) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_all_methods_mend_a_noisy_copy():
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
     start = np.where(generator.random(600) < 0.1, generator.integers(0, 600, 600), order)
     samples = generator.choice(600, 550, replace=False)
-    pair = SpectralPair(
+    pair = PreparedPair(
         x, y, jnp.asarray(start), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
     )
     for name, method in METHODS.items():

@@ -39,6 +39,15 @@ class Spectrum(eqx.Module):
             self.mask,
         )
 
+    def scale(self, factor: float) -> Spectrum:
+        """The same shape with every area multiplied by a factor, every length by its square root."""
+        return Spectrum(
+            self.eigenvalues / factor,
+            self.eigenvectors / factor**0.5,
+            self.vertex_areas * factor,
+            self.mask,
+        )
+
     def pad(self, number_of_vertices: int) -> Spectrum:
         """The same shape with masked vertices up to a given number.
 

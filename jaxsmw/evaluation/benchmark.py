@@ -5,30 +5,41 @@ Whatever interrupts it, what is finished is on the disk, and the same command go
 
 from __future__ import annotations
 
+import hashlib
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Int, Int64
 from tqdm import tqdm
 
-import jaxsmw
 from jaxsmw.core.batch import padded_size
+from jaxsmw.core.functional_map import encode
+from jaxsmw.core.pointwise_map import nearest_neighbor, spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.evaluation.journal import Journal, Row, claim_directory, code_digest
+from jaxsmw.evaluation.journal import Journal, Row, claim_directory
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
-from jaxsmw.evaluation.opponents import METHODS, MOST_SAMPLES, SpectralPair
+from jaxsmw.evaluation.opponents import (
+    FIRST_EIGENVECTORS,
+    MOST_EIGENVECTORS,
+    MOST_SAMPLES,
+    Method,
+    PreparedPair,
+    Published,
+    read_published_map,
+)
 from jaxsmw.evaluation.workers import run_tasks
 from jaxsmw.geometry.cache import recomputing
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -36,7 +47,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import Start, initial_map
+from jaxsmw.matching import Start, initial_map, paired_spectra
+from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
 """Where correspondence quality curves are kept, in square roots of the area."""
@@ -57,12 +69,16 @@ class Settings:
 
     **Attributes:**
 
-    - `init`: what all methods start from; see `jaxsmw.match`.
+    - `init`: what all methods start from: a descriptor (see `jaxsmw.match`), or a directory with maps
+      `X_Y.map` computed elsewhere.
+    - `mirrored`: take the mirrored truth where a map is nearer to that, for methods and starts that cannot
+      tell left from right.
     - `evaluated_points`: so many rows of each ground truth, the same for all methods; all if None.
     - `seed`: of their draw.
     """
 
-    init: Start = "shot"
+    init: str = "shot"
+    mirrored: bool = False
     evaluated_points: int | None = None
     seed: int = 0
 
@@ -72,7 +88,7 @@ class Task:
     """What is still missing of one pair."""
 
     pair: DataPair
-    methods: tuple[str, ...]
+    methods: dict[str, Method]
 
 
 def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataPair]:
@@ -110,10 +126,11 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: one for each pair and method, in this order: `source`, `target`, `method`, `result`, `seconds`
-      (from the start to the map, without compilation), `FIGURES`, and `curve`, the shares of points with an
-      error of at most `CURVE`.
-    - `shapes`: for each shape its number of `vertices` and how long its spectrum and descriptors took.
+    - `rows`: one for each pair and method, in this order: `source`, `target`, `method`, `machine`, `result`,
+      `seconds` (from the start to the map, without compilation), the `truth` that counted, `FIGURES`, and
+      `curve`, the shares of points with an error of at most `CURVE`.
+    - `shapes`: for each shape the `digest` of its file, its number of `vertices` and how long its spectrum
+      and descriptors took.
     """
 
     rows: list[Row]
@@ -123,7 +140,7 @@ class Results(NamedTuple):
 def run_benchmark(
     pairs: Sequence[DataPair],
     output: Path,
-    methods: Sequence[str],
+    methods: Mapping[str, Method],
     settings: Settings,
     executor: Executor,
 ) -> Results:
@@ -133,131 +150,213 @@ def run_benchmark(
 
     - `pairs`: what to match.
     - `output`: a directory that exists; gets `results.csv`, `shapes.csv` and `provenance.json`.
-    - `methods`: keys of `jaxsmw.evaluation.opponents.METHODS`.
+    - `methods`: by the names that they get in tables; for example `jaxsmw.evaluation.opponents.METHODS`.
     - `settings`: must be those of results that are there already.
     - `executor`: what works.
 
     **Raises:** `InputError` if the directory holds results of something else, or pairs could not be measured
     (all others are kept).
     """
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown:
-        raise InputError(f"{unknown[0]!r} is no method: choose from {', '.join(METHODS)}.")
-    code = sorted(Path(jaxsmw.__file__).parent.glob("[ceg][ove]*/*.py"))
-    claim_directory(output, {"settings": asdict(settings), "versions": {"code": code_digest(code)}})
+    _check_start(settings.init)
+    made_with = versions() | {"code": code_digest(measured_code())}
+    claim_directory(output, {"settings": asdict(settings), "versions": made_with}, {"commit": commit()})
     results = Journal(output / "results.csv", ["source", "target", "method"])
     shapes = Journal(output / "shapes.csv", ["shape"])
     tasks = []
     for pair in pairs:
-        missing = tuple(name for name in methods if (pair.source, pair.target, name) not in results)
+        missing = {name: methods[name] for name in methods if (*pair.names, name) not in results}
         if missing:
             tasks.append(Task(pair, missing))
-    needed = {}
-    for task in tasks:
-        needed[task.pair.source] = task.pair.source_file
-        needed[task.pair.target] = task.pair.target_file
-    largest = max(method.number_of_eigenvectors for method in METHODS.values())
-    missing_shapes = [(name, file) for name, file in needed.items() if (name,) not in shapes]
+    files = {name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)}
+    for name, file in files.items():
+        if (name,) in shapes and shapes[(name,)]["digest"] != _digest(file):
+            raise InputError(
+                f"{file}: has changed since results in {output} were measured: give another --output."
+            )
+    missing_shapes = {name: (name, file) for name, file in files.items() if (name,) not in shapes}
 
-    failed: list[str] = []
-    _run("shapes", partial(measure_shape, k=largest), missing_shapes, executor, shapes, failed)
-    _run("pairs", partial(measure_pair, k=largest, settings=settings), tasks, executor, results, failed)
+    measure = partial(measure_pair, settings=settings)
+    failed = {
+        **_run("shapes", measure_shape, missing_shapes, executor, shapes),
+        **_run("pairs", measure, {task.pair.name: task for task in tasks}, executor, results),
+    }
     if failed:
+        some = [f"{name} ({str(error).rstrip('.')})" for name, error in failed.items()][:_NAMED_FAILURES]
+        more = f"; and {len(failed) - len(some)} more" if len(failed) > len(some) else ""
         raise InputError(
-            f"{len(failed)} could not be measured, the others are kept in {output}: {'; '.join(failed)}. "
-            "Mend them and start again."
+            f"{len(failed)} shapes or pairs could not be measured, the others are kept in {output}: "
+            f"{'; '.join(some)}{more}. Mend them and start again."
         )
-    return Results(
-        [results[pair.source, pair.target, name] for pair in pairs for name in methods],
-        {name: shapes[(name,)] for pair in pairs for name in (pair.source, pair.target)},
-    )
+    wanted = [(*pair.names, name) for pair in pairs for name in methods]
+    return Results([results[key] for key in wanted], {name: shapes[(name,)] for name in files})
+
+
+def _check_start(init: str) -> None:
+    if init not in get_args(Start) and not Path(init).is_dir():
+        raise InputError(
+            f"{init!r} is no start: choose from {', '.join(get_args(Start))}, or give a directory with maps "
+            "X_Y.map."
+        )
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+
+
+# So many are named in a message; usually all have the same fault.
+_NAMED_FAILURES = 5
 
 
 def _run(
-    what: str, measure: Any, tasks: Sequence[Any], executor: Executor, journal: Journal, failed: list[str]
-) -> None:
-    """Measure all tasks with a progress bar; note which fail and go on."""
+    what: str,
+    measure: Callable[[Any], list[Row]],
+    tasks: Mapping[str, Any],
+    executor: Executor,
+    journal: Journal,
+) -> dict[str, BaseException]:
+    """Measure all tasks with a progress bar, keep what comes, and go on where one fails."""
     if not tasks:
-        return
+        return {}
+    failed: dict[str, BaseException] = {}
     with tqdm(total=len(tasks), desc=what, unit=what[:-1], smoothing=0) as progress:
-        run_tasks(
-            measure,
-            tasks,
-            executor,
-            keep=lambda _, rows: journal.append(rows),
-            failed=lambda task, error: failed.append(f"{_name(task)} ({error})"),
-            advance=progress.update,
-        )
+        for name, result in run_tasks(measure, tasks, executor):
+            if isinstance(result, BaseException):
+                failed[name] = result
+            else:
+                journal.append(result)
+            progress.update()
+    return {name: failed[name] for name in tasks if name in failed}
 
 
-def _name(task: Any) -> str:
-    return task.pair.name if isinstance(task, Task) else task[0]
-
-
-def measure_shape(shape: tuple[str, Path], k: int) -> list[Row]:
+def measure_shape(shape: tuple[str, Path]) -> list[Row]:
     """Precompute what all pairs of a shape share, and note how long each part took."""
     name, file = shape
     with recomputing():
         seconds, mesh = {}, read_mesh(file)
         for what, compute in (
-            ("spectrum", lambda: compute_spectrum(mesh, k)),
+            ("spectrum", lambda: compute_spectrum(mesh, MOST_EIGENVECTORS)),
             ("descriptors", lambda: shot_descriptors(mesh)),
         ):
             began = time.perf_counter()
             compute()
             seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}"
-    return [{"shape": name, "vertices": len(mesh.vertices), **seconds}]
+    return [{"shape": name, "digest": _digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(task: Task, k: int, settings: Settings) -> list[Row]:
+def measure_pair(task: Task, settings: Settings) -> list[Row]:
     """Match a pair with every method and measure the maps; a row for each."""
-    mesh_x, mesh_y = (read_mesh(file) for file in (task.pair.source_file, task.pair.target_file))
-    truth = task.pair.ground_truth(mesh_x, mesh_y)
-    m, pair = len(mesh_x.vertices), _spectral_pair(mesh_x, mesh_y, k, settings.init)
+    data = task.pair
+    mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
+    truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
+    if settings.mirrored:
+        truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+    both_directions = any(method.both_directions for method in task.methods.values())
+    pair = prepare_pair(data, mesh_x, mesh_y, settings.init, both_directions=both_directions)
     rows = []
-    for name in task.methods:
-        method = METHODS[name]
-        sizes = pair.spectrum_x.eigenvectors.shape, pair.spectrum_y.eigenvectors.shape
-        if (name, sizes) not in _compiled:
-            jax.block_until_ready(method(pair))
-            _compiled.add((name, sizes))
-        began = time.perf_counter()
-        pointwise_map, result = jax.block_until_ready(method(pair))
-        seconds = time.perf_counter() - began
-        identity = {"source": task.pair.source, "target": task.pair.target, "method": name}
+    for name, method in task.methods.items():
+        pointwise_map, result, seconds = _timed(name, method, pair)
         ending = "successful" if result == RESULTS.successful else sentence(result)
-        figures = _evaluate(mesh_y, np.asarray(pointwise_map)[:m], truth, settings)
+        figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+        identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
         rows.append(identity | {"result": ending, "seconds": f"{seconds:.5f}"} | figures)
     return rows
 
 
-# Methods whose programs for these sizes this process has compiled already: times are of what comes after.
-_compiled: set[tuple[str, Any]] = set()
+def _timed(name: str, method: Method, pair: PreparedPair) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
+    """The map and its seconds, without compilation; NaN for a map that was computed elsewhere."""
+    program = name, pair.spectrum_x.eigenvectors.shape, pair.spectrum_y.eigenvectors.shape
+    if method.compiled and program not in _compiled:
+        jax.block_until_ready(method(pair))
+        _compiled.add(program)
+    began = time.perf_counter()
+    pointwise_map, result = jax.block_until_ready(method(pair))
+    seconds = np.nan if isinstance(method, Published) else time.perf_counter() - began
+    return np.asarray(pointwise_map), result, seconds
 
 
-def _spectral_pair(mesh_x: Mesh, mesh_y: Mesh, k: int, init: Start) -> SpectralPair:
+# What this process has compiled already: times are of what comes after.
+_compiled: set[tuple[str, tuple[int, ...], tuple[int, ...]]] = set()
+
+
+def prepare_pair(
+    data: DataPair, mesh_x: Mesh, mesh_y: Mesh, init: str, *, both_directions: bool = False
+) -> PreparedPair:
     """Spectra, start and samples, padded so that few programs serve all pairs."""
-    spectrum_x, spectrum_y = (compute_spectrum(mesh, k) for mesh in (mesh_x, mesh_y))
-    start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init)
-    sizes = [padded_size(len(mesh.vertices)) for mesh in (mesh_x, mesh_y)]
-    samples_x, samples_y = (farthest_point_samples(mesh, MOST_SAMPLES) for mesh in (mesh_x, mesh_y))
-    return SpectralPair(
-        spectrum_x.pad(sizes[0]),
-        spectrum_y.pad(sizes[1]),
-        jnp.asarray(np.pad(start, (0, sizes[0] - len(start))), jnp.int32),
-        (jnp.asarray(samples_x), jnp.asarray(samples_y)),
+    meshes = mesh_x, mesh_y
+    spectra = paired_spectra(*meshes, MOST_EIGENVECTORS, partial=data.partial)
+    start = _start(data.names, meshes, spectra, init, data.partial)
+    reverse = None
+    if both_directions:
+        reverse = _reverse_start(data, meshes, spectra, init, start)
+    sizes = [padded_size(len(mesh.vertices)) for mesh in meshes]
+
+    def padded(pointwise_map: Int64[np.ndarray, " m"], size: int) -> Int[Array, " p"]:
+        return jnp.asarray(np.pad(pointwise_map, (0, size - len(pointwise_map))), jnp.int32)
+
+    samples = (
+        jnp.asarray(farthest_point_samples(mesh, min(MOST_SAMPLES, int(mesh.used_vertices.sum()))))
+        for mesh in meshes
     )
+    return PreparedPair(
+        spectra[0].pad(sizes[0]),
+        spectra[1].pad(sizes[1]),
+        padded(start, sizes[0]),
+        tuple(samples),  # type: ignore[arg-type]
+        None if reverse is None else padded(reverse, sizes[1]),
+        meshes,
+        data.names,
+        data.partial,
+    )
+
+
+def _start(
+    names: tuple[str, str],
+    meshes: tuple[Mesh, Mesh],
+    spectra: tuple[Spectrum, Spectrum],
+    init: str,
+    partial: bool,
+) -> Int64[np.ndarray, " m"]:
+    if init in get_args(Start):
+        return initial_map(*meshes, *spectra, init=init, partial=partial)
+    given = read_published_map(Path(init), names, meshes)
+    return initial_map(*meshes, *spectra, init=given, partial=partial)
+
+
+def _reverse_start(
+    data: DataPair,
+    meshes: tuple[Mesh, Mesh],
+    spectra: tuple[Spectrum, Spectrum],
+    init: str,
+    start: Int64[np.ndarray, " m"],
+) -> Int64[np.ndarray, " n"]:
+    """The same kind of start from Y to X; where none was published, from the start's functional map."""
+    names = data.target, data.source
+    if init in get_args(Start) or (Path(init) / f"{'_'.join(names)}.map").is_file():
+        return _start(names, meshes[::-1], spectra[::-1], init, data.partial)
+    spectrum_x, spectrum_y = (spectrum.truncate(FIRST_EIGENVECTORS) for spectrum in spectra)
+    functional_map = encode(jnp.asarray(start), spectrum_x, spectrum_y)
+    embeddings = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
+    reverse = nearest_neighbor(*embeddings[::-1], database_mask=spectrum_x.mask)
+    return np.asarray(reverse).astype(np.int64)
 
 
 def _evaluate(
-    mesh_y: Mesh, pointwise_map: Int[np.ndarray, " m"], truth: GroundTruth, settings: Settings
+    mesh_y: Mesh,
+    pointwise_map: Int[np.ndarray, " m"],
+    truths: Mapping[str, GroundTruth],
+    settings: Settings,
 ) -> Row:
-    """The figures of one map; all NaN where it failed."""
+    """The figures of one map against the truth that it is nearest to; all NaN where it failed."""
     if (pointwise_map < 0).any():
-        return dict.fromkeys(FIGURES, "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
-    error = geodesic_error(
-        mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed
-    )
+        return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+    errors = {
+        name: geodesic_error(
+            mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed
+        )
+        for name, truth in truths.items()
+    }
+    nearest = min(errors, key=lambda name: errors[name].mean)
+    error = errors[nearest]
     figures = (
         error.mean,
         error.median,
@@ -267,6 +366,8 @@ def _evaluate(
         coverage(mesh_y, pointwise_map),
     )
     curve = error.correspondence_quality_curve(CURVE)
-    return {name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)} | {
-        "curve": " ".join(f"{share:.5f}" for share in curve)
+    return {
+        "truth": nearest,
+        **{name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)},
+        "curve": " ".join(f"{share:.5f}" for share in curve),
     }

@@ -32,6 +32,7 @@ class DataPair:
     - `truth`: the files `read_ground_truth` reads; none where vertex i is vertex i.
     - `mirrored_truth`: the same for the left-right mirrored body; None where there is none.
     - `index_base`: what the indices in these files count from; None for what their form says.
+    - `partial`: whether the source is only a part of the target, in the same unit of length.
     """
 
     source: str
@@ -41,6 +42,7 @@ class DataPair:
     truth: tuple[Path, ...] = ()
     mirrored_truth: tuple[Path, ...] | None = None
     index_base: IndexBase | None = None
+    partial: bool = False
 
     @property
     def name(self) -> str:
@@ -48,9 +50,14 @@ class DataPair:
         return f"{self.source} to {self.target}"
 
     @property
-    def files(self) -> tuple[Path, ...]:
-        """All that is read of it."""
-        return self.source_file, self.target_file, *self.truth, *(self.mirrored_truth or ())
+    def names(self) -> tuple[str, str]:
+        """Of source and target."""
+        return self.source, self.target
+
+    @property
+    def meshes(self) -> tuple[Path, Path]:
+        """The files of source and target."""
+        return self.source_file, self.target_file
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
         """The truth about the pair, given its meshes.
@@ -204,13 +211,13 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     return pairs
 
 
-def _class_of(name: str) -> str:
+def class_of(name: str) -> str:
     """What the name of a shape says about its kind: all but the number at its end."""
     return re.sub(r"[_-]?\d+$", "", name)
 
 
 def _within_classes(names: Iterable[str]) -> list[tuple[str, str]]:
-    return [(x, y) for x, y in permutations(names, 2) if _class_of(x) == _class_of(y)]
+    return [(x, y) for x, y in permutations(names, 2) if class_of(x) == class_of(y)]
 
 
 def _remeshed(directory: Path) -> list[DataPair] | None:
@@ -284,7 +291,7 @@ def _partial(directory: Path) -> list[DataPair] | None:
             raise InputError(f"{truth}: is missing, the ground truth of {file}: complete the copy.")
         null = match[1]
         sides = (mirrored,) if mirrored.is_file() else None
-        pairs.append(DataPair(name, null, file, nulls[null], (truth,), sides))
+        pairs.append(DataPair(name, null, file, nulls[null], (truth,), sides, partial=True))
     return pairs
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import csv
-import hashlib
 import io
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from jaxsmw.errors import InputError
@@ -84,8 +83,14 @@ class Journal:
             self._rows.setdefault(tuple(row[name] for name in self.key), row)
 
 
-def claim_directory(directory: Path, provenance: Mapping[str, Mapping[str, Any]]) -> None:
+def claim_directory(
+    directory: Path,
+    provenance: Mapping[str, Mapping[str, Any]],
+    noted: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
     """Note in `provenance.json` what the results in a directory come from, or check that it is the same.
+
+    `noted` are facts about the first time that may differ later.
 
     **Raises:** `InputError` if the directory holds results that come from something else.
     """
@@ -93,6 +98,7 @@ def claim_directory(directory: Path, provenance: Mapping[str, Mapping[str, Any]]
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
         found = json.loads(path.read_text("utf-8"))
+        found.pop("noted", None)
         for group in {**found, **wanted}:
             before, now = found.get(group, {}), wanted.get(group, {})
             for name in {**before, **now}:
@@ -104,17 +110,6 @@ def claim_directory(directory: Path, provenance: Mapping[str, Mapping[str, Any]]
     elif any(directory.glob("*.csv")):
         raise InputError(f"{directory}: holds results of unknown origin: give another --output.")
     else:
+        contents = {**wanted, "noted": dict(noted)} if noted else wanted
         with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n", "utf-8")
-
-
-def code_digest(paths: Iterable[Path]) -> str:
-    """A hash of what Python files do: comments, docstrings and layout do not count."""
-    digest = hashlib.sha256()
-    for path in paths:
-        tree = ast.parse(path.read_text("utf-8"))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
-                del node.body[0]
-        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
-    return digest.hexdigest()[:16]
+            temporary.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import equinox as eqx
-from jaxtyping import Array, Int
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, Int64
 
 from jaxsmw.core.filters import Identity
 from jaxsmw.core.functional_map import encode
@@ -18,10 +21,14 @@ from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.ground_truth import read_pointwise_map
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching import common_range
 
 
 @dataclass(frozen=True, eq=False)
-class SpectralPair:
+class PreparedPair:
     """What methods work on.
 
     **Attributes:**
@@ -29,12 +36,30 @@ class SpectralPair:
     - `spectrum_x`, `spectrum_y`: with at least as many eigenvectors as any method asks for.
     - `start`: the initial T: X -> Y (m,).
     - `samples`: vertices of X and of Y in farthest-point order, for methods that iterate on samples.
+    - `reverse_start`: the initial map Y -> X (n,), for methods that work in `both_directions`.
+    - `meshes`: X and Y, for methods that look at edges.
+    - `names`: of X and Y, for maps on files.
+    - `partial`: whether one shape is a part of the other, so that spectra only have a range in common.
     """
 
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     start: Int[Array, " m"]
-    samples: tuple[Int[Array, " s"], Int[Array, " s"]]
+    samples: tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
+    reverse_start: Int[Array, " n"] | None = None
+    meshes: tuple[Mesh, Mesh] | None = None
+    names: tuple[str, str] = ("X", "Y")
+    partial: bool = False
+
+    def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
+        """Both spectra with k eigenvectors; of a partial pair with those that they have in common."""
+        spectra = self.spectrum_x.truncate(k), self.spectrum_y.truncate(k)
+        return common_range(*spectra) if self.partial else spectra
+
+    def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
+        """The first samples of both, or none."""
+        samples_x, samples_y = self.samples
+        return (None, None) if count is None else (samples_x[:count], samples_y[:count])
 
 
 class Method(abc.ABC):
@@ -44,13 +69,17 @@ class Method(abc.ABC):
 
     - `number_of_eigenvectors`: the largest number it uses.
     - `reference`: where it is published, with what settings.
+    - `both_directions`: whether it needs `PreparedPair.reverse_start`.
+    - `compiled`: whether its first call in a process takes longer.
     """
 
     number_of_eigenvectors: int
     reference: str
+    both_directions: bool = False
+    compiled: bool = True
 
     @abc.abstractmethod
-    def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         """The map, and how its computation ended."""
 
 
@@ -61,8 +90,42 @@ class Start(Method):
     reference: str
     number_of_eigenvectors: int = 1
 
-    def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         return pair.start, RESULTS.successful  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Published(Method):
+    """Maps that others computed, on files in a directory; see `read_published_map`."""
+
+    directory: Path
+    number_of_eigenvectors: int = 1
+    compiled: bool = False
+
+    @property
+    def reference(self) -> str:  # type: ignore[override]
+        """Where the maps lie."""
+        return f"maps in {self.directory}, computed elsewhere"
+
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        assert pair.meshes is not None
+        pointwise_map = read_published_map(self.directory, pair.names, pair.meshes)
+        missing = pair.spectrum_x.mask.shape[0] - len(pointwise_map)
+        padded = jnp.asarray(np.pad(pointwise_map, (0, missing)), jnp.int32)
+        return padded, RESULTS.successful  # type: ignore[return-value]
+
+
+def read_published_map(
+    directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
+) -> Int64[np.ndarray, " m"]:
+    """The map X -> Y from a directory as they circulate: `X_Y.map`, a vertex per line counted from 1.
+
+    **Raises:** `InputError` if it is missing or does not fit the meshes.
+    """
+    file = directory / f"{'_'.join(names)}.map"
+    if not file.is_file():
+        raise InputError(f"{file}: is missing, the map from {names[0]} to {names[1]}: add it.")
+    return read_pointwise_map(file, *meshes, index_base=1)
 
 
 @dataclass(frozen=True)
@@ -75,13 +138,10 @@ class Refined(Method):
     iterations: int = 3
     number_of_samples: int | None = None
 
-    def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
-        samples_x, samples_y = (
-            None if self.number_of_samples is None else vertices[: self.number_of_samples]
-            for vertices in pair.samples
-        )
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        samples_x, samples_y = pair.sampled(self.number_of_samples)
         refined = refine(
-            *_truncated(pair, self.number_of_eigenvectors),
+            *pair.truncated(self.number_of_eigenvectors),
             pair.start,
             refiner=self.refiner,
             iterations=self.iterations,
@@ -90,6 +150,9 @@ class Refined(Method):
         )
         return refined.pointwise_map, refined.result
 
+
+# ZoomOut's published sizes of C.
+FIRST_EIGENVECTORS, ZOOMOUT_STEP, LAST_EIGENVECTORS = 20, 5, 120
 
 _UNFILTERED = WaveletPreservation(Identity())
 _UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_inverse="least_squares"))
@@ -104,31 +167,38 @@ class ZoomOut(Method):
     """
 
     reference: str
-    first: int = 20
-    step: int = 5
-    number_of_eigenvectors: int = 120
+    first: int = FIRST_EIGENVECTORS
+    step: int = ZOOMOUT_STEP
+    number_of_eigenvectors: int = LAST_EIGENVECTORS
     number_of_samples: int | None = None
 
-    def __call__(self, pair: SpectralPair) -> tuple[Int[Array, " m"], RESULTS]:
-        x, y, pointwise_map, refiner = pair.spectrum_x, pair.spectrum_y, pair.start, _UNFILTERED
-        if self.number_of_samples is not None:
-            samples_x, samples_y = (vertices[: self.number_of_samples] for vertices in pair.samples)
-            x, y, refiner = x.sample(samples_x), y.sample(samples_y), _UNFILTERED_ON_SAMPLES
-            first = _encode(pair.start, *_truncated(pair, self.first))
-            pointwise_map = _decode(first, x.truncate(self.first), y.truncate(self.first))
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        pointwise_map, refiner = pair.start, _UNFILTERED
+        samples_x, samples_y = pair.sampled(self.number_of_samples)
+        if samples_x is not None:
+            refiner, first = _UNFILTERED_ON_SAMPLES, pair.truncated(self.first)
+            pointwise_map = _decode(_encode(pair.start, *first), *_at(first, samples_x, samples_y))
         for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
-            refined = refine(x.truncate(k), y.truncate(k), pointwise_map, refiner=refiner, iterations=1)
+            spectra = _at(pair.truncated(k), samples_x, samples_y)
+            refined = refine(*spectra, pointwise_map, refiner=refiner, iterations=1)
             pointwise_map = refined.pointwise_map
-        if self.number_of_samples is not None:
-            pointwise_map = _decode(refined.functional_map, *_truncated(pair, k))
+        if samples_x is not None:
+            pointwise_map = _decode(refined.functional_map, *pair.truncated(k))
         return pointwise_map, refined.result
 
 
 _encode, _decode = eqx.filter_jit(encode), eqx.filter_jit(decode)
 
 
-def _truncated(pair: SpectralPair, k: int) -> tuple[Spectrum, Spectrum]:
-    return pair.spectrum_x.truncate(k), pair.spectrum_y.truncate(k)
+def _at(
+    spectra: tuple[Spectrum, Spectrum],
+    samples_x: Int[Array, " s_x"] | None,
+    samples_y: Int[Array, " s_y"] | None,
+) -> tuple[Spectrum, Spectrum]:
+    """Both shapes, seen at samples only if there are any."""
+    if samples_x is None or samples_y is None:
+        return spectra
+    return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
 
 
 MOST_SAMPLES = 1000
@@ -147,3 +217,24 @@ METHODS: dict[str, Method] = {
         "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
     ),
 }
+
+
+MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
+
+
+def find_method(name: str) -> tuple[str, Method]:
+    """The method of a name, or of a directory with maps computed elsewhere, whose name it then takes.
+
+    **Raises:** `InputError` if it is neither.
+    """
+    from jaxsmw.evaluation.peers import installed_peers
+
+    known = METHODS | installed_peers()
+    if name in known:
+        return name, known[name]
+    directory = Path(name)
+    if not directory.is_dir():
+        raise InputError(
+            f"{name!r} is no method: choose from {', '.join(known)}, or give a directory with maps X_Y.map."
+        )
+    return directory.resolve().name, Published(directory.resolve())

@@ -6,10 +6,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from jaxsmw.errors import InputError
 
@@ -87,20 +87,12 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 
 
 def run_tasks(
-    function: Callable[[Task], Result],
-    tasks: Iterable[Task],
-    executor: Executor,
-    keep: Callable[[Task, Result], None],
-    failed: Callable[[Task, BaseException], None],
-    advance: Callable[[], Any] = lambda: None,
-) -> None:
-    """Give every task to a worker and every result to `keep` as soon as it is there, here in this process."""
-    futures = {executor.submit(function, task): task for task in tasks}
+    function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor
+) -> Iterator[tuple[str, Result | BaseException]]:
+    """Give every task to a worker; yield its name and its result, or the error, as soon as it is there."""
+    futures = {executor.submit(function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
-        # So that what was kept need not stay in memory.
-        task = futures.pop(future)
-        if (error := future.exception()) is None:
-            keep(task, future.result())
-        else:
-            failed(task, error)
-        advance()
+        # Popped, so that what was yielded need not stay in memory.
+        name = futures.pop(future)
+        error = future.exception()
+        yield name, future.result() if error is None else error

@@ -9,16 +9,19 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.mesh import Mesh
 
 _AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11
 _DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
+SHOT_RADIUS = 0.06
+"""The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
 # Vertex–neighbour pairs handled at once; bounds the memory at about 300 bytes per pair.
 _PAIRS_PER_BLOCK = 1_000_000
 
 
-def shot_descriptors(mesh: Mesh, *, radius: float = 0.06) -> Float64[np.ndarray, "n 352"]:
+def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.ndarray, "n 352"]:
     """Signatures of histograms of orientations, one per vertex.
 
     Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
@@ -29,7 +32,8 @@ def shot_descriptors(mesh: Mesh, *, radius: float = 0.06) -> Float64[np.ndarray,
 
     Invariant to rotation, translation and scale, but not to reflection, so that it tells left from right.
     Renumbering vertices renumbers descriptors. Normals are turned outwards first (by the sign of the
-    enclosed volume), so that an inside-out mesh gives the same.
+    enclosed volume), so that an inside-out mesh gives the same. Results are kept on disk
+    (`jaxsmw.geometry.cache`).
 
     **Arguments:**
 
@@ -63,16 +67,19 @@ def shot_descriptors(mesh: Mesh, *, radius: float = 0.06) -> Float64[np.ndarray,
             raise InputError(fault)
         warnings.warn(fault, stacklevel=2)
 
-    descriptors = np.zeros((len(mesh.vertices), _DIMENSION))
-    block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
-    for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
-        pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-        # Vertices at the same place have no direction to each other.
-        pairs = pairs[pairs["v"] > 0]
-        descriptors[vertices[block]] = _describe(
-            positions, normals, block, pairs["i"], pairs["j"], pairs["v"], radius
-        )
-    return descriptors
+    def compute() -> dict[str, np.ndarray]:
+        descriptors = np.zeros((len(mesh.vertices), _DIMENSION))
+        block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
+        for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
+            pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+            # Vertices at the same place have no direction to each other.
+            pairs = pairs[pairs["v"] > 0]
+            descriptors[vertices[block]] = _describe(
+                positions, normals, block, pairs["i"], pairs["j"], pairs["v"], radius
+            )
+        return {"descriptors": descriptors}
+
+    return cached("shot", (mesh.vertices, mesh.faces, radius), compute)["descriptors"]
 
 
 def _describe(

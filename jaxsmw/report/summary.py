@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +19,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.files import atomic_write
 from jaxsmw.matching import Correspondence
+from jaxsmw.provenance import machine, versions
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -141,13 +140,7 @@ def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError
 
 def provenance() -> dict[str, str]:
     """What a figure depends on besides its input: versions and machine."""
-    packages = ("jaxsmw", "jax", "jaxlib", "numpy", "scipy", "libigl")
-    return {
-        **{package: metadata.version(package) for package in packages},
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "device": jax.devices()[0].device_kind,
-    }
+    return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
 def make_directory(path: str | os.PathLike[str]) -> Path:

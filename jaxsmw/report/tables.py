@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,10 +11,14 @@ from jaxtyping import Float64
 
 from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings
 from jaxsmw.evaluation.datasets import DataSet
+from jaxsmw.evaluation.intervals import CONFIDENCE, Interval, mean_interval
 from jaxsmw.evaluation.journal import Row
-from jaxsmw.evaluation.opponents import METHODS
+from jaxsmw.evaluation.opponents import Method
 from jaxsmw.files import atomic_write
 from jaxsmw.report.figures import draw_quality_curves, save_figure
+
+REFERENCE = "mwp"
+"""The method from which the differences of all others are taken."""
 
 
 class MethodSummary(NamedTuple):
@@ -23,10 +27,11 @@ class MethodSummary(NamedTuple):
     **Attributes:**
 
     - `mean`, `median`: of the pairs' mean errors, x 10^-3 of the square root of the area.
+    - `difference`: of the pairs' mean errors from those of `REFERENCE`, pair by pair; NaN without it.
     - `within`: the mean share of points within 0.05.
     - `area_under_curve`: its mean.
     - `coverage`: its mean.
-    - `seconds`: the median time from start to map.
+    - `seconds`: the median time from start to map; NaN where maps came from elsewhere.
     - `pipeline_seconds`: the median time with both shapes' precomputation.
     - `failures`: how many pairs failed.
     - `curve`: the mean correspondence quality curve at `CURVE`.
@@ -34,6 +39,7 @@ class MethodSummary(NamedTuple):
 
     mean: float
     median: float
+    difference: Interval
     within: float
     area_under_curve: float
     coverage: float
@@ -43,19 +49,25 @@ class MethodSummary(NamedTuple):
     curve: Float64[np.ndarray, " t"]
 
 
-def summarize_methods(rows: Sequence[Row], shapes: Mapping[str, Row]) -> dict[str, MethodSummary]:
-    """The rows of `jaxsmw.evaluation.benchmark.run_benchmark`, by method."""
+def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
+    """What `jaxsmw.evaluation.benchmark.run_benchmark` found, by method; `seed` is of the intervals."""
     found = {}
-    for name in dict.fromkeys(row["method"] for row in rows):
-        own = [row for row in rows if row["method"] == name]
+    reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
+    for name in dict.fromkeys(row["method"] for row in results.rows):
+        own = [row for row in results.rows if row["method"] == name]
         good = [row for row in own if row["result"] == "successful"]
-        means = 1e3 * _column(good, "mean")
-        precomputing = np.array([_precomputing(row, shapes) for row in good])
+        errors = _mean_errors(good)
+        differences = np.array(
+            [error - reference[pair] for pair, error in errors.items() if pair in reference]
+        )
+        means = np.array(list(errors.values()))
+        precomputing = np.array([_precomputing(row, results.shapes) for row in good])
         seconds = _column(good, "seconds")
         curves = np.array([np.array(row["curve"].split(), float) for row in good]).reshape(-1, len(CURVE))
         found[name] = MethodSummary(
             mean=_mean(means),
             median=_median(means),
+            difference=mean_interval(differences, seed),
             within=_mean(_column(good, "within_0.05")),
             area_under_curve=_mean(_column(good, "area_under_curve")),
             coverage=_mean(_column(good, "coverage")),
@@ -65,6 +77,15 @@ def summarize_methods(rows: Sequence[Row], shapes: Mapping[str, Row]) -> dict[st
             curve=curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
         )
     return found
+
+
+def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
+    """By pair, x 10^-3; of successful rows only."""
+    return {
+        (row["source"], row["target"]): 1e3 * float(row["mean"])
+        for row in rows
+        if row["result"] == "successful"
+    }
 
 
 def _column(rows: Sequence[Row], name: str) -> Float64[np.ndarray, " r"]:
@@ -88,14 +109,19 @@ def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
     )
 
 
-_COLUMNS = (
-    ("mean error", lambda s: f"{s.mean:.1f}"),
-    ("median", lambda s: f"{s.median:.1f}"),
-    ("within 0.05", lambda s: f"{s.within:.1%}"),
-    ("area under curve", lambda s: f"{s.area_under_curve:.3f}"),
-    ("coverage", lambda s: f"{s.coverage:.1%}"),
-    ("refinement, s", lambda s: f"{s.seconds:.3f}"),
-    ("with precomputation, s", lambda s: f"{s.pipeline_seconds:.2f}"),
+def _text(form: str, value: float) -> str:
+    return "—" if np.isnan(value) else form.format(value)
+
+
+_COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
+    ("mean error", lambda s: _text("{:.1f}", s.mean)),
+    ("median", lambda s: _text("{:.1f}", s.median)),
+    (f"minus {REFERENCE}", lambda s: str(s.difference)),
+    ("within 0.05", lambda s: _text("{:.1%}", s.within)),
+    ("area under curve", lambda s: _text("{:.3f}", s.area_under_curve)),
+    ("coverage", lambda s: _text("{:.1%}", s.coverage)),
+    ("refinement, s", lambda s: _text("{:.2f}", s.seconds)),
+    ("with precomputation, s", lambda s: _text("{:.2f}", s.pipeline_seconds)),
     ("failed", lambda s: str(s.failures)),
 )
 
@@ -104,9 +130,17 @@ def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
     """One row for each method."""
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
-    return (
-        "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows)) + "\n"
+    return markdown([header, *rows])
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A table of text cells; the first row is its header."""
+    return "".join(
+        "| " + " | ".join(cells) + " |\n" for cells in (rows[0], ["---"] * len(rows[0]), *rows[1:])
     )
+
+
+_LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "$-$", "—": "---"})
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
@@ -115,26 +149,29 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
     lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
     for name, summary in summaries.items():
-        cells = [text(summary) for _, text in _COLUMNS]
+        cells = [cell.translate(_LATEX) for cell in (name, *(text(summary) for _, text in _COLUMNS))]
         if summary.mean == best:
-            cells[0] = rf"\textbf{{{cells[0]}}}"
-        lines.append(" & ".join([name, *cells]).replace("%", r"\%") + r" \\")
+            cells[1] = rf"\textbf{{{cells[1]}}}"
+        lines.append(" & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
-def write_tables(directory: Path, data_set: DataSet, results: Results, settings: Settings) -> None:
+def write_tables(
+    directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
+) -> None:
     """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`."""
-    summaries = summarize_methods(*results)
+    summaries = summarize_methods(results, seed=settings.seed)
     pairs = len({(row["source"], row["target"]) for row in results.rows})
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     parts = [
         f"# {data_set.name}",
         f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}), all methods from the same start "
         f"({settings.init}). Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, "
-        f"at {points} of the ground truth; their mean and median are over the pairs. Times are medians over "
-        "the pairs, on one core each.",
+        f"at {points} of the ground truth; mean and median are over the pairs on which a method did not "
+        f"fail, the difference is pair by pair, with its {CONFIDENCE:.0%} bootstrap interval. Times are "
+        "medians over the pairs, of one process with one core, without compilation.",
         markdown_table(summaries),
-        "\n".join(f"- **{name}**: {METHODS[name].reference}" for name in summaries),
+        "\n".join(f"- **{name}**: {methods[name].reference}" for name in summaries),
         "Pair by pair: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
     ]
     _write(directory / "summary.md", "\n\n".join(parts) + "\n")

@@ -8,25 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.stats import bootstrap
 
 from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, Settings
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.core.functional_map import Convention
+from jaxsmw.evaluation.intervals import CONFIDENCE, RESAMPLES, Interval, mean_interval
 from jaxsmw.evaluation.journal import Row
 
-CONFIDENCE = 0.95
 SETTLED = 0.05
 """An iteration in which fewer matches than this share move is the one in which a map settles."""
-_RESAMPLES = 9999
-
-
-class Interval(NamedTuple):
-    """A mean with its bootstrap confidence interval."""
-
-    mean: float
-    low: float
-    high: float
 
 
 class Comparison(NamedTuple):
@@ -40,26 +30,6 @@ class Comparison(NamedTuple):
     difference: Interval
     better: float
     failures: int
-
-
-def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
-    """The mean of a sample and its bias-corrected and accelerated bootstrap interval (Efron 1987)."""
-    if len(values) == 0:
-        return Interval(np.nan, np.nan, np.nan)
-    mean = float(values.mean())
-    if np.ptp(values) == 0:  # as of the default with itself
-        return Interval(mean, mean, mean)
-    if len(values) < 3:  # too few to say anything
-        return Interval(mean, np.nan, np.nan)
-    found = bootstrap(
-        (values,),
-        np.mean,
-        n_resamples=_RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="BCa",
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return Interval(mean, float(found.low), float(found.high))
 
 
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
@@ -137,7 +107,7 @@ class Study:
         """One variant minus another on the pairs on which neither failed, and on how many one did."""
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
         both = np.isfinite(differences)
-        text = _interval(mean_interval(differences[both], self.settings.seed))
+        text = str(mean_interval(differences[both], self.settings.seed))
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
@@ -183,7 +153,7 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             "**error**: mean geodesic error x 10⁻³ of the square root of the target's area, at "
             f"{settings.evaluated_points} points of the ground truth, the same for all variants.",
             "**difference**: mean over the pairs of the error minus that of the default (Meyer, filtering, "
-            f"pullback) on the same pair, with its {CONFIDENCE:.0%} bootstrap interval (BCa, {_RESAMPLES} "
+            f"pullback) on the same pair, with its {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} "
             "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow; and of so "
             "many intervals one in twenty would miss zero by chance alone.",
             "**better**: the share of pairs with a smaller error than the default's; a failure is none.",
@@ -247,7 +217,7 @@ def _overview(study: Study, convention: Convention) -> str:
         for update in UPDATES:
             variant = Variant(frame, update, convention)
             found = study.comparisons[variant, "both"]
-            text = f"{_number(found.mean)} ({_interval(found.difference)})"
+            text = f"{_number(found.mean)} ({found.difference!s})"
             cells.append(("= " if variant in study.twins else "") + _failing(text, found))
         rows.append(cells)
     return _table(header, rows)
@@ -280,7 +250,7 @@ def _ablations(study: Study) -> str:
             cells = [f"{label} ({variant.frame}, {variant.update})"]
             for name in [*data_sets, "both"]:
                 found = study.comparisons[variant, name]
-                cells += [_failing(_number(found.mean), found), _interval(found.difference)]
+                cells += [_failing(_number(found.mean), found), str(found.difference)]
             rows.append([*cells, f"−{-least:.2g}" if least < -1e-4 else "≥ 0"])
     header = ["", *(title for name in [*data_sets, "both"] for title in (name, "difference"))]
     return _table([*header, "least eigenvalue of the kernel"], rows) + (
@@ -356,7 +326,7 @@ def _details(study: Study, convention: Convention, data_set: str) -> str:
                     ("= " if variant in study.twins else "") + variant.update,
                     _number(found.mean),
                     _number(found.median),
-                    _interval(found.difference),
+                    str(found.difference),
                     "default" if variant == DEFAULT else f"{found.better:.0%}",
                     _significant(study.relative_energy(variant, data_set)),
                     f"> {study.settings.iterations}" if np.isinf(settling) else _significant(settling),
@@ -408,14 +378,6 @@ def _significant(value: float) -> str:
     if not np.isfinite(value):
         return "—" if np.isnan(value) else "∞"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}" if abs(value) < 1e5 else f"{value:.0e}"
-
-
-def _interval(interval: Interval) -> str:
-    if np.isnan(interval.mean):
-        return "—"
-    if np.isnan(interval.low):
-        return f"{interval.mean:+.1f}".replace("-", "−")
-    return "{:+.1f} [{:+.1f}, {:+.1f}]".format(*interval).replace("-", "−")
 
 
 def _list(*items: str) -> str:

@@ -1,0 +1,61 @@
+"""What a result was made with: versions, code, machine."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+
+_PACKAGES = ("jaxsmw", "jax", "jaxlib", "numpy", "scipy", "libigl")
+_LIBRARY = Path(__file__).parent
+
+
+def versions() -> dict[str, str]:
+    """Of everything that results depend on."""
+    return {
+        **{package: metadata.version(package) for package in _PACKAGES},
+        "python": platform.python_version(),
+    }
+
+
+def machine() -> str:
+    """System, processor and number of cores."""
+    processor = platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():  # Linux, where the platform module knows no more than the architecture
+        lines = cpuinfo.read_text("utf-8", "replace").splitlines()
+        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        processor = models[0] if models else processor
+    return f"{platform.system()}, {processor}, {os.cpu_count()} cores"
+
+
+def commit() -> str:
+    """The commit of a checkout, with `-dirty` where files were changed since; the version elsewhere."""
+    call = ["git", "-C", str(_LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
+    try:
+        return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return metadata.version("jaxsmw")
+
+
+def measured_code() -> list[Path]:
+    """The library's modules on which numbers depend, without command line and drawing."""
+    parts = (_LIBRARY / part for part in ("core", "geometry", "evaluation"))
+    return [*sorted(path for part in parts for path in part.glob("*.py")), _LIBRARY / "matching.py"]
+
+
+def code_digest(paths: Iterable[Path]) -> str:
+    """A hash of what Python files do: comments, docstrings and layout do not count."""
+    digest = hashlib.sha256()
+    for path in paths:
+        tree = ast.parse(path.read_text("utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+                del node.body[0]
+        digest.update(f"{path.name}\n{ast.dump(tree)}\n".encode())
+    return digest.hexdigest()[:16]

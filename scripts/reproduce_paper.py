@@ -1,0 +1,295 @@
+"""The MWP paper's comparisons, on whatever data sets are there.
+
+    python scripts/reproduce_paper.py DATA_DIRECTORY [--output DIR] [--only NAME ...] [--pairs N] [--quick]
+
+DATA_DIRECTORY holds data sets as `docs/datasets.md` describes them, each in its own directory. Every
+experiment below is measured on those it is for:
+
+- `table1`: error and refinement time of all methods (Table 1), time with precomputation (Table 2) and
+  correspondence quality curves (Fig. 4), on sets whose pairs are of one class;
+- `fig6`: parts of shapes, cuts and holes apart;
+- `fig7`: bodies glued to themselves;
+- `fig9`: other meshings and resolutions of the target, and other starts;
+- `nonisometric`: pairs of different classes, from published starts where there are, beside published results.
+
+The output gets a directory for each run (what `jaxsmw benchmark` writes) and `README.md` with all tables.
+Whatever interrupts it, the same command goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import NamedTuple
+
+import igl
+import numpy as np
+from jaxtyping import Int64
+from scipy.spatial import KDTree
+
+from jaxsmw import InputError
+from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
+from jaxsmw.evaluation.opponents import METHODS, Method, Published
+from jaxsmw.evaluation.peers import installed_peers
+from jaxsmw.evaluation.workers import open_executor
+from jaxsmw.files import atomic_write
+from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.report.summary import make_directory
+from jaxsmw.report.tables import MethodSummary, markdown, summarize_methods, write_tables
+
+FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")
+# How many pairs of each set fig9 takes of those that the other experiments take.
+FIG9_SHARE = 4
+STARTS = ("shot", "wks", "hks", "wavelet", "functional")
+# SHOT and what is made of it alone tell left from right.
+_MIRRORED = {"wks", "hks", "wavelet"}
+
+
+class Run(NamedTuple):
+    """One benchmark: a column of an experiment's table."""
+
+    experiment: str
+    name: str
+    data_set: DataSet
+    pairs: list[DataPair]
+    methods: Mapping[str, Method]
+    settings: Settings
+
+
+def find_data_sets(data: Path) -> list[DataSet]:
+    """All that are recognised in a directory's directories."""
+    found = []
+    for directory in sorted(path for path in data.iterdir() if path.is_dir()):
+        try:
+            found.append(open_data_set(directory))
+        except InputError as error:
+            print(f"left out: {error}")
+    if not found:
+        raise InputError(f"{data}: holds no data set: give the directory that holds them.")
+    return found
+
+
+def is_isometric(data_set: DataSet) -> bool:
+    """Whether its pairs are poses of whole bodies of one kind."""
+    special = ("SHREC'16 partial", "SHREC'16 topology")
+    within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
+    return within and data_set.layout not in special
+
+
+def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Whole near-isometric shapes, every method."""
+    for data_set in filter(is_isometric, data_sets):
+        yield Run(
+            "table1", data_set.name, data_set, chosen(data_set, options), methods(options), settings(options)
+        )
+
+
+def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Parts to their full shapes."""
+    whole_only = installed_peers().keys()
+    partial = {name: method for name, method in methods(options).items() if name not in whole_only}
+    for data_set in data_sets:
+        if data_set.layout != "SHREC'16 partial":
+            continue
+        for kind in ("cuts", "holes"):
+            pairs = tuple(pair for pair in data_set.pairs if pair.source.startswith(kind))
+            if pairs:
+                part = dataclasses.replace(data_set, pairs=pairs)
+                yield Run(
+                    "fig6", f"{data_set.name}-{kind}", part, chosen(part, options), partial, settings(options)
+                )
+
+
+def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Topological noise."""
+    for data_set in data_sets:
+        if data_set.layout == "SHREC'16 topology":
+            pairs = chosen(data_set, options)
+            yield Run("fig7", data_set.name, data_set, pairs, methods(options), settings(options))
+
+
+def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Other meshings and resolutions of the target, other starts."""
+    some = {name: METHODS[name] for name in FIG9_METHODS}
+    few = argparse.Namespace(**{**vars(options), "pairs": max(2, (options.pairs or 40) // FIG9_SHARE)})
+    for data_set in filter(is_isometric, data_sets):
+        pairs = chosen(data_set, few)
+        for start in (*STARTS, *published(data_set)):
+            setting = settings(options, init=start, mirrored=_can_mirror(start, pairs))
+            yield Run("fig9", f"{data_set.name}-from-{Path(start).name}", data_set, pairs, some, setting)
+        if not all(len(pair.truth) in (0, 2) for pair in pairs):
+            continue  # no rows to carry over
+        for name, remesh in MESHINGS.items():
+            directory = options.output / "fig9" / f"meshes-{data_set.name}-{name}"
+            derived = derive(directory, pairs, name, remesh)
+            every = list(derived.pairs)
+            yield Run("fig9", f"{data_set.name}-{name}", derived, every, some, settings(options))
+
+
+def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Different kinds of bodies, and what others made of them from the same starts."""
+    for data_set in data_sets:
+        if is_isometric(data_set) or data_set.layout != "a remeshed set":
+            continue
+        directories = published(data_set)
+        starts = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
+        for start in starts or ["shot"]:
+            finished = {Path(path).name: Published(Path(path)) for path in directories if path not in starts}
+            setting = settings(options, init=start)
+            pairs = chosen(data_set, options)
+            yield Run(
+                "nonisometric", f"{data_set.name}-from-{Path(start).name}", data_set, pairs,
+                methods(options) | finished, setting,
+            )  # fmt: skip
+
+
+EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric)}
+
+
+def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
+    """The pairs of a set that are measured."""
+    return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
+
+
+def methods(options: argparse.Namespace) -> dict[str, Method]:
+    """All there are, or a few quick ones."""
+    every = METHODS | installed_peers()
+    return {name: every[name] for name in ("start", "mwp", "zoomout-sampled")} if options.quick else every
+
+
+def settings(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
+    """The same points for all."""
+    return Settings(init, mirrored, 200 if options.quick else None, options.seed)
+
+
+def published(data_set: DataSet) -> list[str]:
+    """Directories with maps that come with a set."""
+    return sorted(str(path) for path in (data_set.directory / "maps").glob("*") if path.is_dir())
+
+
+def _can_mirror(start: str, pairs: list[DataPair]) -> bool:
+    unsure = start in _MIRRORED or "symm" in Path(start).name
+    return unsure and all(pair.mirrored_truth is not None for pair in pairs)
+
+
+# Each meshing gives, for every new vertex, the old vertex at its place, or -1.
+Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
+
+
+def finer(mesh: Mesh) -> Remeshed:
+    """Every face cut in four."""
+    vertices, faces = igl.upsample(mesh.vertices, mesh.faces, 1)
+    old = np.full(len(vertices), -1)
+    old[: len(mesh.vertices)] = np.arange(len(mesh.vertices))
+    return make_mesh(vertices, faces), old
+
+
+def coarser(mesh: Mesh) -> Remeshed:
+    """Edges collapsed, the shortest first, until a quarter of the faces is left."""
+    return _decimate(mesh, mesh.vertices, len(mesh.faces) // 4)
+
+
+def uneven(mesh: Mesh) -> Remeshed:
+    """The same down to half, with edges counted up to four times as long towards one end of the body."""
+    centered = mesh.vertices - mesh.vertices.mean(axis=0)
+    _, _, axes = np.linalg.svd(centered, full_matrices=False)
+    along = centered @ axes[0]
+    along = (along - along.min()) / np.ptp(along)
+    return _decimate(mesh, centered * 4 ** along[:, None], len(mesh.faces) // 2)
+
+
+def _decimate(mesh: Mesh, positions: np.ndarray, faces: int) -> Remeshed:
+    _, kept, _, old = igl.decimate(positions, mesh.faces.astype(np.int32), faces)
+    return make_mesh(mesh.vertices[old], kept), np.asarray(old)
+
+
+MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": coarser, "uneven": uneven}
+
+
+def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
+    """A remeshed set on disk: the sources as they are, the targets meshed anew."""
+    listing = directory / "test_pairs.txt"
+    if not listing.exists():
+        shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")
+        for pair in pairs:
+            mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
+            truth = pair.ground_truth(mesh_x, mesh_y)
+            remeshed, old = remesh(mesh_y)
+            new = KDTree(remeshed.vertices).query(mesh_y.vertices)[1]
+            new[old[old >= 0]] = np.flatnonzero(old >= 0)
+            for shape, mesh, rows in (
+                (pair.source, mesh_x, truth.source_vertices),
+                (f"{pair.target}-{name}", remeshed, new[truth.targets]),
+            ):
+                write_mesh(shapes / f"{shape}.off", mesh)
+                np.savetxt(truths / f"{shape}.vts", rows + 1, fmt="%d")
+        with atomic_write(listing) as temporary:
+            temporary.write_text("".join(f"{pair.source} {pair.target}-{name}\n" for pair in pairs), "utf-8")
+    return open_data_set(directory)
+
+
+def perform(run: Run, output: Path, executor: Executor) -> dict[str, MethodSummary]:
+    """Measure what is missing and write its tables."""
+    directory = make_directory(output / run.experiment / run.name)
+    print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
+    results = run_benchmark(run.pairs, directory, run.methods, run.settings, executor)
+    write_tables(directory, run.data_set, results, run.settings, run.methods)
+    return summarize_methods(results, seed=run.settings.seed)
+
+
+def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
+    """A table for each experiment: methods by runs, mean error and seconds of refinement."""
+    parts = ["# The paper's comparisons", "Mean error x 10⁻³ of √area, seconds from start to map."]
+    for experiment in dict.fromkeys(experiment for experiment, _ in found):
+        columns = {name: summaries for (own, name), summaries in found.items() if own == experiment}
+        names = dict.fromkeys(name for summaries in columns.values() for name in summaries)
+        rows = [["method", *(f"[{name}]({experiment}/{name}/summary.md)" for name in columns)]]
+        rows += [[name, *(_cell(summaries.get(name)) for summaries in columns.values())] for name in names]
+        parts += [f"## {experiment}", markdown(rows)]
+    return "\n\n".join(parts)
+
+
+def _cell(summary: MethodSummary | None) -> str:
+    if summary is None:
+        return "—"
+    seconds = "" if np.isnan(summary.seconds) else f", {summary.seconds:.2f} s"
+    return f"{summary.mean:.1f}{seconds}" + (f", {summary.failures} failed" if summary.failures else "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument("--output", type=Path, default=Path("paper"), metavar="DIR")
+    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS))
+    parser.add_argument("--pairs", type=int, help="at most so many of each set, at random (default: all)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster")
+    parser.add_argument("--quick", action="store_true", help="two pairs, three methods, 200 points")
+    options = parser.parse_args()
+    if options.quick:
+        options.pairs = min(options.pairs or 2, 2)
+    try:
+        data_sets = find_data_sets(options.data)
+        found = {}
+        with open_executor(options.workers, options.scheduler) as executor:
+            for name in options.only:
+                for run in EXPERIMENTS[name](data_sets, options):
+                    found[run.experiment, run.name] = perform(run, options.output, executor)
+                    with atomic_write(options.output / "README.md") as temporary:
+                        temporary.write_text(overview(found), "utf-8")
+    except InputError as error:
+        parser.exit(2, f"{error}\n")
+    print(options.output / "README.md")
+
+
+if __name__ == "__main__":
+    main()
