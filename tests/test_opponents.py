@@ -1,5 +1,7 @@
 """The opponents do what their papers say: against plain NumPy, and on cases with a known answer."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -76,6 +78,8 @@ def test_all_methods_mend_a_noisy_copy():
         x, y, jnp.asarray(start), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
     )
     for name, method in METHODS.items():
+        if isinstance(method, ZoomOut):
+            method = replace(method, step=50)  # every size is compiled
         found, result = method(pair)
         assert result == RESULTS.successful
         wrong = np.mean(np.asarray(found) != order)

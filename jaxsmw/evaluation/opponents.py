@@ -22,6 +22,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.evaluation.cpd import DriftRecovery
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import common_range
@@ -211,6 +212,11 @@ METHODS: dict[str, Method] = {
         "Ovsjanikov et al. 2012, spectral ICP: k = 100, 10 iterations",
         WaveletPreservation(Identity(), NearestOrthogonal(Filtering())),
         iterations=10,
+    ),
+    "cpd": Refined(
+        "Rodolà, Moeller, Cremers 2015: k = 30, 3 times C and its recovery by Coherent Point Drift",
+        DriftRecovery(),
+        number_of_eigenvectors=30,
     ),
     "zoomout": ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120"),
     "zoomout-sampled": ZoomOut(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +35,6 @@ class Peer(Method):
     """
 
     number_of_eigenvectors = LAST_EIGENVECTORS
-    compiled = False
     package: str
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
@@ -114,13 +112,10 @@ class Geomfum(Peer):
         from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
         from geomfum.refine import ZoomOut
 
-        basis_y, basis_x = (
-            EigenBasis(shape.eigenvalues, shape.eigenvectors, use_k=FIRST_EIGENVECTORS) for shape in (y, x)
-        )
-        first = FmFromP2pConverter()(start, basis_y, basis_x)
-        refined: Any = ZoomOut(nit=_STEPS, step=ZOOMOUT_STEP)(first, basis_y, basis_x)
-        basis_y.use_k = basis_x.use_k = LAST_EIGENVECTORS
-        return np.asarray(P2pFromFmConverter()(refined, basis_y, basis_x))
+        bases = [EigenBasis(shape.eigenvalues, shape.eigenvectors) for shape in (y, x)]
+        first = FmFromP2pConverter()(start, *(basis.truncate(FIRST_EIGENVECTORS) for basis in bases))
+        refined = ZoomOut(nit=_STEPS, step=ZOOMOUT_STEP)(first, *bases)
+        return np.asarray(P2pFromFmConverter()(refined, *bases))
 
 
 _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
