@@ -10,7 +10,8 @@ from synthetic import random_spectrum
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents import METHODS, Refined, PreparedPair, Start, ZoomOut
+from jaxsmw.evaluation.opponents import METHODS, PreparedPair, Refined, Start, ZoomOut
+from jaxsmw.evaluation.peers import installed_peers
 
 M, N, K = 200, 180, 40
 
@@ -84,3 +85,31 @@ def test_all_methods_mend_a_noisy_copy():
         assert result == RESULTS.successful
         wrong = np.mean(np.asarray(found) != order)
         assert wrong > 0.08 if isinstance(method, Start) else wrong < 0.02, name
+
+
+@pytest.mark.filterwarnings("ignore::ImportWarning")
+def test_other_libraries_run_the_same_zoomout():
+    """Padding and unused vertices are kept from them, and their maps count the same vertices as ours."""
+    peers = installed_peers()
+    if not peers:
+        pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")
+    generator = np.random.default_rng(0)
+    order = generator.permutation(300)
+    y = random_spectrum(300, 120, seed=1)
+    x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
+    start = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
+    samples = (jnp.arange(200), jnp.arange(200))
+    expected, _ = METHODS["zoomout"](PreparedPair(x, y, start, samples))
+    # One vertex in front that no face uses, and padding behind.
+    x, y = (
+        Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
+        for s in (x.pad(320), y.pad(310))
+    )
+    shifted = jnp.roll(jnp.pad(start + 1, (0, 20)), 1)
+    for name, peer in peers.items():
+        found, result = peer(PreparedPair(x, y, shifted, samples))
+        assert result == RESULTS.successful
+        found = np.asarray(found)[1:301] - 1
+        assert np.mean(found != order) < 0.02
+        if name == "pyfm-zoomout":
+            np.testing.assert_array_equal(found, expected)
