@@ -159,7 +159,9 @@ def run_benchmark(
     """
     _check_start(settings.init)
     made_with = versions() | {"code": code_digest(measured_code())}
-    claim_directory(output, {"settings": asdict(settings), "versions": made_with}, {"commit": commit()})
+    # Not the path of maps, so that a moved copy of the data is no other start.
+    chosen = asdict(settings) | {"init": Path(settings.init).name}
+    claim_directory(output, {"settings": chosen, "versions": made_with}, {"commit": commit()})
     results = Journal(output / "results.csv", ["source", "target", "method"])
     shapes = Journal(output / "shapes.csv", ["shape"])
     tasks = []

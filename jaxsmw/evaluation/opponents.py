@@ -106,7 +106,7 @@ class Published(Method):
     @property
     def reference(self) -> str:  # type: ignore[override]
         """Where the maps lie."""
-        return f"maps in {self.directory}, computed elsewhere"
+        return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         assert pair.meshes is not None

@@ -27,7 +27,7 @@ class MethodSummary(NamedTuple):
     **Attributes:**
 
     - `mean`, `median`: of the pairs' mean errors, x 10^-3 of the square root of the area.
-    - `difference`: of the pairs' mean errors from those of `REFERENCE`, pair by pair; NaN without it.
+    - `difference`: of the pairs' mean errors from those of `REFERENCE`, pair by pair; NaN of itself.
     - `within`: the mean share of points within 0.05.
     - `area_under_curve`: its mean.
     - `coverage`: its mean.
@@ -67,7 +67,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
         found[name] = MethodSummary(
             mean=_mean(means),
             median=_median(means),
-            difference=mean_interval(differences, seed),
+            difference=mean_interval(differences if name != REFERENCE else differences[:0], seed),
             within=_mean(_column(good, "within_0.05")),
             area_under_curve=_mean(_column(good, "area_under_curve")),
             coverage=_mean(_column(good, "coverage")),
@@ -162,14 +162,17 @@ def write_tables(
     """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`."""
     summaries = summarize_methods(results, seed=settings.seed)
     pairs = len({(row["source"], row["target"]) for row in results.rows})
+    machines = sorted({row["machine"] for row in results.rows})
+    start = Path(settings.init).name
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     parts = [
         f"# {data_set.name}",
         f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}), all methods from the same start "
-        f"({settings.init}). Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, "
+        f"({start}). Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, "
         f"at {points} of the ground truth; mean and median are over the pairs on which a method did not "
         f"fail, the difference is pair by pair, with its {CONFIDENCE:.0%} bootstrap interval. Times are "
-        "medians over the pairs, of one process with one core, without compilation.",
+        f"medians over the pairs, without compilation, on {'; '.join(machines)}; local workers have one core "
+        "each.",
         markdown_table(summaries),
         "\n".join(f"- **{name}**: {methods[name].reference}" for name in summaries),
         "Pair by pair: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
