@@ -366,7 +366,7 @@ def _benchmark(options: argparse.Namespace) -> None:
     check_drawable()
     from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
     from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents import METHODS, find_method
+    from jaxsmw.evaluation.opponents import find_method, suited_methods
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.summary import make_directory
     from jaxsmw.report.tables import markdown_table, summarize_methods, write_tables
@@ -374,7 +374,7 @@ def _benchmark(options: argparse.Namespace) -> None:
     data_set = open_data_set(options.data)
     pairs = choose_pairs(data_set, options.pairs, options.seed)
     settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
-    methods = dict(map(find_method, options.methods or METHODS))
+    methods = dict(map(find_method, options.methods)) if options.methods else suited_methods(pairs)
     output = make_directory(options.output or f"jaxsmw-benchmark-{data_set.name}")
     logging.getLogger("jaxsmw").info(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
     try:

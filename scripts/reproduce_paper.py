@@ -22,7 +22,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
@@ -35,8 +35,7 @@ from scipy.spatial import KDTree
 from jaxsmw import InputError
 from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
-from jaxsmw.evaluation.opponents import METHODS, Method, Published
-from jaxsmw.evaluation.peers import installed_peers
+from jaxsmw.evaluation.opponents import METHODS, Method, Published, suited_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.mesh import Mesh, make_mesh
@@ -88,15 +87,12 @@ def is_isometric(data_set: DataSet) -> bool:
 def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
     """Whole near-isometric shapes, every method."""
     for data_set in filter(is_isometric, data_sets):
-        yield Run(
-            "table1", data_set.name, data_set, chosen(data_set, options), methods(options), settings(options)
-        )
+        pairs = chosen(data_set, options)
+        yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), settings(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
     """Parts to their full shapes."""
-    whole_only = installed_peers().keys()
-    partial = {name: method for name, method in methods(options).items() if name not in whole_only}
     for data_set in data_sets:
         if data_set.layout != "SHREC'16 partial":
             continue
@@ -105,7 +101,12 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
             if pairs:
                 part = dataclasses.replace(data_set, pairs=pairs)
                 yield Run(
-                    "fig6", f"{data_set.name}-{kind}", part, chosen(part, options), partial, settings(options)
+                    "fig6",
+                    f"{data_set.name}-{kind}",
+                    part,
+                    chosen(part, options),
+                    methods(pairs, options),
+                    settings(options),
                 )
 
 
@@ -114,7 +115,7 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
             pairs = chosen(data_set, options)
-            yield Run("fig7", data_set.name, data_set, pairs, methods(options), settings(options))
+            yield Run("fig7", data_set.name, data_set, pairs, methods(pairs, options), settings(options))
 
 
 def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -148,7 +149,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
             pairs = chosen(data_set, options)
             yield Run(
                 "nonisometric", f"{data_set.name}-from-{Path(start).name}", data_set, pairs,
-                methods(options) | finished, setting,
+                methods(pairs, options) | finished, setting,
             )  # fmt: skip
 
 
@@ -160,9 +161,9 @@ def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
     return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
 
 
-def methods(options: argparse.Namespace) -> dict[str, Method]:
-    """All there are, or a few quick ones."""
-    every = METHODS | installed_peers()
+def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
+    """All that suit some pairs, or a few quick ones."""
+    every = suited_methods(pairs)
     return {name: every[name] for name in ("start", "mwp", "zoomout-sampled")} if options.quick else every
 
 

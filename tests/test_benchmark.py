@@ -205,7 +205,9 @@ def test_maps_made_elsewhere_are_starts_and_methods(measure, tmp_path):
     (tmp_path / "perfect" / "mesh002_mesh001.map").write_text("1\n2\n")
     other = tmp_path / "other"
     other.mkdir()
-    with pytest.raises(InputError, match=r"2 shapes or pairs could not be measured.*is missing, the map.*has 2 lines"):
+    with pytest.raises(
+        InputError, match=r"2 shapes or pairs could not be measured.*is missing, the map.*has 2 lines"
+    ):
         measure(
             ["start", str(tmp_path / "perfect")],
             output=other,

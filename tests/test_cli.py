@@ -493,8 +493,10 @@ def test_an_interrupted_run_ends_soon_and_leaves_nothing_behind(pair, tmp_path):
 def test_the_readme_names_existing_options(run):
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     helps = "".join(
-        run(command, "--help").output for command in ("demo", "match", "evaluate", "spectrum", "render")
+        run(command, "--help").output
+        for command in ("demo", "match", "evaluate", "benchmark", "spectrum", "render")
     )
+    readme = re.sub(r"^python3 .*", "", readme, flags=re.MULTILINE)  # pip's and pytest's
     for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", readme)) - {"--quiet", "--help"}:
         assert option in helps, option
 

@@ -52,7 +52,7 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
 def refine_pairs(
     spectra: Sequence[Spectrum],
     pairs: Sequence[tuple[int, int]],
-    pointwise_maps: Sequence[Int[Array, " _"]],
+    pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     *,
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
     iterations: int = 3,

@@ -252,6 +252,8 @@ def measure_pair(task: Task, settings: Settings) -> list[Row]:
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+    if data.partial and (unfit := [name for name, method in task.methods.items() if method.whole_only]):
+        raise InputError(f"{unfit[0]} is for whole shapes: leave it out of --methods.")
     both_directions = any(method.both_directions for method in task.methods.values())
     pair = prepare_pair(data, mesh_x, mesh_y, settings.init, both_directions=both_directions)
     rows = []

@@ -6,6 +6,7 @@ Every method takes a prepared pair, with the same spectra and the same start, an
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +23,9 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.evaluation.bcicp import bcicp
 from jaxsmw.evaluation.cpd import DriftRecovery
+from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import common_range
@@ -72,12 +75,14 @@ class Method(abc.ABC):
     - `reference`: where it is published, with what settings.
     - `both_directions`: whether it needs `PreparedPair.reverse_start`.
     - `compiled`: whether its first call in a process takes longer.
+    - `whole_only`: whether it makes no sense where one shape is a part of the other.
     """
 
     number_of_eigenvectors: int
     reference: str
     both_directions: bool = False
     compiled: bool = True
+    whole_only: bool = False
 
     @abc.abstractmethod
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
@@ -202,6 +207,22 @@ def _at(
     return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
 
 
+@dataclass(frozen=True)
+class BCICP(Method):
+    """Bijective and continuous ICP; see `jaxsmw.evaluation.bcicp`."""
+
+    reference: str
+    number_of_eigenvectors: int = 50
+    both_directions: bool = True
+    whole_only: bool = True
+
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        assert pair.meshes is not None and pair.reverse_start is not None
+        maps = (np.asarray(start).astype(np.int64) for start in (pair.start, pair.reverse_start))
+        pointwise_map, _ = bcicp(*pair.meshes, *pair.truncated(self.number_of_eigenvectors), *maps)
+        return jnp.asarray(pointwise_map, jnp.int32), RESULTS.successful  # type: ignore[return-value]
+
+
 MOST_SAMPLES = 1000
 METHODS: dict[str, Method] = {
     "start": Start("nearest neighbours of the descriptors, from which all others start"),
@@ -218,6 +239,10 @@ METHODS: dict[str, Method] = {
         DriftRecovery(),
         number_of_eigenvectors=30,
     ),
+    "bcicp": BCICP(
+        "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (the maps published "
+        "for tosca_nonisometric are better)"
+    ),
     "zoomout": ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120"),
     "zoomout-sampled": ZoomOut(
         "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
@@ -226,6 +251,15 @@ METHODS: dict[str, Method] = {
 
 
 MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
+
+
+def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
+    """Ours and those of other libraries that are installed, where they make sense for all of the pairs."""
+    from jaxsmw.evaluation.peers import installed_peers
+
+    partial = any(pair.partial for pair in pairs)
+    every = METHODS | installed_peers()
+    return {name: method for name, method in every.items() if not (partial and method.whole_only)}
 
 
 def find_method(name: str) -> tuple[str, Method]:

@@ -35,11 +35,10 @@ class Peer(Method):
     """
 
     number_of_eigenvectors = LAST_EIGENVECTORS
+    whole_only = True
     package: str
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
-        if pair.partial:
-            raise NotImplementedError(f"{self.package} is compared on whole shapes only")
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         start = _positions(y.vertices, np.asarray(pair.start)[x.vertices])
         found = np.zeros(pair.start.shape, np.int32)
