@@ -240,8 +240,8 @@ METHODS: dict[str, Method] = {
         number_of_eigenvectors=30,
     ),
     "bcicp": BCICP(
-        "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (the maps published "
-        "for tosca_nonisometric are better)"
+        "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (maps "
+        "published for tosca_nonisometric are better)"
     ),
     "zoomout": ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120"),
     "zoomout-sampled": ZoomOut(
