@@ -7,8 +7,11 @@ from pathlib import Path
 import hypothesis
 import jax
 import pytest
+from threadpoolctl import threadpool_limits
 
 jax.config.update("jax_enable_x64", True)
+# Most of the time goes into compiling small programs that run once.
+jax.config.update("jax_disable_most_optimizations", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -32,6 +35,16 @@ def shared() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return directory
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread_each() -> Iterator[None]:
+    """Test processes side by side do not wait for each other's threads; nor do the commands they start."""
+    alone = "PYTEST_XDIST_WORKER" not in os.environ
+    with pytest.MonkeyPatch.context() as patch, threadpool_limits(None if alone else 1):
+        if not alone:
+            patch.setenv("OPENBLAS_NUM_THREADS", "1")
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

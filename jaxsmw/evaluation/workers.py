@@ -77,7 +77,7 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
             "--scheduler needs Dask's distributed: install it with pip install 'jaxsmw[cluster]'."
         ) from None
     try:
-        client = Client(scheduler, timeout=10, set_as_default=False)
+        client = Client(scheduler, timeout=5, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
             f"{scheduler}: no Dask scheduler answers there ({error}): start one, or give its address."
