@@ -369,7 +369,7 @@ def _benchmark(options: argparse.Namespace) -> None:
     from jaxsmw.evaluation.opponents import find_method, suited_methods
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.summary import make_directory
-    from jaxsmw.report.tables import markdown_table, summarize_methods, write_tables
+    from jaxsmw.report.tables import markdown_table, write_tables
 
     data_set = open_data_set(options.data)
     pairs = choose_pairs(data_set, options.pairs, options.seed)
@@ -383,8 +383,7 @@ def _benchmark(options: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         _say(f"what is finished is kept in {output}; the same command goes on from there.")
         raise
-    write_tables(output, data_set, results, settings, methods)
-    print(markdown_table(summarize_methods(results, seed=options.seed)), end="")
+    print(markdown_table(write_tables(output, data_set, results, settings, methods)), end="")
 
 
 def _demo(options: argparse.Namespace) -> None:

@@ -41,7 +41,7 @@ from jaxsmw.files import atomic_write
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.report.summary import make_directory
-from jaxsmw.report.tables import MethodSummary, markdown, summarize_methods, write_tables
+from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 
 FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")
 # How many pairs of each set fig9 takes of those that the other experiments take.
@@ -243,8 +243,7 @@ def perform(run: Run, output: Path, executor: Executor) -> dict[str, MethodSumma
     directory = make_directory(output / run.experiment / run.name)
     print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
     results = run_benchmark(run.pairs, directory, run.methods, run.settings, executor)
-    write_tables(directory, run.data_set, results, run.settings, run.methods)
-    return summarize_methods(results, seed=run.settings.seed)
+    return write_tables(directory, run.data_set, results, run.settings, run.methods)
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:

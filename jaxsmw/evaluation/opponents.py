@@ -253,13 +253,17 @@ METHODS: dict[str, Method] = {
 MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
 
 
-def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Ours and those of other libraries that are installed, where they make sense for all of the pairs."""
+def known_methods() -> dict[str, Method]:
+    """Ours, and those of other libraries that are installed."""
     from jaxsmw.evaluation.peers import installed_peers
 
+    return METHODS | installed_peers()
+
+
+def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
+    """The known methods that make sense for all of some pairs."""
     partial = any(pair.partial for pair in pairs)
-    every = METHODS | installed_peers()
-    return {name: method for name, method in every.items() if not (partial and method.whole_only)}
+    return {name: method for name, method in known_methods().items() if not (partial and method.whole_only)}
 
 
 def find_method(name: str) -> tuple[str, Method]:
@@ -267,9 +271,7 @@ def find_method(name: str) -> tuple[str, Method]:
 
     **Raises:** `InputError` if it is neither.
     """
-    from jaxsmw.evaluation.peers import installed_peers
-
-    known = METHODS | installed_peers()
+    known = known_methods()
     if name in known:
         return name, known[name]
     directory = Path(name)

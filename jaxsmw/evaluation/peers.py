@@ -40,7 +40,7 @@ class Peer(Method):
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
-        start = _positions(y.vertices, np.asarray(pair.start)[x.vertices])
+        start = np.searchsorted(y.vertices, np.asarray(pair.start)[x.vertices])
         found = np.zeros(pair.start.shape, np.int32)
         found[x.vertices] = y.vertices[self.refine(start, x, y)]
         return jnp.asarray(found), RESULTS.successful  # type: ignore[return-value]
@@ -64,10 +64,6 @@ class _Shape:
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
-
-
-def _positions(vertices: Int64[np.ndarray, " u"], wanted: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    return np.searchsorted(vertices, wanted)
 
 
 class PyFM(Peer):

@@ -47,27 +47,21 @@ def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.n
     """
     if not radius > 0:
         raise InputError(f"the SHOT radius is {radius}, but it must be positive; 0.06 is the usual choice.")
-    vertices = np.flatnonzero(mesh.used_vertices)
-    positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
-    normals = mesh.vertex_normals[vertices]
-    corners = mesh.vertices[mesh.faces] - mesh.vertices[vertices].mean(axis=0)
-    if np.linalg.det(corners).sum() < 0:
-        normals = -normals
-
-    tree = KDTree(positions)
-    neighbors = tree.query_ball_point(positions, radius, return_length=True, workers=-1) - 1
-    lonely = np.mean(neighbors < _FEWEST_NEIGHBORS)
-    if lonely > 0.01:
-        fault = (
-            f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
-            f"the SHOT radius of {radius} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
-            "from another map (init='wks', on the command line --init wks)."
-        )
-        if lonely > 0.5:
-            raise InputError(fault)
-        warnings.warn(fault, stacklevel=2)
 
     def compute() -> dict[str, np.ndarray]:
+        vertices = np.flatnonzero(mesh.used_vertices)
+        positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
+        normals = mesh.vertex_normals[vertices]
+        corners = mesh.vertices[mesh.faces] - mesh.vertices[vertices].mean(axis=0)
+        if np.linalg.det(corners).sum() < 0:
+            normals = -normals
+
+        tree = KDTree(positions)
+        neighbors = tree.query_ball_point(positions, radius, return_length=True, workers=-1) - 1
+        lonely = np.mean(neighbors < _FEWEST_NEIGHBORS)
+        if lonely > 0.5:
+            raise InputError(_too_coarse(mesh, lonely, radius))
+
         descriptors = np.zeros((len(mesh.vertices), _DIMENSION))
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
@@ -77,9 +71,20 @@ def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.n
             descriptors[vertices[block]] = _describe(
                 positions, normals, block, pairs["i"], pairs["j"], pairs["v"], radius
             )
-        return {"descriptors": descriptors}
+        return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
-    return cached("shot", (mesh.vertices, mesh.faces, radius), compute)["descriptors"]
+    result = cached("shot-descriptors", (mesh.vertices, mesh.faces, radius), compute)
+    if (lonely := float(result["lonely"])) > 0.01:
+        warnings.warn(_too_coarse(mesh, lonely, radius), stacklevel=2)
+    return result["descriptors"]
+
+
+def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
+    return (
+        f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
+        f"the SHOT radius of {radius} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
+        "from another map (init='wks', on the command line --init wks)."
+    )
 
 
 def _describe(

@@ -158,8 +158,8 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
 
 def write_tables(
     directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
-) -> None:
-    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`."""
+) -> dict[str, MethodSummary]:
+    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`; return what they say."""
     summaries = summarize_methods(results, seed=settings.seed)
     pairs = len({(row["source"], row["target"]) for row in results.rows})
     machines = sorted({row["machine"] for row in results.rows})
@@ -183,6 +183,7 @@ def write_tables(
     means = {name: summary.mean / 1e3 for name, summary in summaries.items()}
     save_figure(directory / "curves.png", draw_quality_curves(curves, mean_errors=means))
     write_parquet(directory / "results.parquet", results.rows)
+    return summaries
 
 
 def _write(path: Path, text: str) -> None:

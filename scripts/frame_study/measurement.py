@@ -28,7 +28,7 @@ from frame_study.variants import (
 from jaxsmw import read_mesh
 from jaxsmw.core.filters import FilterBank, Meyer
 from jaxsmw.core.refinement import Problem, Refinement, Refiner, refine
-from jaxsmw.core.results import RESULTS
+from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
@@ -131,13 +131,8 @@ def load_pair(data: Path, name: PairName, settings: Settings) -> Pair:
 
 def pad(spectrum: Spectrum) -> Spectrum:
     """The shape with masked vertices up to a multiple of a common size."""
-    n = -len(spectrum.mask) % _PADDING
-    return Spectrum(
-        spectrum.eigenvalues,
-        jnp.pad(spectrum.eigenvectors, ((0, n), (0, 0))),
-        jnp.pad(spectrum.vertex_areas, (0, n)),
-        jnp.pad(spectrum.mask, (0, n)),
-    )
+    n = len(spectrum.mask)
+    return spectrum.pad(n + -n % _PADDING)
 
 
 def pad_map(pointwise_map: Int[np.ndarray, " m"], padded: Spectrum) -> Int32[Array, " padded_m"]:
@@ -211,11 +206,6 @@ def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings
             }
         )
     return rows
-
-
-def sentence(result: RESULTS) -> str:
-    """What a result says to a person."""
-    return RESULTS[result]  # type: ignore[misc]
 
 
 def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
