@@ -403,7 +403,7 @@ def test_filter_figure() -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_quality_curves() -> None:
     thresholds = np.linspace(0, 0.25, 26)
-    names = ["$x_1", "_hidden", *(f"method {i}" for i in range(12))]
+    names = ["$x_1", "_hidden", *(f"method {i}" for i in range(18))]
     curves = {name: (thresholds, 1 - np.exp(-(i + 1) * 5 * thresholds)) for i, name in enumerate(names)}
     figure = draw_quality_curves(curves, mean_errors={"$x_1": 0.01234})
     axes = figure.axes[0]
@@ -412,11 +412,13 @@ def test_quality_curves() -> None:
         assert np.allclose(line.get_ydata(), 100 * shares)
     assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == len(names)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert texts == ["$x_1\nmean 0.0123", *names[1:]]
+    assert texts == ["$x_1: 0.0123", *names[1:]]
     assert axes.get_xlim() == (0, 0.25)
-    # The legend stands beside the curves, not on them.
+    # The legend stands beside the curves, not on them, and all of it within the figure.
     pixels(figure)
-    assert figure.legends[0].get_window_extent().x0 > axes.get_window_extent().x1
+    legend = figure.legends[0].get_window_extent()
+    assert legend.x0 > axes.get_window_extent().x1
+    assert figure.bbox.fully_containsx(legend.x1) and figure.bbox.y0 < legend.y0 < legend.y1 < figure.bbox.y1
     with pytest.raises(InputError, match="at least one"):
         draw_quality_curves({})
     with pytest.raises(InputError, match="as many shares"):

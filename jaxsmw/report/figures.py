@@ -28,6 +28,8 @@ _DPI = 200
 # The largest height and width of a body, in pixels.
 _BODY_SIZE = (800, 800)
 _LONGEST_NAME = 36
+# The height of a line of a legend, in inches.
+_LEGEND_LINE = 0.24
 _INK, _FAINT = "#1d2430", "#79818c"
 # Okabe and Ito's colours, told apart by colour-blind eyes; lines differ in style as well, for print.
 _LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -222,7 +224,7 @@ def draw_quality_curves(
         raise InputError("there is no quality curve to draw; give at least one.")
     if strangers := mean_errors.keys() - curves.keys():
         raise InputError(f"there are mean errors but no quality curves for {', '.join(sorted(strangers))}.")
-    figure = _new_figure(6.8, 3.8, plot=True)
+    figure = _new_figure(6.8, max(3.8, 0.6 + _LEGEND_LINE * len(curves)), plot=True)
     axes = figure.add_subplot()
     lines, labels = [], []
     for index, (name, (thresholds, shares)) in enumerate(curves.items()):
@@ -238,7 +240,7 @@ def draw_quality_curves(
             linestyle=_LINE_STYLES[index % len(_LINE_STYLES)],
             linewidth=2,
         )
-        labels.append(f"{name}\nmean {mean_errors[name]:.4f}" if name in mean_errors else name)
+        labels.append(f"{name}: {mean_errors[name]:.4f}" if name in mean_errors else name)
     axes.set_xlim(min(t[0] for t, _ in curves.values()), max(t[-1] for t, _ in curves.values()))
     axes.set_ylim(0, 101)
     axes.set_xlabel("geodesic error / √area")
@@ -246,11 +248,13 @@ def draw_quality_curves(
     legend = figure.legend(
         lines,
         labels,
+        title="mean error" if mean_errors else None,
+        title_fontsize=8,
         loc="outside right center",
         frameon=False,
         fontsize=8,
         labelcolor=_INK,
-        labelspacing=1,
+        labelspacing=0.8,
         handlelength=3.5,
     )
     for text in legend.get_texts():
