@@ -168,7 +168,9 @@ def _parser() -> argparse.ArgumentParser:
         "--methods",
         metavar="METHOD",
         nargs="+",
-        help="which of them (default: all); or directories with maps X_Y.map made elsewhere",
+        help="start, mwp, mwp-sampled, no-filter, icp, cpd, bcicp, zoomout, zoomout-sampled; pyfm-zoomout, "
+        "geomfum-zoomout where these are installed; directories with maps X_Y.map made elsewhere (default: "
+        "all that suit the pairs; cpd and bcicp take half a minute per pair)",
     )
     benchmark.add_argument(
         "--pairs", metavar="N|FILE", help="so many at random, or those of a list (default: all)"
@@ -366,7 +368,7 @@ def _benchmark(options: argparse.Namespace) -> None:
     check_drawable()
     from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
     from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents import find_method, suited_methods
+    from jaxsmw.evaluation.opponents import find_methods, suited_methods
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.summary import make_directory
     from jaxsmw.report.tables import markdown_table, write_tables
@@ -374,16 +376,18 @@ def _benchmark(options: argparse.Namespace) -> None:
     data_set = open_data_set(options.data)
     pairs = choose_pairs(data_set, options.pairs, options.seed)
     settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
-    methods = dict(map(find_method, options.methods)) if options.methods else suited_methods(pairs)
+    methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
     output = make_directory(options.output or f"jaxsmw-benchmark-{data_set.name}")
     logging.getLogger("jaxsmw").info(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
     try:
         with open_executor(options.workers, options.scheduler) as executor:
-            results = run_benchmark(pairs, output, methods, settings, executor)
+            results = run_benchmark(data_set, pairs, output, methods, settings, executor)
     except KeyboardInterrupt:
         _say(f"what is finished is kept in {output}; the same command goes on from there.")
         raise
-    print(markdown_table(write_tables(output, data_set, results, settings, methods)), end="")
+    if results.rows:
+        print(markdown_table(write_tables(output, data_set, results, settings, methods)), end="")
+    results.check()
 
 
 def _demo(options: argparse.Namespace) -> None:

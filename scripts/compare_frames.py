@@ -44,7 +44,7 @@ from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
 from tqdm import tqdm
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.journal import Journal, Row, claim_directory
+from jaxsmw.evaluation.journal import Journal, Row, claimed_directory
 from jaxsmw.evaluation.workers import Workers, run_tasks
 from jaxsmw.files import atomic_write
 from jaxsmw.provenance import code_digest, measured_code
@@ -228,20 +228,20 @@ def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
         "versions": {**provenance(), "code": code_digest(code)},
         "data": {"digest of the pairs' files": digest(data, pairs)},
     }
-    claim_directory(make_directory(output), origin)
-    every = variants.variants(settings.frames)
-    same = twins(every, frames(settings.number_of_filters))
-    measured = [variant for variant in every if variant not in same]
-    journals = Journals(output, pairs, settings, measured)
-    run(data, journals, workers)
-    journals.sort()
-    times = measured_times(output, data, pairs, measured, settings)
-    if code_digest(code) != origin["versions"]["code"]:
-        raise InputError(f"{output}: the code changed while it was measured: remove it and start again.")
-    whole = Study(journals.results.rows, times, pairs, every, same, settings)
-    with atomic_write(output / "summary.md") as temporary:
-        temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")
-    draw_figures(output, data, whole, journals.parameters.rows)
+    with claimed_directory(make_directory(output), origin):
+        every = variants.variants(settings.frames)
+        same = twins(every, frames(settings.number_of_filters))
+        measured = [variant for variant in every if variant not in same]
+        journals = Journals(output, pairs, settings, measured)
+        run(data, journals, workers)
+        journals.sort()
+        times = measured_times(output, data, pairs, measured, settings)
+        if code_digest(code) != origin["versions"]["code"]:
+            raise InputError(f"{output}: the code changed while it was measured: remove it and start again.")
+        whole = Study(journals.results.rows, times, pairs, every, same, settings)
+        with atomic_write(output / "summary.md") as temporary:
+            temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")
+        draw_figures(output, data, whole, journals.parameters.rows)
     print(output / "summary.md")
 
 

@@ -242,7 +242,8 @@ def perform(run: Run, output: Path, executor: Executor) -> dict[str, MethodSumma
     """Measure what is missing and write its tables."""
     directory = make_directory(output / run.experiment / run.name)
     print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
-    results = run_benchmark(run.pairs, directory, run.methods, run.settings, executor)
+    results = run_benchmark(run.data_set, run.pairs, directory, run.methods, run.settings, executor)
+    results.check()
     return write_tables(directory, run.data_set, results, run.settings, run.methods)
 
 

@@ -8,6 +8,7 @@ import sys
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from synthetic import random_spectrum
@@ -156,12 +157,20 @@ def test_memory_of_a_pair_is_about_what_the_compiler_says(m, n, k):
     assert 0.5 < bytes_per_pair(m, n, k, 4) / used < 2
 
 
-def test_what_does_not_fit_together():
+def test_what_does_not_fit_together(monkeypatch):
+    # As users run it: checks of types at run time would forestall some sentences.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     spectra, starts = make_problem()
+    with pytest.raises(ValueError, match="spectra are wanted, not str"):
+        refine_pairs(["cat.off"], [], [])
     with pytest.raises(ValueError, match="7 pairs and 6 initial maps"):
         refine_pairs(spectra, PAIRS, starts[:-1])
     with pytest.raises(ValueError, match="pair 0 is"):
         refine_pairs(spectra[:1], PAIRS, starts)
+    with pytest.raises(ValueError, match="pair 0 is"):
+        refine_pairs(spectra, [(0, 1, 1)], starts[:1])
+    with pytest.raises(ValueError, match="pair 0 is of float"):
+        refine_pairs(spectra, PAIRS, [np.asarray(start, float) for start in starts])
     with pytest.raises(ValueError, match="initial map of pair 1"):
         refine_pairs(spectra, PAIRS, [starts[0]] * 7)
     with pytest.raises(ValueError, match="samples of 1"):
@@ -179,6 +188,7 @@ def test_what_does_not_fit_together():
 _PROGRAM = """
 import sys
 import jax
+import jaxtyping
 jax.config.update("jax_enable_x64", True)
 output, process, processes, address = sys.argv[1:]
 if int(processes) > 1:
@@ -202,7 +212,7 @@ def run_processes(output, count: int) -> None:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     here = os.path.dirname(__file__)
-    flags = f"--xla_force_host_platform_device_count={4 // count}"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={4 // count}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": here}
     running = [
         subprocess.Popen(

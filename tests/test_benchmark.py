@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +22,8 @@ from synthetic import bumpy_mesh, sphere_mesh
 from jaxsmw import InputError
 from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents import find_method
+from jaxsmw.evaluation.opponents import METHODS, find_methods
+from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import write_mesh
 from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
@@ -128,6 +130,9 @@ def test_nobody_answers(scape, tmp_path):
     call = command(scape, tmp_path / "results", "--scheduler", "tcp://127.0.0.1:1")
     outcome = subprocess.run(call, capture_output=True, text=True)
     assert outcome.returncode == 2 and "no Dask scheduler answers" in outcome.stderr
+    for address in ("somewhere", "tcp://somewhere:x"):
+        with pytest.raises(InputError, match="no Dask scheduler answers"), open_executor(1, address):
+            pass
 
 
 def test_pairs_are_chosen(scape, tmp_path):
@@ -138,22 +143,35 @@ def test_pairs_are_chosen(scape, tmp_path):
     assert [pair.name for pair in choose_pairs(data_set, "99", 0)] == every
     drawn = [[pair.name for pair in choose_pairs(data_set, "3", seed)] for seed in (0, 0, 1)]
     assert drawn[0] == drawn[1] != drawn[2] and len(drawn[0]) == 3
-    (tmp_path / "list.txt").write_text("mesh002 mesh000\n")
+    (tmp_path / "list.txt").write_text("# some\nmesh002 mesh000  # twice\n\nmesh002 mesh000\n")
     assert [pair.name for pair in choose_pairs(data_set, str(tmp_path / "list.txt"), 0)] == [
         "mesh002 to mesh000"
     ]
     with pytest.raises(InputError, match="at least 1"):
         choose_pairs(data_set, "0", 0)
     (tmp_path / "list.txt").write_text("mesh002 mesh002\n")
-    with pytest.raises(InputError, match="not a pair of"):
+    with pytest.raises(InputError, match="does not say which points of mesh002 and mesh002"):
         choose_pairs(data_set, str(tmp_path / "list.txt"), 0)
 
 
-def test_unknown_methods_and_starts_are_refused(scape, tmp_path):
+def test_unknown_methods_and_starts_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"'magic' is no method: choose from start, mwp"):
-        find_method("magic")
+        find_methods(["mwp", "magic"])
     with pytest.raises(InputError, match=r"'luck' is no start: choose from shot"):
-        run_benchmark([], tmp_path, {}, Settings("luck"), Here())
+        Settings("luck")
+    for name in ("mwp", "mine", "other/mine"):
+        (tmp_path / name).mkdir(parents=True)
+    assert list(find_methods(["mwp", "start", "mwp", str(tmp_path / "mine")])) == ["mwp", "start", "mine"]
+    for names in (["mwp"], ["mine", "other/mine"]):
+        with pytest.raises(InputError, match="another method is called m"):
+            find_methods([str(tmp_path / name) for name in names])
+
+
+def test_help_names_every_method():
+    outcome = subprocess.run(
+        [sys.executable, "-m", "jaxsmw", "benchmark", "--help"], capture_output=True, text=True
+    )
+    assert set(METHODS) <= set(re.findall(r"[\w-]+", re.sub(r"-\s+", "-", outcome.stdout)))
 
 
 class Here(Executor):
@@ -173,9 +191,9 @@ def measure(scape, tmp_path):
     """Some methods on some pairs, in this process."""
 
     def run(names, *, output=tmp_path, data=scape, pairs="2", **settings):
-        methods = dict(map(find_method, names))
-        chosen = choose_pairs(open_data_set(data), pairs, 0)
-        return run_benchmark(chosen, output, methods, Settings(evaluated_points=100, **settings), Here())
+        data_set = open_data_set(data)
+        chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
+        return run_benchmark(data_set, chosen, output, find_methods(names), every, Here())
 
     return run
 
@@ -199,23 +217,16 @@ def test_maps_made_elsewhere_are_starts_and_methods(measure, tmp_path):
     assert means["perfect"] == [0, 0]
     assert min(means["start"]) > 0.1 and max(means["mwp"]) < 0.02
     assert [row["seconds"] for row in rows if row["method"] == "perfect"] == ["nan", "nan"]
-    (tmp_path / "perfect" / "mesh000_mesh001.map").unlink()
-    (tmp_path / "perfect" / "mesh002_mesh001.map").write_text("1\n2\n")
     other = tmp_path / "other"
     other.mkdir()
-    with pytest.raises(
-        InputError, match=r"2 shapes or pairs could not be measured.*is missing, the map.*has 2 lines"
-    ):
-        measure(
-            ["start", str(tmp_path / "perfect")],
-            output=other,
-            pairs=listed(tmp_path, "mesh000 mesh001\nmesh002 mesh001"),
-        )
-
-
-def listed(directory: Path, pairs: str) -> str:
-    (directory / "pairs.txt").write_text(pairs)
-    return str(directory / "pairs.txt")
+    (tmp_path / "perfect" / "mesh000_mesh001.map").unlink()
+    with pytest.raises(InputError, match=r"mesh000_mesh001.map: is missing, like 1 of 6 maps"):
+        measure(["start", str(tmp_path / "perfect")], output=other, pairs="6")
+    (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
+    found = measure(["start", str(tmp_path / "perfect")], output=other, pairs="6")
+    assert list(found.failures) == ["mesh000 to mesh001"] and len(found.rows) == 10
+    with pytest.raises(InputError, match=r"the rest is kept:\nmesh000 to mesh001: .*has 2 lines"):
+        found.check()
 
 
 def test_a_map_that_took_left_for_right_counts_as_mirrored_only_when_asked(measure, tmp_path):
@@ -258,11 +269,29 @@ def test_one_bad_shape_does_not_stop_the_others(measure, scape, tmp_path):
     output.mkdir()
     whole = (data / "mesh002.off").read_text()
     (data / "mesh002.off").write_text(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"could not be measured.*mesh002"):
-        measure(["start"], data=data, output=output, pairs="6")
-    assert len((output / "results.csv").read_text().splitlines()) == 1 + 2
+    found = measure(["start"], data=data, output=output, pairs="6")
+    assert len(found.rows) == 2 and len((output / "results.csv").read_text().splitlines()) == 1 + 2
+    with pytest.raises(InputError) as caught:
+        found.check()
+    _, *causes = str(caught.value).splitlines()
+    assert len(causes) == 1 and "and 2 more: " in causes[0] and causes[0].count("mesh002.off") == 1
     (data / "mesh002.off").write_text(whole)
-    assert len(measure(["start"], data=data, output=output, pairs="6").rows) == 6
+    found = measure(["start"], data=data, output=output, pairs="6")
+    found.check()
+    assert len(found.rows) == 6
+
+
+def test_results_of_another_data_set_are_not_mixed_in(measure, scape, tmp_path):
+    output, data = tmp_path / "output", tmp_path / "data"
+    output.mkdir()
+    measure(["start"], output=output)
+    for file in scape.iterdir():
+        data.mkdir(exist_ok=True)
+        shutil.copy(file, data / file.name.replace("mesh", "tr_reg_"))
+    kept = (output / "results.csv").read_bytes()
+    with pytest.raises(InputError, match=r"results of another data set, with a shape mesh00\d"):
+        measure(["start"], data=data, output=output)
+    assert (output / "results.csv").read_bytes() == kept
 
 
 def row(
@@ -282,7 +311,7 @@ def test_tables_say_what_the_rows_say():
     ]
     seconds = {"seconds_spectrum": "2", "seconds_descriptors": "3"}
     shapes = {name: seconds for name in ("y", *(f"x{i}" for i in range(5)))}
-    summaries = summarize_methods(Results(rows, shapes))
+    summaries = summarize_methods(Results(rows, shapes, {}))
     mwp, other = summaries["mwp"], summaries["a_b"]
     assert mwp.mean == mwp.median == pytest.approx(30) and np.isnan(mwp.difference.mean)
     assert (mwp.seconds, mwp.pipeline_seconds, mwp.failures) == (2, 12, 0)

@@ -30,7 +30,7 @@ from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
-from jaxsmw.evaluation.journal import Journal, claim_directory
+from jaxsmw.evaluation.journal import Journal, claimed_directory
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.provenance import code_digest
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
@@ -74,8 +74,8 @@ def test_journal_survives_a_torn_header_and_rows_written_twice(tmp_path):
 
 def test_results_of_different_origin_are_never_mixed(tmp_path):
     origin = {"settings": {"seed": 0, "frames": ("Meyer",)}, "versions": {"jax": "1.0"}}
-    claim_directory(tmp_path, origin)
-    claim_directory(tmp_path, origin)
+    for _ in range(2):
+        claim(tmp_path, origin)
     for group, name, value in (
         ("settings", "seed", 1),
         ("settings", "new", 1),
@@ -83,11 +83,21 @@ def test_results_of_different_origin_are_never_mixed(tmp_path):
         ("versions", "jax", "1.1"),
     ):
         with pytest.raises(InputError, match=name):
-            claim_directory(tmp_path, {**origin, group: {**origin[group], name: value}})
+            claim(tmp_path, {**origin, group: {**origin[group], name: value}})
+    with claimed_directory(tmp_path, origin), pytest.raises(InputError, match="another run"):
+        claim(tmp_path, origin)
+    (tmp_path / "provenance.json").write_text("{")
+    with pytest.raises(InputError, match="is damaged"):
+        claim(tmp_path, origin)
     (tmp_path / "provenance.json").unlink()
     (tmp_path / "results.csv").touch()
     with pytest.raises(InputError, match="unknown origin"):
-        claim_directory(tmp_path, origin)
+        claim(tmp_path, origin)
+
+
+def claim(directory, origin):
+    with claimed_directory(directory, origin):
+        pass
 
 
 def test_code_digest_heeds_what_code_does_and_nothing_else(tmp_path):
@@ -352,6 +362,7 @@ def test_interval_is_that_of_a_mean():
     assert summary.mean_interval(sample, seed=0) == (mean, low, high)
     assert summary.mean_interval(sample, seed=1) != (mean, low, high)
     assert summary.mean_interval(np.full(5, 0.25), seed=0) == (0.25, 0.25, 0.25)
+    assert np.isnan(summary.mean_interval(np.full(1, 0.25), seed=0)).tolist() == [False, True, True]
     mean, low, high = summary.mean_interval(np.array([1.0, 2.0]), seed=0)
     assert mean == 1.5 and np.isnan(low) and np.isnan(high)
     assert np.isnan(summary.mean_interval(np.array([]), seed=0)).all()

@@ -1,5 +1,6 @@
 """Data sets are recognised by the layouts in which they circulate, and what is missing is named."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,11 @@ def test_layouts_are_recognised_and_their_truth_is_read(tmp_path, layout):
 def test_lists_of_pairs_come_first(tmp_path):
     remeshed(tmp_path)
     put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
-    assert names(open_data_set(tmp_path)) == [("dog0", "cat1"), ("cat2", "dog0")]
+    data_set = open_data_set(tmp_path)
+    assert names(data_set) == [("dog0", "cat1"), ("cat2", "dog0")]
+    # Others within a class can be asked for.
+    others = {pair.names for pair in data_set.others}
+    assert len(others) == 6 and ("cat10", "cat2") in others and len(data_set.shapes) == 4
     shrec19(tmp_path / "other")
     put(tmp_path / "other" / "PAIRS_list_SHREC19_connectivity.txt", "2,10\n")
     assert names(open_data_set(tmp_path / "other")) == [("2", "10")]
@@ -139,6 +144,9 @@ def test_lists_of_pairs_come_first(tmp_path):
         read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
     with pytest.raises(InputError, match="cannot be read"):
         read_pairs(tmp_path / "none.txt", [])
+    put(tmp_path / "list.txt", "# cat1 cat2\n")
+    with pytest.raises(InputError, match="names no pair"):
+        read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
 
 
 def test_one_shape_in_two_formats_is_one_shape(tmp_path):
@@ -154,6 +162,11 @@ BREAKAGES = {
     "only text": (lambda d: put(d / "readme.txt", "x"), "remeshed sets: off/NAME.off"),
     "no meshes": (lambda d: put(d / "corres" / "a.vts", "1\n"), "no folder with the meshes"),
     "no truth": (lambda d: (remeshed(d), (d / "corres" / "cat2.vts").unlink()), "cat2.vts: is missing"),
+    "no mesh": (lambda d: (remeshed(d), (d / "off" / "cat2.off").unlink()), "no mesh for .*cat2.vts"),
+    "several": (lambda d: (remeshed(d / "a"), faust(d / "b")), r"several data sets \(a, b\)"),
+    "a kid without truth": (
+        lambda d: (topology(d), (d / "kid02_ref.txt").unlink()), "kid02_ref.txt: is missing"
+    ),
     "no null": (lambda d: put(d / "cuts" / "cuts_cat_shape_1.off"), "no null/"),
     "no parts": (lambda d: put(d / "null" / "cat.off"), "no cuts/ or holes/"),
     "a part of nothing": (lambda d: (partial(d), put(d / "cuts" / "cuts_dog_shape_1.off")), "no full shape"),
@@ -177,6 +190,12 @@ def test_what_is_missing_is_named(tmp_path, case):
         open_data_set(tmp_path / "set")
     assert str(tmp_path / "set") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_folder_of_meshes_is_not_the_set(tmp_path):
+    remeshed(tmp_path)
+    with pytest.raises(InputError, match=f"meshes of a remeshed set: give {re.escape(str(tmp_path))}"):
+        open_data_set(tmp_path / "off")
 
 
 def test_shapes_that_should_share_vertices(tmp_path):

@@ -96,9 +96,15 @@ def refine_pairs(
         raise ValueError(f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps")
     if samples is not None and len(samples) != len(spectra):
         raise ValueError(f"there are {len(spectra)} shapes and samples of {len(samples)}")
+    if strangers := [type(shape).__name__ for shape in spectra if not isinstance(shape, Spectrum)]:
+        raise ValueError(f"spectra are wanted, not {strangers[0]}: see compute_spectrum")
     for position, (pair, pointwise_map) in enumerate(zip(pairs, pointwise_maps, strict=True)):
-        if not all(0 <= shape < len(spectra) for shape in pair):
-            raise ValueError(f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes")
+        if len(pair) != 2 or any(shape not in range(len(spectra)) for shape in pair):
+            raise ValueError(
+                f"pair {position} is {tuple(pair)}, but two positions among {len(spectra)} shapes are wanted"
+            )
+        if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
+            raise ValueError(f"the initial map of pair {position} is of {pointwise_map.dtype}, not integers")
         vertices = spectra[pair[0]].mask.shape
         if pointwise_map.shape != vertices:
             raise ValueError(

@@ -29,7 +29,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.evaluation.journal import Journal, Row, claim_directory
+from jaxsmw.evaluation.journal import Journal, Row, claimed_directory
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
 from jaxsmw.evaluation.opponents import (
     FIRST_EIGENVECTORS,
@@ -38,6 +38,7 @@ from jaxsmw.evaluation.opponents import (
     Method,
     PreparedPair,
     Published,
+    published_file,
     read_published_map,
 )
 from jaxsmw.evaluation.workers import run_tasks
@@ -75,12 +76,21 @@ class Settings:
       tell left from right.
     - `evaluated_points`: so many rows of each ground truth, the same for all methods; all if None.
     - `seed`: of their draw.
+
+    **Raises:** `InputError` if `init` is neither.
     """
 
     init: str = "shot"
     mirrored: bool = False
     evaluated_points: int | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.init not in get_args(Start) and not Path(self.init).is_dir():
+            raise InputError(
+                f"{self.init!r} is no start: choose from {', '.join(get_args(Start))}, or give a directory "
+                "with maps X_Y.map."
+            )
 
 
 @dataclass(frozen=True)
@@ -96,11 +106,11 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
     **Arguments:**
 
-    - `wanted`: how many, drawn without replacement (all if there are no more), or a file that lists them (see
-      `read_pairs`); all if None.
+    - `wanted`: how many, drawn without replacement (all if there are no more), or a file that lists some
+      whose truth is known (see `read_pairs`), each of which counts once; all of the set's own if None.
     - `seed`: of the draw.
 
-    **Raises:** `InputError` if the number is not positive, or the file names pairs that the set has not.
+    **Raises:** `InputError` if the number is not positive, or the truth of a listed pair is not known.
     """
     pairs = list(data_set.pairs)
     if wanted is None:
@@ -111,12 +121,12 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
             raise InputError(f"{count} pairs cannot be measured: ask for at least 1.")
         rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
         return [pairs[row] for row in np.sort(rows)]
-    known = {(pair.source, pair.target): pair for pair in pairs}
+    known = {pair.names: pair for pair in (*pairs, *data_set.others)}
     listed = read_pairs(wanted, data_set.shapes)
     if unknown := [names for names in listed if names not in known]:
         raise InputError(
-            f"{wanted}: {' to '.join(unknown[0])} is not a pair of {data_set.directory}, which has "
-            f"{len(pairs)}: remove it from the list."
+            f"{wanted}: {data_set.directory} does not say which points of {' and '.join(unknown[0])} are the "
+            "same: remove the pair from the list."
         )
     return [known[names] for names in dict.fromkeys(listed)]
 
@@ -126,44 +136,96 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: one for each pair and method, in this order: `source`, `target`, `method`, `machine`, `result`,
-      `seconds` (from the start to the map, without compilation), the `truth` that counted, `FIGURES`, and
-      `curve`, the shares of points with an error of at most `CURVE`.
+    - `rows`: one for each measured pair and method, in this order: `source`, `target`, `method`, `machine`,
+      `result`, `seconds` (from the start to the map, without compilation), the `truth` that counted,
+      `FIGURES`, and `curve`, the shares of points with an error of at most `CURVE`.
     - `shapes`: for each shape the `digest` of its file, its number of `vertices` and how long its spectrum
       and descriptors took.
+    - `failures`: which shapes and pairs could not be measured, and why.
     """
 
     rows: list[Row]
     shapes: dict[str, Row]
+    failures: dict[str, str]
+
+    def check(self) -> None:
+        """Pass only if all could be measured.
+
+        **Raises:** `InputError` that gives every cause with its shapes and pairs.
+        """
+        if not self.failures:
+            return
+        causes: dict[str, list[str]] = {}
+        for name, cause in self.failures.items():
+            causes.setdefault(cause, []).append(name)
+        lines = [f"{_some(names)}: {cause}" for cause, names in causes.items()]
+        raise InputError(
+            "\n".join(
+                ["not everything could be measured; mend this and start again, the rest is kept:", *lines]
+            )
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first of them, in words."""
+    more = len(names) - _NAMED_FAILURES
+    return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
+
+
+# So many are named in a message; the others have the same fault.
+_NAMED_FAILURES = 3
 
 
 def run_benchmark(
+    data_set: DataSet,
     pairs: Sequence[DataPair],
     output: Path,
     methods: Mapping[str, Method],
     settings: Settings,
     executor: Executor,
 ) -> Results:
-    """Measure what is missing of some pairs; keep each as it comes.
+    """Measure what is missing of some pairs; keep each as it comes, and go on where one fails.
 
     **Arguments:**
 
-    - `pairs`: what to match.
+    - `data_set`, `pairs`: what to match, of which data set.
     - `output`: a directory that exists; gets `results.csv`, `shapes.csv` and `provenance.json`.
     - `methods`: by the names that they get in tables; for example `jaxsmw.evaluation.opponents.METHODS`.
     - `settings`: must be those of results that are there already.
     - `executor`: what works.
 
-    **Raises:** `InputError` if the directory holds results of something else, or pairs could not be measured
-    (all others are kept).
+    **Returns:** What is known of these pairs and methods. Look at its `failures`, or call its `check`.
+
+    **Raises:** `InputError` if the directory holds results of something else, another process adds to it, or
+    maps that were computed elsewhere are missing.
     """
-    _check_start(settings.init)
+    for method in methods.values():
+        method.check(pairs)
+    if settings.init not in get_args(Start):
+        Published(Path(settings.init)).check(pairs)
     made_with = versions() | {"code": code_digest(measured_code())}
     # Not the path of maps, so that a moved copy of the data is no other start.
     chosen = asdict(settings) | {"init": Path(settings.init).name}
-    claim_directory(output, {"settings": chosen, "versions": made_with}, {"commit": commit()})
+    origin = {"settings": chosen, "versions": made_with}
+    with claimed_directory(output, origin, {"commit": commit()}):
+        return _measure_missing(data_set, pairs, output, methods, settings, executor)
+
+
+def _measure_missing(
+    data_set: DataSet,
+    pairs: Sequence[DataPair],
+    output: Path,
+    methods: Mapping[str, Method],
+    settings: Settings,
+    executor: Executor,
+) -> Results:
     results = Journal(output / "results.csv", ["source", "target", "method"])
     shapes = Journal(output / "shapes.csv", ["shape"])
+    if strangers := [row["shape"] for row in shapes.rows if row["shape"] not in data_set.shapes]:
+        raise InputError(
+            f"{output}: holds results of another data set, with a shape {strangers[0]} that is not in "
+            f"{data_set.directory}: give another --output."
+        )
     tasks = []
     for pair in pairs:
         missing = {name: methods[name] for name in methods if (*pair.names, name) not in results}
@@ -182,31 +244,22 @@ def run_benchmark(
         **_run("shapes", measure_shape, missing_shapes, executor, shapes),
         **_run("pairs", measure, {task.pair.name: task for task in tasks}, executor, results),
     }
-    if failed:
-        some = [f"{name} ({str(error).rstrip('.')})" for name, error in failed.items()][:_NAMED_FAILURES]
-        more = f"; and {len(failed) - len(some)} more" if len(failed) > len(some) else ""
-        raise InputError(
-            f"{len(failed)} shapes or pairs could not be measured, the others are kept in {output}: "
-            f"{'; '.join(some)}{more}. Mend them and start again."
-        )
-    wanted = [(*pair.names, name) for pair in pairs for name in methods]
-    return Results([results[key] for key in wanted], {name: shapes[(name,)] for name in files})
+    # Of a pair all methods or none, so that all are compared on the same pairs.
+    by_pair = [[(*pair.names, name) for name in methods] for pair in pairs if _have(shapes, pair)]
+    finished = [keys for keys in by_pair if all(key in results for key in keys)]
+    return Results(
+        [results[key] for keys in finished for key in keys],
+        {name: shapes[(name,)] for name in files if (name,) in shapes},
+        {name: str(error) or type(error).__name__ for name, error in failed.items()},
+    )
 
 
-def _check_start(init: str) -> None:
-    if init not in get_args(Start) and not Path(init).is_dir():
-        raise InputError(
-            f"{init!r} is no start: choose from {', '.join(get_args(Start))}, or give a directory with maps "
-            "X_Y.map."
-        )
+def _have(shapes: Journal, pair: DataPair) -> bool:
+    return all((name,) in shapes for name in pair.names)
 
 
 def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-
-
-# So many are named in a message; usually all have the same fault.
-_NAMED_FAILURES = 5
 
 
 def _run(
@@ -252,8 +305,6 @@ def measure_pair(task: Task, settings: Settings) -> list[Row]:
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
-    if data.partial and (unfit := [name for name, method in task.methods.items() if method.whole_only]):
-        raise InputError(f"{unfit[0]} is for whole shapes: leave it out of --methods.")
     both_directions = any(method.both_directions for method in task.methods.values())
     pair = prepare_pair(data, mesh_x, mesh_y, settings.init, both_directions=both_directions)
     rows = []
@@ -335,7 +386,7 @@ def _reverse_start(
 ) -> Int64[np.ndarray, " n"]:
     """The same kind of start from Y to X; where none was published, from the start's functional map."""
     names = data.target, data.source
-    if init in get_args(Start) or (Path(init) / f"{'_'.join(names)}.map").is_file():
+    if init in get_args(Start) or published_file(Path(init), names).is_file():
         return _start(names, meshes[::-1], spectra[::-1], init, data.partial)
     spectrum_x, spectrum_y = (spectrum.truncate(FIRST_EIGENVECTORS) for spectrum in spectra)
     functional_map = encode(jnp.asarray(start), spectrum_x, spectrum_y)

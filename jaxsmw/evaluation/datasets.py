@@ -88,11 +88,13 @@ class DataSet:
     - `directory`: where.
     - `layout`: what was recognised, in words.
     - `pairs`: the pairs to be matched, in the set's own order where it has one.
+    - `others`: further pairs whose truth is known.
     """
 
     directory: Path
     layout: str
     pairs: tuple[DataPair, ...]
+    others: tuple[DataPair, ...] = ()
 
     @property
     def name(self) -> str:
@@ -103,7 +105,7 @@ class DataSet:
     def shapes(self) -> dict[str, Path]:
         """The meshes that occur in pairs, by name."""
         found = {}
-        for pair in self.pairs:
+        for pair in (*self.pairs, *self.others):
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
         return found
 
@@ -123,25 +125,48 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
     Pairs are those of a list where there is one (`test_pairs.txt`, `PAIRS_list_….txt`: two names per line);
     else all ordered pairs of different shapes, within a class where names have one (`cat0`, `cat1`).
+    A directory that holds several sets is none.
 
     **Raises:** `InputError` that says what was expected, or what is missing.
     """
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"{directory}: is not a directory: give the one that a data set was unpacked to.")
+    inner = [
+        folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _looks_like_a_set(folder)
+    ]
+    if len(inner) > 1:
+        raise InputError(
+            f"{directory}: holds several data sets ({', '.join(folder.name for folder in inner)}): give one."
+        )
+    found = _recognise(directory)
+    if found is None:
+        raise InputError(
+            f"{directory}: is not laid out like a data set that is known ({'; '.join(_EXPECTED)}): give the "
+            "directory that one was unpacked to."
+        )
+    layout, (pairs, others) = found
+    if not pairs:
+        raise InputError(
+            f"{directory}: looks like {layout}, but no two of its shapes make a pair: complete the copy."
+        )
+    return DataSet(directory, layout, tuple(pairs), tuple(others))
+
+
+def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
+    """The first layout that fits a directory, and its pairs."""
     for layout, open_layout in _LAYOUTS.items():
-        pairs = open_layout(directory)
-        if pairs is not None:
-            if not pairs:
-                raise InputError(
-                    f"{directory}: looks like {layout}, but no two of its shapes make a pair: "
-                    "complete the copy."
-                )
-            return DataSet(directory, layout, tuple(pairs))
-    raise InputError(
-        f"{directory}: is not laid out like a data set that is known ({'; '.join(_EXPECTED)}): give the "
-        "directory that one was unpacked to."
-    )
+        if (pairs := open_layout(directory)) is not None:
+            return layout, pairs
+    return None
+
+
+def _looks_like_a_set(directory: Path) -> bool:
+    """Whether a directory is a data set, complete or not."""
+    try:
+        return _recognise(directory) is not None
+    except InputError:
+        return True
 
 
 _EXPECTED = (
@@ -171,6 +196,10 @@ def _meshes(directory: Path) -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=_natural)}
 
 
+# Pairs to be matched and further ones whose truth is known.
+_Pairs = tuple[list[DataPair], list[DataPair]]
+
+
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
     """Meshes with such names, in a directory or in the first folder of it that has any."""
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
@@ -192,7 +221,9 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
     """Read a list of pairs: in each line the names of source and target, with spaces or a comma between.
 
-    **Raises:** `InputError` that names the line that is not two of the shapes.
+    What follows a `#` does not count.
+
+    **Raises:** `InputError` that names the line that is not two of the shapes, or if there is no pair.
     """
     path, known, pairs = Path(path), set(shapes), []
     try:
@@ -200,7 +231,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text ({error}): give a list of pairs.") from error
     for number, line in enumerate(lines, start=1):
-        names = re.split(r"[,;\s]+", line.strip())
+        names = re.split(r"[,;\s]+", line.partition("#")[0].strip())
         if names == [""]:
             continue
         wrong = [name for name in names if name not in known]
@@ -208,6 +239,8 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
             fault = f"{wrong[0][:60]!a} is none of the shapes" if wrong else "does not name two shapes"
             raise InputError(f"{path}, line {number}: {fault}: correct the line, or complete the data set.")
         pairs.append((names[0], names[1]))
+    if not pairs:
+        raise InputError(f"{path}: names no pair: write two names of shapes on each line.")
     return pairs
 
 
@@ -220,7 +253,18 @@ def _within_classes(names: Iterable[str]) -> list[tuple[str, str]]:
     return [(x, y) for x, y in permutations(names, 2) if class_of(x) == class_of(y)]
 
 
-def _remeshed(directory: Path) -> list[DataPair] | None:
+def _listed_first(
+    pair: Callable[[str, str], DataPair],
+    listed: Iterable[tuple[str, str]] | None,
+    known: Iterable[tuple[str, str]],
+) -> _Pairs:
+    """The listed pairs, if there is a list, and others whose truth is known; else all of these."""
+    wanted = dict.fromkeys(known if listed is None else listed)
+    others = (names for names in known if names not in wanted)
+    return [pair(*names) for names in wanted], [pair(*names) for names in others]
+
+
+def _remeshed(directory: Path) -> _Pairs | None:
     truths = directory / "corres"
     files = {file.name.removesuffix(".vts"): file for file in truths.glob("*.vts")}
     plain = {name: file for name, file in files.items() if not name.endswith(".sym")}
@@ -238,6 +282,10 @@ def _remeshed(directory: Path) -> list[DataPair] | None:
             f"{truths / missing[0]}.vts: is missing, the ground truth of {shapes[missing[0]]}: complete the "
             "copy, or remove the mesh."
         )
+    if missing := [name for name in plain if name not in shapes]:
+        raise InputError(
+            f"{directory}: has no mesh for {plain[missing[0]]}: complete the copy, or remove the file."
+        )
 
     def pair(x: str, y: str) -> DataPair:
         mirrored = None
@@ -245,10 +293,10 @@ def _remeshed(directory: Path) -> list[DataPair] | None:
             mirrored = (files[f"{x}.sym"], plain[y])
         return DataPair(x, y, shapes[x], shapes[y], (plain[x], plain[y]), mirrored)
 
-    return [pair(*names) for names in _listed_pairs(directory, shapes) or _within_classes(shapes)]
+    return _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
 
 
-def _shrec19(directory: Path) -> list[DataPair] | None:
+def _shrec19(directory: Path) -> _Pairs | None:
     between = re.compile(r"(\d+)_(\d+)")
     truths = {
         (match[1], match[2]): file
@@ -259,18 +307,17 @@ def _shrec19(directory: Path) -> list[DataPair] | None:
     if not truths:
         return None
     shapes = _mesh_folder(directory, re.compile(r"\d+"))
-    listed = _listed_pairs(directory, shapes)
-    if listed is None:
-        listed = [pair for pair in truths if set(pair) <= set(shapes)]
-    pairs = []
-    for x, y in listed:
+
+    def pair(x: str, y: str) -> DataPair:
         if (x, y) not in truths:
             raise InputError(f"{directory}: the ground truth {x}_{y} of a listed pair is missing: add it.")
-        pairs.append(DataPair(x, y, shapes[x], shapes[y], (truths[x, y],), index_base=1))
-    return pairs
+        return DataPair(x, y, shapes[x], shapes[y], (truths[x, y],), index_base=1)
+
+    known = [names for names in truths if set(names) <= set(shapes)]
+    return _listed_first(pair, _listed_pairs(directory, shapes), known)
 
 
-def _partial(directory: Path) -> list[DataPair] | None:
+def _partial(directory: Path) -> _Pairs | None:
     nulls = _meshes(directory / "null")
     parts = {**_meshes(directory / "cuts"), **_meshes(directory / "holes")}
     if not nulls and not parts:
@@ -292,37 +339,45 @@ def _partial(directory: Path) -> list[DataPair] | None:
         null = match[1]
         sides = (mirrored,) if mirrored.is_file() else None
         pairs.append(DataPair(name, null, file, nulls[null], (truth,), sides, partial=True))
-    return pairs
+    return pairs, []
 
 
-def _topology(directory: Path) -> list[DataPair] | None:
+def _topology(directory: Path) -> _Pairs | None:
     shapes = _mesh_folder(directory, re.compile(r"kid\d+"))
     if not shapes:
         return None
     if "kid00" not in shapes:
         raise InputError(f"{directory}: has kids but no kid00, to which all others are matched: add it.")
+    full = shapes.pop("kid00")
     pairs = []
     for name, file in shapes.items():
         truth = file.with_name(f"{name}_ref.txt")
-        if name != "kid00" and truth.is_file():
-            pairs.append(DataPair(name, "kid00", file, shapes["kid00"], (truth,)))
-    return pairs
+        if not truth.is_file():
+            raise InputError(f"{truth}: is missing, the ground truth of {file}: complete the copy.")
+        pairs.append(DataPair(name, "kid00", file, full, (truth,)))
+    return pairs, []
 
 
-def _identical(names: str) -> Callable[[Path], list[DataPair] | None]:
+def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     pattern = re.compile(names)
 
-    def open_layout(directory: Path) -> list[DataPair] | None:
+    def open_layout(directory: Path) -> _Pairs | None:
         shapes = _mesh_folder(directory, pattern)
         if not shapes:
             return None
-        listed = _listed_pairs(directory, shapes) or _within_classes(shapes)
-        return [DataPair(x, y, shapes[x], shapes[y]) for x, y in listed]
+        above = directory.resolve().parent
+        if any((above / "corres").glob("*.vts")):
+            raise InputError(f"{directory}: holds only the meshes of a remeshed set: give {above}.")
+
+        def pair(x: str, y: str) -> DataPair:
+            return DataPair(x, y, shapes[x], shapes[y])
+
+        return _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
 
     return open_layout
 
 
-_LAYOUTS: dict[str, Callable[[Path], list[DataPair] | None]] = {
+_LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
     "a remeshed set": _remeshed,
     "SHREC'19 humans": _shrec19,
     "SHREC'16 partial": _partial,

@@ -36,10 +36,10 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
-    if np.ptp(values) == 0:  # as of the default with itself
-        return Interval(mean, mean, mean)
     if len(values) < 3:  # too few to say anything
         return Interval(mean, np.nan, np.nan)
+    if np.ptp(values) == 0:  # as of the default with itself
+        return Interval(mean, mean, mean)
     found = bootstrap(
         (values,),
         np.mean,

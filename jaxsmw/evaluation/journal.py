@@ -6,10 +6,13 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
@@ -83,21 +86,41 @@ class Journal:
             self._rows.setdefault(tuple(row[name] for name in self.key), row)
 
 
-def claim_directory(
+@contextmanager
+def claimed_directory(
     directory: Path,
     provenance: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, Any] = MappingProxyType({}),
-) -> None:
-    """Note in `provenance.json` what the results in a directory come from, or check that it is the same.
+) -> Iterator[None]:
+    """Keep other processes out of a directory while results are added to it.
 
-    `noted` are facts about the first time that may differ later.
+    What these come from is noted in `provenance.json`, or found there to be the same. `noted` are facts
+    about the first time that may differ later.
 
-    **Raises:** `InputError` if the directory holds results that come from something else.
+    **Raises:** `InputError` if the directory holds results that come from something else, or another
+    process is adding to it.
     """
+    try:
+        # The operating system lets go of the lock however the process ends.
+        with FileLock(directory / ".lock", timeout=0):
+            _check_origin(directory, provenance, noted)
+            yield
+    except Timeout:
+        raise InputError(
+            f"{directory}: another run is adding results: wait for its end, or give another --output."
+        ) from None
+
+
+def _check_origin(
+    directory: Path, provenance: Mapping[str, Mapping[str, Any]], noted: Mapping[str, Any]
+) -> None:
     path = directory / "provenance.json"
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
-        found = json.loads(path.read_text("utf-8"))
+        try:
+            found = json.loads(path.read_text("utf-8"))
+        except ValueError:
+            raise InputError(f"{path}: is damaged: give another --output, or remove the directory.") from None
         found.pop("noted", None)
         for group in {**found, **wanted}:
             before, now = found.get(group, {}), wanted.get(group, {})

@@ -6,7 +6,7 @@ Every method takes a prepared pair, with the same spectra and the same start, an
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -88,6 +88,14 @@ class Method(abc.ABC):
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         """The map, and how its computation ended."""
 
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Whether some pairs can be measured, before any is.
+
+        **Raises:** `InputError` if one cannot.
+        """
+        if self.whole_only and any(pair.partial for pair in pairs):
+            raise InputError(f"{self.reference}: is for whole shapes: leave it out of --methods.")
+
 
 @dataclass(frozen=True)
 class Start(Method):
@@ -120,6 +128,20 @@ class Published(Method):
         padded = jnp.asarray(np.pad(pointwise_map, (0, missing)), jnp.int32)
         return padded, RESULTS.successful  # type: ignore[return-value]
 
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Whether there is a map for each of some pairs."""
+        missing = [pair for pair in pairs if not published_file(self.directory, pair.names).is_file()]
+        if missing:
+            raise InputError(
+                f"{published_file(self.directory, missing[0].names)}: is missing, like {len(missing)} of "
+                f"{len(pairs)} maps: add them, or choose pairs with --pairs FILE."
+            )
+
+
+def published_file(directory: Path, names: tuple[str, str]) -> Path:
+    """Where the map between two shapes lies among maps as they circulate."""
+    return directory / f"{'_'.join(names)}.map"
+
 
 def read_published_map(
     directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
@@ -128,7 +150,7 @@ def read_published_map(
 
     **Raises:** `InputError` if it is missing or does not fit the meshes.
     """
-    file = directory / f"{'_'.join(names)}.map"
+    file = published_file(directory, names)
     if not file.is_file():
         raise InputError(f"{file}: is missing, the map from {names[0]} to {names[1]}: add it.")
     return read_pointwise_map(file, *meshes, index_base=1)
@@ -266,17 +288,25 @@ def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
     return {name: method for name, method in known_methods().items() if not (partial and method.whole_only)}
 
 
-def find_method(name: str) -> tuple[str, Method]:
-    """The method of a name, or of a directory with maps computed elsewhere, whose name it then takes.
+def find_methods(names: Iterable[str]) -> dict[str, Method]:
+    """The methods of some names, or of directories with maps computed elsewhere, whose name they then take.
 
-    **Raises:** `InputError` if it is neither.
+    **Raises:** `InputError` if one is neither, or two would be called the same.
     """
-    known = known_methods()
-    if name in known:
-        return name, known[name]
-    directory = Path(name)
-    if not directory.is_dir():
-        raise InputError(
-            f"{name!r} is no method: choose from {', '.join(known)}, or give a directory with maps X_Y.map."
-        )
-    return directory.resolve().name, Published(directory.resolve())
+    known, found = known_methods(), {}
+    for name in dict.fromkeys(names):
+        directory = Path(name).resolve()
+        if name in known:
+            found[name] = known[name]
+            continue
+        if not directory.is_dir():
+            raise InputError(
+                f"{name!r} is no method: choose from {', '.join(known)}, or give a directory with maps "
+                "X_Y.map."
+            )
+        if directory.name in {**known, **found}:
+            raise InputError(
+                f"{directory}: another method is called {directory.name} already: rename the directory."
+            )
+        found[directory.name] = Published(directory)
+    return found

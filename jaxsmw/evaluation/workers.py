@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import TypeVar
+from urllib.parse import urlsplit
 
 from jaxsmw.errors import InputError
 
@@ -77,6 +78,9 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
             "--scheduler needs Dask's distributed: install it with pip install 'jaxsmw[cluster]'."
         ) from None
     try:
+        # A client that fails for want of a port leaves threads behind that complain later.
+        if urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}").port is None:
+            raise ValueError("it has no port")
         client = Client(scheduler, timeout=5, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(

@@ -172,7 +172,8 @@ def write_tables(
         f"at {points} of the ground truth; mean and median are over the pairs on which a method did not "
         f"fail, the difference is pair by pair, with its {CONFIDENCE:.0%} bootstrap interval. Times are "
         f"medians over the pairs, without compilation, on {'; '.join(machines)}; local workers have one core "
-        "each.",
+        "each."
+        + (f" {len(results.failures)} shapes or pairs could not be measured." if results.failures else ""),
         markdown_table(summaries),
         "\n".join(f"- **{name}**: {methods[name].reference}" for name in summaries),
         "Pair by pair: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
