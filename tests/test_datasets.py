@@ -1,6 +1,7 @@
 """Data sets are recognised by the layouts in which they circulate, and what is missing is named."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,8 @@ def test_what_is_missing_is_named(tmp_path, case):
 
 def test_the_folder_of_meshes_is_not_the_set(tmp_path):
     remeshed(tmp_path)
+    shutil.copytree(tmp_path / "off", tmp_path / "shapes")
+    assert len(open_data_set(tmp_path).pairs) == 6
     with pytest.raises(InputError, match=f"meshes of a remeshed set: give {re.escape(str(tmp_path))}"):
         open_data_set(tmp_path / "off")
 

@@ -132,9 +132,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"{directory}: is not a directory: give the one that a data set was unpacked to.")
-    inner = [
-        folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _looks_like_a_set(folder)
-    ]
+    inner = [folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _is_a_set(folder)]
     if len(inner) > 1:
         raise InputError(
             f"{directory}: holds several data sets ({', '.join(folder.name for folder in inner)}): give one."
@@ -161,12 +159,11 @@ def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
     return None
 
 
-def _looks_like_a_set(directory: Path) -> bool:
-    """Whether a directory is a data set, complete or not."""
+def _is_a_set(directory: Path) -> bool:
     try:
         return _recognise(directory) is not None
     except InputError:
-        return True
+        return False
 
 
 _EXPECTED = (
