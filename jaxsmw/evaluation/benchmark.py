@@ -208,54 +208,40 @@ def run_benchmark(
     chosen = asdict(settings) | {"init": Path(settings.init).name}
     origin = {"settings": chosen, "versions": made_with}
     with claimed_directory(output, origin, {"commit": commit()}):
-        return _measure_missing(data_set, pairs, output, methods, settings, executor)
-
-
-def _measure_missing(
-    data_set: DataSet,
-    pairs: Sequence[DataPair],
-    output: Path,
-    methods: Mapping[str, Method],
-    settings: Settings,
-    executor: Executor,
-) -> Results:
-    results = Journal(output / "results.csv", ["source", "target", "method"])
-    shapes = Journal(output / "shapes.csv", ["shape"])
-    if strangers := [row["shape"] for row in shapes.rows if row["shape"] not in data_set.shapes]:
-        raise InputError(
-            f"{output}: holds results of another data set, with a shape {strangers[0]} that is not in "
-            f"{data_set.directory}: give another --output."
-        )
-    tasks = []
-    for pair in pairs:
-        missing = {name: methods[name] for name in methods if (*pair.names, name) not in results}
-        if missing:
-            tasks.append(Task(pair, missing))
-    files = {name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)}
-    for name, file in files.items():
-        if (name,) in shapes and shapes[(name,)]["digest"] != _digest(file):
+        results = Journal(output / "results.csv", ["source", "target", "method"])
+        shapes = Journal(output / "shapes.csv", ["shape"])
+        if strangers := [row["shape"] for row in shapes.rows if row["shape"] not in data_set.shapes]:
             raise InputError(
-                f"{file}: has changed since results in {output} were measured: give another --output."
+                f"{output}: holds results of another data set, with a shape {strangers[0]} that is not in "
+                f"{data_set.directory}: give another --output."
             )
-    missing_shapes = {name: (name, file) for name, file in files.items() if (name,) not in shapes}
+        tasks = []
+        for pair in pairs:
+            missing = {name: methods[name] for name in methods if (*pair.names, name) not in results}
+            if missing:
+                tasks.append(Task(pair, missing))
+        files = {name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)}
+        for name, file in files.items():
+            if (name,) in shapes and shapes[(name,)]["digest"] != _digest(file):
+                raise InputError(
+                    f"{file}: has changed since results in {output} were measured: give another --output."
+                )
+        missing_shapes = {name: (name, file) for name, file in files.items() if (name,) not in shapes}
 
-    measure = partial(measure_pair, settings=settings)
-    failed = {
-        **_run("shapes", measure_shape, missing_shapes, executor, shapes),
-        **_run("pairs", measure, {task.pair.name: task for task in tasks}, executor, results),
-    }
-    # Of a pair all methods or none, so that all are compared on the same pairs.
-    by_pair = [[(*pair.names, name) for name in methods] for pair in pairs if _have(shapes, pair)]
-    finished = [keys for keys in by_pair if all(key in results for key in keys)]
-    return Results(
-        [results[key] for keys in finished for key in keys],
-        {name: shapes[(name,)] for name in files if (name,) in shapes},
-        {name: str(error) or type(error).__name__ for name, error in failed.items()},
-    )
-
-
-def _have(shapes: Journal, pair: DataPair) -> bool:
-    return all((name,) in shapes for name in pair.names)
+        measure = partial(measure_pair, settings=settings)
+        failed = {
+            **_run("shapes", measure_shape, missing_shapes, executor, shapes),
+            **_run("pairs", measure, {task.pair.name: task for task in tasks}, executor, results),
+        }
+        # Of a pair all methods or none, so that all are compared on the same pairs.
+        known = [pair for pair in pairs if all((name,) in shapes for name in pair.names)]
+        by_pair = [[(*pair.names, name) for name in methods] for pair in known]
+        finished = [keys for keys in by_pair if all(key in results for key in keys)]
+        return Results(
+            [results[key] for keys in finished for key in keys],
+            {name: shapes[(name,)] for name in files if (name,) in shapes},
+            {name: str(error) or type(error).__name__ for name, error in failed.items()},
+        )
 
 
 def _digest(file: Path) -> str:
