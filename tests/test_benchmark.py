@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Executor, Future
+from contextlib import nullcontext
 from itertools import permutations
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, sphere_mesh
 
 from jaxsmw import InputError
+from jaxsmw.cli import main
 from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.evaluation.opponents import METHODS, find_methods
@@ -279,6 +281,22 @@ def test_one_bad_shape_does_not_stop_the_others(measure, scape, tmp_path):
     found = measure(["start"], data=data, output=output, pairs="6")
     found.check()
     assert len(found.rows) == 6
+
+
+def test_tables_are_of_what_could_be_measured(scape, tmp_path, monkeypatch, capsys):
+    data, output = tmp_path / "data", tmp_path / "output"
+    shutil.copytree(scape, data)
+    (data / "mesh002.off").write_text("OFF\n1")
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
+    call = ["benchmark", str(data), "--methods", "start", "--output", str(output)]
+    with pytest.raises(SystemExit) as ended:
+        main([*call, "--evaluation-samples", "50"])
+    printed = capsys.readouterr()
+    assert ended.value.code == 2
+    assert "| start |" in printed.out and "| start |" in (output / "summary.md").read_text()
+    assert "2 of 6 pairs" in (output / "summary.md").read_text()
+    assert "5 shapes or pairs could not be measured" in (output / "summary.md").read_text()
+    assert printed.err.count("mesh002.off:") == 1 and (output / "results.parquet").exists()
 
 
 def test_results_of_another_data_set_are_not_mixed_in(measure, scape, tmp_path):
