@@ -188,7 +188,6 @@ def test_what_does_not_fit_together(monkeypatch):
 _PROGRAM = """
 import sys
 import jax
-import jaxtyping
 jax.config.update("jax_enable_x64", True)
 output, process, processes, address = sys.argv[1:]
 if int(processes) > 1:

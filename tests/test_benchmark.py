@@ -68,6 +68,8 @@ def test_one_command_finishes_what_a_killed_one_began(scape, tmp_path):
     assert lines[: len(kept)] == kept  # not measured again: times would differ
     assert len(lines) == len(set(lines)) == 1 + 6 * 2
     assert second.stdout.startswith("| method | mean error |")
+    third = subprocess.run(call, check=True, capture_output=True, text=True)
+    assert third.stdout == second.stdout and results.read_text().splitlines() == lines
 
     table = pyarrow.parquet.read_table(output / "results.parquet").to_pylist()
     assert len(table) == 12 and table[0]["curve"][-1] <= 1 and isinstance(table[0]["mean"], float)

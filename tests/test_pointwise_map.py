@@ -19,7 +19,9 @@ from jaxsmw.core.pointwise_map import decode, matching_objective, nearest_neighb
         (128, 130, 1),
         (129, 500, 20),
         (600, 1, 3),
+        (255, 64, 1),
         (256, 128, 3),
+        (257, 63, 20),
     ],
 )
 def test_equals_brute_force(m, n, d):

@@ -210,7 +210,8 @@ def run_benchmark(
     with claimed_directory(output, origin, {"commit": commit()}):
         results = Journal(output / "results.csv", ["source", "target", "method"])
         shapes = Journal(output / "shapes.csv", ["shape"])
-        if strangers := [row["shape"] for row in shapes.rows if row["shape"] not in data_set.shapes]:
+        own = data_set.shapes
+        if strangers := [row["shape"] for row in shapes.rows if row["shape"] not in own]:
             raise InputError(
                 f"{output}: holds results of another data set, with a shape {strangers[0]} that is not in "
                 f"{data_set.directory}: give another --output."
