@@ -11,7 +11,8 @@ experiment below is measured on those it is for:
 - `fig6`: parts of shapes, cuts and holes apart;
 - `fig7`: bodies glued to themselves;
 - `fig9`: other meshings and resolutions of the target, and other starts;
-- `nonisometric`: pairs of different classes, from published starts where there are, beside published results.
+- `nonisometric`: pairs of different classes, from published starts where there are, beside published results;
+- `settings`: MWP and its opponents at other settings than the published ones, on the sets of `table1`.
 
 The output gets a directory for each run (what `jaxsmw benchmark` writes) and `README.md` with all tables.
 Whatever interrupts it, the same command goes on from there. Quick takes minutes on shapes of 5000 vertices.
@@ -25,7 +26,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import igl
 import numpy as np
@@ -33,7 +34,7 @@ from jaxtyping import Int64
 from scipy.spatial import KDTree
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+from jaxsmw.evaluation.benchmark import Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
 from jaxsmw.evaluation.opponents import METHODS, Method, Published, suited_methods
 from jaxsmw.evaluation.workers import open_executor
@@ -66,6 +67,8 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
     """Those of some names, or all that are recognised in a directory's directories."""
     if names:
         return [open_data_set(data / name) for name in names]
+    if not data.is_dir():
+        raise InputError(f"{data}: is no directory: give the one that holds the data sets.")
     found = []
     for directory in sorted(path for path in data.iterdir() if path.is_dir()):
         try:
@@ -88,7 +91,7 @@ def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Ru
     """Whole near-isometric shapes, every method."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
-        yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), settings(options))
+        yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -106,7 +109,7 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
                     part,
                     chosen(part, options),
                     methods(pairs, options),
-                    settings(options),
+                    same(options),
                 )
 
 
@@ -115,7 +118,7 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
             pairs = chosen(data_set, options)
-            yield Run("fig7", data_set.name, data_set, pairs, methods(pairs, options), settings(options))
+            yield Run("fig7", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
 def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -125,7 +128,7 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, few)
         for start in (*STARTS, *published(data_set)):
-            setting = settings(options, init=start, mirrored=_can_mirror(start, pairs))
+            setting = same(options, init=start, mirrored=_can_mirror(start, pairs))
             yield Run("fig9", f"{data_set.name}-from-{Path(start).name}", data_set, pairs, some, setting)
         if not all(len(pair.truth) in (0, 2) for pair in pairs):
             continue  # no rows to carry over
@@ -133,7 +136,7 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
             directory = options.output / "fig9" / f"meshes-{data_set.name}-{name}"
             derived = derive(directory, pairs, name, remesh)
             every = list(derived.pairs)
-            yield Run("fig9", f"{data_set.name}-{name}", derived, every, some, settings(options))
+            yield Run("fig9", f"{data_set.name}-{name}", derived, every, some, same(options))
 
 
 def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -145,7 +148,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         starts = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for start in starts or ["shot"]:
             finished = {Path(path).name: Published(Path(path)) for path in directories if path not in starts}
-            setting = settings(options, init=start)
+            setting = same(options, init=start)
             pairs = chosen(data_set, options)
             yield Run(
                 "nonisometric", f"{data_set.name}-from-{Path(start).name}", data_set, pairs,
@@ -153,7 +156,42 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
             )  # fmt: skip
 
 
-EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric)}
+def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
+    """Whether the published settings are what decides."""
+    for data_set in filter(is_isometric, data_sets):
+        pairs = chosen(data_set, options)
+        yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
+
+
+def other_settings() -> dict[str, Method]:
+    """The published ones, more eigenvectors and fewer, more iterations, another first k and other steps."""
+    found = {"start": METHODS["start"]}
+    for name, changes in _CHANGES.items():
+        method = found[name] = METHODS[name]
+        assert dataclasses.is_dataclass(method)
+        reference = method.reference.partition(":")[0]
+        for change in changes:
+            changed: dict[str, Any] = {
+                _NAMES.get(setting, setting): value for setting, value in change.items()
+            }
+            label = ", ".join(f"{setting} = {value}" for setting, value in change.items())
+            found[f"{name}: {label}"] = dataclasses.replace(
+                method, reference=f"{reference}, with {label}", **changed
+            )
+    return found
+
+
+_NAMES = {"k": "number_of_eigenvectors"}
+_CHANGES: dict[str, list[dict[str, int]]] = {
+    "mwp": [{"k": k, "iterations": i} for i in (3, 10) for k in (50, 100, 150, 200) if (k, i) != (100, 3)],
+    "icp": [{"k": 20}, {"k": 50}, {"k": 200}, {"iterations": 50}],
+    "cpd": [{"k": 20}, {"k": 60}],
+    "bcicp": [{"k": 30}, {"k": 100}],
+    "zoomout": [{"k": 60}, {"k": 200}, {"first": 10}, {"first": 50}, {"step": 1}, {"step": 20}],
+}
+
+
+EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric, settings)}
 
 
 def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
@@ -167,8 +205,8 @@ def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str,
     return {name: every[name] for name in ("start", "mwp", "zoomout-sampled")} if options.quick else every
 
 
-def settings(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
-    """The same points for all."""
+def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
+    """What all methods of a run have in common."""
     return Settings(init, mirrored, 200 if options.quick else None, options.seed)
 
 
@@ -238,13 +276,14 @@ def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[
     return open_data_set(directory)
 
 
-def perform(run: Run, output: Path, executor: Executor) -> dict[str, MethodSummary]:
+def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[str, MethodSummary]]:
     """Measure what is missing and write its tables."""
     directory = make_directory(output / run.experiment / run.name)
     print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
     results = run_benchmark(run.data_set, run.pairs, directory, run.methods, run.settings, executor)
-    results.check()
-    return write_tables(directory, run.data_set, results, run.settings, run.methods)
+    if not results.rows:
+        return results, {}
+    return results, write_tables(directory, run.data_set, results, run.settings, run.methods)
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
@@ -284,13 +323,17 @@ def main() -> None:
         options.pairs = min(options.pairs or 2, 2)
     try:
         data_sets = find_data_sets(options.data, options.sets)
-        found = {}
+        found: dict[tuple[str, str], dict[str, MethodSummary]] = {}
+        failures: dict[str, str] = {}
         with open_executor(options.workers, options.scheduler) as executor:
             for name in options.only:
                 for run in EXPERIMENTS[name](data_sets, options):
-                    found[run.experiment, run.name] = perform(run, options.output, executor)
+                    results, found[run.experiment, run.name] = perform(run, options.output, executor)
+                    for what, why in results.failures.items():
+                        failures[f"{run.experiment}, {run.name}, {what}"] = why
                     with atomic_write(options.output / "README.md") as temporary:
                         temporary.write_text(overview(found), "utf-8")
+        Results([], {}, failures).check()
     except InputError as error:
         parser.exit(2, f"{error}\n")
     print(options.output / "README.md")

@@ -14,17 +14,21 @@ from contextlib import nullcontext
 from itertools import permutations
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
 from scipy.spatial import KDTree
-from synthetic import bumpy_mesh, sphere_mesh
+from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError
 from jaxsmw.cli import main
+from jaxsmw.core.results import RESULTS
+from jaxsmw.evaluation import benchmark
 from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents import METHODS, find_methods
+from jaxsmw.evaluation.opponents import METHODS, Method, PreparedPair, find_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import write_mesh
@@ -342,6 +346,37 @@ def test_tables_say_what_the_rows_say():
     latex = latex_table(summaries)
     assert r"mwp & \textbf{30.0} &" in latex and r"a\_b & 45.0 &" in latex and "—" not in latex
     assert all(line.count("&") == 9 for line in latex.splitlines()[2:] if "&" in line)
+
+
+class Slow(Method):
+    """Compiles something, and says how often it ran and how long."""
+
+    number_of_eigenvectors = 1
+    reference = "nothing"
+
+    def __init__(self, seconds: float):
+        self.seconds, self.runs = seconds, 0
+
+    def __call__(self, pair):
+        self.runs += 1
+        time.sleep(self.seconds)
+        return jax.jit(lambda start: jnp.sort(start + self.runs))(pair.start), RESULTS.successful
+
+
+def test_times_are_without_compilation(monkeypatch):
+    """What compiles is run again, but not where that would take long."""
+    monkeypatch.setattr(benchmark, "_LONG", 0.5)
+    monkeypatch.setattr(benchmark, "_warm", {"short"})
+    spectrum = random_spectrum(30, 5, seed=0)
+    pair = PreparedPair(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
+    compiling = benchmark._compiling.seconds
+    for name, seconds, runs in (("short", 0.0, 2), ("long", 0.6, 1)):
+        method = Slow(seconds)
+        began = time.perf_counter()
+        _, _, measured = benchmark._timed(name, method, pair)
+        assert method.runs == runs
+        assert benchmark._compiling.seconds > compiling
+        assert seconds <= measured < time.perf_counter() - began
 
 
 def test_a_table_has_its_first_row_for_a_header():

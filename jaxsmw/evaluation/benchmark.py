@@ -205,7 +205,10 @@ def run_benchmark(
         Published(Path(settings.init)).check(pairs)
     made_with = versions() | {"code": code_digest(measured_code())}
     # Not the path of maps, so that a moved copy of the data is no other start.
-    chosen = asdict(settings) | {"init": Path(settings.init).name}
+    chosen: dict[str, Any] = asdict(settings) | {"init": Path(settings.init).name}
+    # The same for most choices of methods, so that more can be added; times of precomputation depend on it.
+    most = max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
+    chosen["number_of_eigenvectors"] = most
     origin = {"settings": chosen, "versions": made_with}
     with claimed_directory(output, origin, {"commit": commit()}):
         results = Journal(output / "results.csv", ["source", "target", "method"])
@@ -229,9 +232,10 @@ def run_benchmark(
                 )
         missing_shapes = {name: (name, file) for name, file in files.items() if (name,) not in shapes}
 
-        measure = partial(measure_pair, settings=settings)
+        precompute = partial(measure_shape, number_of_eigenvectors=most)
+        measure = partial(measure_pair, settings=settings, number_of_eigenvectors=most)
         failed = {
-            **_run("shapes", measure_shape, missing_shapes, executor, shapes),
+            **_run("shapes", precompute, missing_shapes, executor, shapes),
             **_run("pairs", measure, {task.pair.name: task for task in tasks}, executor, results),
         }
         # Of a pair all methods or none, so that all are compared on the same pairs.
@@ -270,13 +274,13 @@ def _run(
     return {name: failed[name] for name in tasks if name in failed}
 
 
-def measure_shape(shape: tuple[str, Path]) -> list[Row]:
+def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int = MOST_EIGENVECTORS) -> list[Row]:
     """Precompute what all pairs of a shape share, and note how long each part took."""
     name, file = shape
     with recomputing():
         seconds, mesh = {}, read_mesh(file)
         for what, compute in (
-            ("spectrum", lambda: compute_spectrum(mesh, MOST_EIGENVECTORS)),
+            ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors)),
             ("descriptors", lambda: shot_descriptors(mesh)),
         ):
             began = time.perf_counter()
@@ -285,7 +289,9 @@ def measure_shape(shape: tuple[str, Path]) -> list[Row]:
     return [{"shape": name, "digest": _digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(task: Task, settings: Settings) -> list[Row]:
+def measure_pair(
+    task: Task, settings: Settings, number_of_eigenvectors: int = MOST_EIGENVECTORS
+) -> list[Row]:
     """Match a pair with every method and measure the maps; a row for each."""
     data = task.pair
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
@@ -293,7 +299,9 @@ def measure_pair(task: Task, settings: Settings) -> list[Row]:
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
     both_directions = any(method.both_directions for method in task.methods.values())
-    pair = prepare_pair(data, mesh_x, mesh_y, settings.init, both_directions=both_directions)
+    pair = prepare_pair(
+        data, mesh_x, mesh_y, settings.init, number_of_eigenvectors, both_directions=both_directions
+    )
     rows = []
     for name, method in task.methods.items():
         pointwise_map, result, seconds = _timed(name, method, pair)
@@ -306,26 +314,52 @@ def measure_pair(task: Task, settings: Settings) -> list[Row]:
 
 def _timed(name: str, method: Method, pair: PreparedPair) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
     """The map and its seconds, without compilation; NaN for a map that was computed elsewhere."""
-    program = name, pair.spectrum_x.eigenvectors.shape, pair.spectrum_y.eigenvectors.shape
-    if method.compiled and program not in _compiled:
-        jax.block_until_ready(method(pair))
-        _compiled.add(program)
-    began = time.perf_counter()
-    pointwise_map, result = jax.block_until_ready(method(pair))
-    seconds = np.nan if isinstance(method, Published) else time.perf_counter() - began
-    return np.asarray(pointwise_map), result, seconds
+    for _ in range(2):
+        compiling_before, began = _compiling.seconds, time.perf_counter()
+        pointwise_map, result = jax.block_until_ready(method(pair))
+        seconds = time.perf_counter() - began
+        compiling = _compiling.seconds - compiling_before
+        seconds -= compiling
+        known = name in _warm and not compiling
+        _warm.add(name)
+        # What else a first run does, such as imports, disappears in a long one.
+        if known or seconds > _LONG:
+            break
+    return np.asarray(pointwise_map), result, np.nan if isinstance(method, Published) else seconds
 
 
-# What this process has compiled already: times are of what comes after.
-_compiled: set[tuple[str, tuple[int, ...], tuple[int, ...]]] = set()
+_LONG = 60
+# The methods that this process has run before.
+_warm: set[str] = set()
+
+
+class _Compiling:
+    """Counts the seconds that XLA has spent compiling in this process."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            self.seconds += duration_secs
+
+
+_compiling = _Compiling()
 
 
 def prepare_pair(
-    data: DataPair, mesh_x: Mesh, mesh_y: Mesh, init: str, *, both_directions: bool = False
+    data: DataPair,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    init: str,
+    number_of_eigenvectors: int,
+    *,
+    both_directions: bool = False,
 ) -> PreparedPair:
     """Spectra, start and samples, padded so that few programs serve all pairs."""
     meshes = mesh_x, mesh_y
-    spectra = paired_spectra(*meshes, MOST_EIGENVECTORS, partial=data.partial)
+    spectra = paired_spectra(*meshes, number_of_eigenvectors, partial=data.partial)
     start = _start(data.names, meshes, spectra, init, data.partial)
     reverse = None
     if both_directions:

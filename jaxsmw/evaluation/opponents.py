@@ -74,14 +74,12 @@ class Method(abc.ABC):
     - `number_of_eigenvectors`: the largest number it uses.
     - `reference`: where it is published, with what settings.
     - `both_directions`: whether it needs `PreparedPair.reverse_start`.
-    - `compiled`: whether its first call in a process takes longer.
     - `whole_only`: whether it makes no sense where one shape is a part of the other.
     """
 
     number_of_eigenvectors: int
     reference: str
     both_directions: bool = False
-    compiled: bool = True
     whole_only: bool = False
 
     @abc.abstractmethod
@@ -114,7 +112,6 @@ class Published(Method):
 
     directory: Path
     number_of_eigenvectors: int = 1
-    compiled: bool = False
 
     @property
     def reference(self) -> str:  # type: ignore[override]
@@ -150,10 +147,7 @@ def read_published_map(
 
     **Raises:** `InputError` if it is missing or does not fit the meshes.
     """
-    file = published_file(directory, names)
-    if not file.is_file():
-        raise InputError(f"{file}: is missing, the map from {names[0]} to {names[1]}: add it.")
-    return read_pointwise_map(file, *meshes, index_base=1)
+    return read_pointwise_map(published_file(directory, names), *meshes, index_base=1)
 
 
 @dataclass(frozen=True)

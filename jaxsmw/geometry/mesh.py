@@ -358,7 +358,9 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
             f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but counted from 0 the "
             f"vertices are 0 to {n - 1}: {cure}."
         )
-    triangles = np.array(faces, dtype=np.int64, order="C")
+    # Filled, as a copy would keep the "long long" that libigl gives, which is another type of the same size.
+    triangles = np.empty(faces.shape, np.int64)
+    triangles[...] = faces
     if (triangles != faces).any():
         raise InputError(f"{name}: a face has an index that is not a whole number: correct the faces.")
     return triangles
