@@ -25,9 +25,10 @@ from .core.filters import (
 )
 from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
-from .core.pointwise_map import decode, nearest_neighbor
+from .core.pointwise_map import decode, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
 from .core.results import RESULTS
+from .core.search import nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.solutions import (
     DescriptorPair,
@@ -124,6 +125,7 @@ __all__ = [
     "read_pointwise_map",
     "refine",
     "refine_pairs",
+    "search_patches",
     "shot_descriptors",
     "stack",
     "tighten",

@@ -16,9 +16,10 @@ from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from jaxsmw.core.pointwise_map import decode, nearest_neighbor
+from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum

@@ -23,8 +23,9 @@ from tqdm import tqdm
 
 from jaxsmw.core.batch import padded_size
 from jaxsmw.core.functional_map import encode
-from jaxsmw.core.pointwise_map import nearest_neighbor, spectral_embeddings
+from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs

@@ -36,8 +36,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.filters import FilterBank, Identity
-from jaxsmw.core.pointwise_map import nearest_neighbor, spectral_embeddings
+from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refinement import Problem, WaveletPreservation
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 
 # GPUs would otherwise multiply in less than float32, and differences of squares with it.

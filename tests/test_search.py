@@ -1,0 +1,195 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from synthetic import bumpy_mesh
+
+from jaxsmw.core.search import make_patches, nearest_neighbor, nearest_neighbor_in_patches, search_in_patches
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+
+
+# Around the sizes of blocks (128) and chunks (64).
+@pytest.mark.parametrize(
+    ("m", "n", "d"),
+    [
+        (1, 1, 1),
+        (1, 63, 3),
+        (2, 64, 20),
+        (127, 65, 3),
+        (128, 130, 1),
+        (129, 500, 20),
+        (600, 1, 3),
+        (255, 64, 1),
+        (256, 128, 3),
+        (257, 63, 20),
+    ],
+)
+def test_equals_brute_force(m, n, d):
+    search = jax.jit(nearest_neighbor)
+    for seed in range(10):
+        generator = np.random.default_rng(seed)
+        queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
+        nearest = search(jnp.asarray(queries), jnp.asarray(database))
+        assert nearest.dtype == jnp.int32
+        np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
+
+
+def test_ties_go_to_the_lowest_index():
+    corners = jnp.asarray([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]])
+    for repeats in (1, 40, 100):
+        database = jnp.tile(corners, (repeats, 1))
+        assert nearest_neighbor(jnp.asarray([[1.0, 1.0], [2.0, 1.0], [3.0, 3.0]]), database).tolist() == [
+            0,
+            1,
+            3,
+        ]
+
+
+@pytest.mark.parametrize("n", [5, 100, 300])
+def test_masked_rows_are_never_chosen(n):
+    generator = np.random.default_rng(0)
+    queries, database = generator.normal(size=(80, 4)), generator.normal(size=(n, 4))
+    mask = generator.random(n) < 0.3
+    mask[-1] = True
+    nearest = nearest_neighbor(jnp.asarray(queries), jnp.asarray(database), database_mask=jnp.asarray(mask))
+    allowed = np.flatnonzero(mask)
+    np.testing.assert_array_equal(nearest, allowed[cdist(queries, database[mask]).argmin(axis=1)])
+
+
+def test_padding_changes_nothing():
+    generator = np.random.default_rng(0)
+    queries, database = (
+        jnp.asarray(generator.normal(size=(90, 5))),
+        jnp.asarray(generator.normal(size=(70, 5))),
+    )
+    padded = jnp.concatenate([database, jnp.zeros((200, 5))])
+    mask = jnp.arange(270) < 70
+    np.testing.assert_array_equal(
+        nearest_neighbor(queries, padded, database_mask=mask), nearest_neighbor(queries, database)
+    )
+
+
+def test_float32_finds_the_same_far_from_the_origin():
+    """Scores lose digits where norms are large against distances; the exact second look makes up for it."""
+    generator = np.random.default_rng(0)
+    database = generator.normal(size=(1000, 10)) + 20
+    queries = database[generator.permutation(1000)] + 1e-3 * generator.normal(size=(1000, 10))
+    single = nearest_neighbor(jnp.asarray(queries, jnp.float32), jnp.asarray(database, jnp.float32))
+    exact = cdist(queries, database).argmin(axis=1)
+    assert np.mean(np.asarray(single) == exact) == 1
+
+
+def test_vmap_equals_a_loop():
+    generator = np.random.default_rng(0)
+    queries, database = (
+        jnp.asarray(generator.normal(size=(3, 70, 4))),
+        jnp.asarray(generator.normal(size=(3, 90, 4))),
+    )
+    looped = jnp.stack([nearest_neighbor(q, b) for q, b in zip(queries, database, strict=True)])
+    np.testing.assert_array_equal(jax.vmap(nearest_neighbor)(queries, database), looped)
+
+
+def test_search_never_stores_all_distances():
+    """50 000 x 50 000 distances would take 10 GB in float32; the compiled program has to do with 1/50."""
+    points = jax.ShapeDtypeStruct((50_000, 100), jnp.float32)
+    memory = jax.jit(nearest_neighbor).lower(points, points).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 200e6
+
+
+def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_mask=None):
+    masks = (query_mask, database_mask)
+    masks = [
+        jnp.ones(len(rows), bool) if mask is None else mask
+        for mask, rows in zip(masks, (queries, database), strict=True)
+    ]
+    patches = (
+        make_patches(rows, mask, size=size, rank=rank)
+        for rows, mask in zip((queries, database), masks, strict=True)
+    )
+    return nearest_neighbor_in_patches(queries, database, *patches)
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "d"), [(1, 1, 1), (3, 50, 2), (50, 3, 30), (130, 210, 5), (300, 300, 1), (257, 500, 20)]
+)
+def test_patches_find_the_same_anywhere(m, n, d):
+    """Also where they have nothing to leave out: points spread evenly in all dimensions."""
+    search = jax.jit(in_patches)
+    for seed in range(5):
+        generator = np.random.default_rng(seed)
+        queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
+        nearest = search(jnp.asarray(queries), jnp.asarray(database))
+        assert nearest.dtype == jnp.int32
+        np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
+
+
+@pytest.fixture(scope="module")
+def embedding():
+    """A surface in 30 dimensions, as functional maps search it."""
+    return compute_spectrum(bumpy_mesh(4), 30).eigenvectors
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
+def test_patches_find_the_same_on_surfaces(embedding, dtype, noise):
+    """A good map, a poor one, and none at all; ties in 0.0 are between vertices that are the same."""
+    generator = np.random.default_rng(0)
+    turned, _ = np.linalg.qr(np.eye(30) + noise * generator.normal(size=(30, 30)) / np.sqrt(30))
+    database = jnp.asarray(embedding @ (turned * generator.uniform(0.1, 1, 30)), dtype)
+    queries = embedding.astype(dtype)
+    found, wanted = jax.jit(in_patches)(queries, database), jax.jit(nearest_neighbor)(queries, database)
+    same = np.asarray(found) == np.asarray(wanted)
+    assert same.mean() > (0.999 if dtype == jnp.float32 else 1 - 1e-9)
+    exact = [
+        np.linalg.norm(np.asarray(queries - database[rows], np.float64), axis=1) for rows in (found, wanted)
+    ]
+    np.testing.assert_allclose(*exact, rtol=1e-6 if dtype == jnp.float32 else 1e-13)
+
+
+def test_patches_are_of_all_points_and_of_equal_size(embedding):
+    mask = jnp.asarray(np.random.default_rng(0).random(len(embedding)) < 0.9)
+    patches = make_patches(embedding, mask, size=40, rank=4)
+    assert patches.rows.shape[1] == -(-2562 // patches.rows.shape[0]) and 28 <= patches.rows.shape[1] <= 57
+    kept = np.asarray(patches.rows)[np.asarray(patches.mask)]
+    np.testing.assert_array_equal(np.sort(kept), np.flatnonzero(mask))
+    everywhere = jnp.var(embedding[:, :6], axis=0).sum()
+    for rows, valid in zip(patches.rows, patches.mask, strict=True):
+        assert not valid.any() or jnp.var(embedding[rows[valid]][:, :6], axis=0).sum() < 0.3 * everywhere
+
+
+def test_patches_leave_out_what_is_masked(embedding):
+    generator = np.random.default_rng(0)
+    query_mask, database_mask = (jnp.asarray(generator.random(2562) < 0.5) for _ in range(2))
+    found = in_patches(embedding, embedding, query_mask=query_mask, database_mask=database_mask)
+    wanted = nearest_neighbor(embedding, embedding, database_mask=database_mask)
+    np.testing.assert_array_equal(found[query_mask], wanted[query_mask])
+
+
+def test_patches_break_ties_like_all_with_all(embedding):
+    """Every point twice, far apart in the order of rows."""
+    twice = jnp.concatenate([embedding, embedding])
+    np.testing.assert_array_equal(in_patches(embedding, twice, size=64), jnp.arange(2562))
+
+
+def test_patches_under_vmap(embedding):
+    turned = jnp.stack([embedding, embedding * jnp.linspace(1, 0.1, 30)[None, :]])
+    looped = [in_patches(embedding, database) for database in turned]
+    np.testing.assert_array_equal(jax.vmap(in_patches, (None, 0))(embedding, turned), jnp.stack(looped))
+
+
+def test_patches_save_most_of_the_work(embedding):
+    for scales, most in ((jnp.ones(30), 0.15), (jnp.linspace(1, 0.1, 30), 0.3)):
+        ones = jnp.ones(2562, bool)
+        queries, database = (make_patches(embedding, ones, size=size, rank=4) for size in (100, 20))
+        _, numbers = search_in_patches(embedding, embedding * scales[None, :], queries, database)
+        assert 0 < numbers.mean() / len(database.rows) < most
+
+
+def test_search_in_patches_never_stores_all_distances():
+    points, mask = jax.ShapeDtypeStruct((50_000, 100), jnp.float32), jax.ShapeDtypeStruct((50_000,), bool)
+    patches = [jax.eval_shape(partial(make_patches, size=s, rank=5), points, mask) for s in (128, 128)]
+    memory = jax.jit(nearest_neighbor_in_patches).lower(points, points, *patches).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 200e6
