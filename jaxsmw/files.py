@@ -70,3 +70,16 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             raise InputError(
                 f"{path}: {place} is write-protected: choose another name or change permissions."
             )
+
+
+def make_directory(path: str | os.PathLike[str]) -> Path:
+    """The directory, made if it is not there yet."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be made a directory ({error.strerror}); choose another place."
+        ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be written to; choose another place or change its permissions.")
+    return Path(path)

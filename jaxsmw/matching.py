@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
@@ -24,7 +27,7 @@ from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature,
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
@@ -33,6 +36,8 @@ from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 
 logger = logging.getLogger("jaxsmw")
 
+Side = TypeVar("Side")
+Result = TypeVar("Result")
 Start = Literal["shot", "wks", "hks", "wavelet", "functional"]
 
 _SIGNATURES = {
@@ -197,9 +202,11 @@ def paired_spectra(
 
     **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
     """
-    spectrum_x, spectrum_y = (
-        compute_spectrum(mesh, number_of_eigenvectors, laplacian=laplacian) for mesh in (mesh_x, mesh_y)
+    pairs = _side_by_side(
+        lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian), mesh_x, mesh_y
     )
+    # Out here, as threads do not inherit `jax.enable_x64`.
+    spectrum_x, spectrum_y = as_spectrum(mesh_x, *pairs[0]), as_spectrum(mesh_y, *pairs[1])
     if not partial:
         return spectrum_x, spectrum_y
     larger = max(mesh_x.area, mesh_y.area)
@@ -264,6 +271,15 @@ def initial_map(
     return _extend_to_unused(mesh_x, start)
 
 
+def _side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
+    """The same for both shapes, in two threads with one core each; what takes long lets the other go on."""
+    # One limit around both: each would undo the other's at its end.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(2) as executor:
+        futures = [executor.submit(copy_context().run, compute, side) for side in (x, y)]
+        result_x, result_y = (future.result() for future in futures)
+    return result_x, result_y
+
+
 def _units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
     """What descriptors measure lengths in: the square root of each area, of a partial pair the larger's."""
     areas = mesh_x.area, mesh_y.area
@@ -275,9 +291,10 @@ def _shot(
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
     """SHOT of both meshes at one scale."""
     unit_x, unit_y = _units_of_length(mesh_x, mesh_y, partial)
-    return (
-        shot_descriptors(mesh_x, radius=SHOT_RADIUS * unit_x / mesh_x.area**0.5),
-        shot_descriptors(mesh_y, radius=SHOT_RADIUS * unit_y / mesh_y.area**0.5),
+    return _side_by_side(
+        lambda side: shot_descriptors(side[0], radius=SHOT_RADIUS * side[1] / side[0].area ** 0.5),
+        (mesh_x, unit_x),
+        (mesh_y, unit_y),
     )
 
 

@@ -38,10 +38,9 @@ from jaxsmw.evaluation.benchmark import Results, Settings, choose_pairs, run_ben
 from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
 from jaxsmw.evaluation.opponents import METHODS, Method, Published, suited_methods
 from jaxsmw.evaluation.workers import open_executor
-from jaxsmw.files import atomic_write
+from jaxsmw.files import atomic_write, make_directory
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
-from jaxsmw.report.summary import make_directory
 from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 
 FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")

@@ -47,13 +47,18 @@ def compute_spectrum(
 
     **Raises:** `InputError` if k does not fit the mesh or the eigenproblem cannot be solved accurately.
     """
-    eigenvalues, eigenvectors, areas = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian)
-    return Spectrum(
-        jnp.asarray(eigenvalues),
-        jnp.asarray(eigenvectors),
-        jnp.asarray(areas),
-        jnp.asarray(mesh.used_vertices),
-    )
+    return as_spectrum(mesh, *eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian))
+
+
+def as_spectrum(
+    mesh: Mesh,
+    eigenvalues: Float64[np.ndarray, " k"],
+    eigenvectors: Float64[np.ndarray, "n k"],
+    vertex_areas: Float64[np.ndarray, " n"],
+) -> Spectrum:
+    """The `eigenpairs` of a mesh for JAX, in its default float type."""
+    arrays = eigenvalues, eigenvectors, vertex_areas, mesh.used_vertices
+    return Spectrum(*(jnp.asarray(array) for array in arrays))
 
 
 def eigenpairs(

@@ -17,8 +17,9 @@ _DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
-# Vertex–neighbour pairs handled at once; bounds the memory at about 300 bytes per pair.
-_PAIRS_PER_BLOCK = 1_000_000
+# Vertex–neighbour pairs handled at once, at about 300 bytes per pair: few enough for their histograms to stay
+# in the cache.
+_PAIRS_PER_BLOCK = 100_000
 
 
 def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.ndarray, "n 352"]:

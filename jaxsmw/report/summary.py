@@ -15,9 +15,8 @@ from jaxtyping import Float, Float64
 
 from jaxsmw.core.filters import FilterBank
 from jaxsmw.core.refinement import WaveletPreservation
-from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
-from jaxsmw.files import atomic_write
+from jaxsmw.files import atomic_write, make_directory
 from jaxsmw.matching import Correspondence
 from jaxsmw.provenance import machine, versions
 from jaxsmw.report.figures import (
@@ -141,19 +140,6 @@ def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError
 def provenance() -> dict[str, str]:
     """What a figure depends on besides its input: versions and machine."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
-
-
-def make_directory(path: str | os.PathLike[str]) -> Path:
-    """The directory, made if it is not there yet."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be made a directory ({error.strerror}); choose another place."
-        ) from error
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"{path}: cannot be written to; choose another place or change its permissions.")
-    return Path(path)
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
