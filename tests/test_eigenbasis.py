@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from synthetic import grid_mesh, sphere_mesh
+from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
@@ -175,19 +175,48 @@ def test_robust_laplacian_with_unused_vertices():
 
 def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
     mesh = make_mesh(*sphere_mesh(3))
-    calls, lanczos = [], eigenbasis._lanczos
+    calls, arpack = [], eigenbasis._arpack
 
-    def sloppy(*arguments, tolerance, subspace):
-        calls.append(tolerance)
-        values, vectors = lanczos(*arguments, tolerance=tolerance, subspace=subspace)
-        return (values, vectors + 1e-3) if len(calls) == 1 else (values, vectors)
+    def sloppy(*arguments):
+        calls.append("lanczos")
+        values, vectors = arpack(*arguments)
+        return values, vectors + 1e-3
+
+    def spy(*arguments):
+        calls.append("arpack")
+        return arpack(*arguments)
 
     monkeypatch.setattr(eigenbasis, "_lanczos", sloppy)
+    monkeypatch.setattr(eigenbasis, "_arpack", spy)
     assert orthonormality(compute_spectrum(mesh, 20)) < 1e-9
-    assert calls == [1e-8, 0]
-    monkeypatch.setattr(eigenbasis, "_lanczos", lambda *a, **k: (np.ones(20), np.ones((642, 20))))
+    assert calls == ["lanczos", "arpack"]
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: (np.ones(20), np.ones((642, 20))))
     with pytest.raises(InputError, match="could not be computed accurately"):
         compute_spectrum(mesh, 20)
+
+
+@pytest.mark.parametrize("k", [2, 30, 100, 150])
+def test_no_copy_of_a_multiple_eigenvalue_is_missing(k):
+    """Those of an icosahedral sphere come in up to five copies, of which Lanczos knows one by itself."""
+    stiffness, areas = assemble_laplacian(make_mesh(*sphere_mesh(3)))
+    areas = areas / areas.sum()
+    exact = scipy.linalg.eigh(stiffness.toarray(), np.diag(areas), eigvals_only=True)
+    found = eigenpairs(make_mesh(*sphere_mesh(3)), k)[0]
+    np.testing.assert_allclose(found, exact[:k], rtol=1e-8, atol=1e-8)
+    assert not eigenbasis._misses_some(stiffness, areas, exact[:k])
+    if k > 30:
+        for lost in (5, k // 2):
+            assert eigenbasis._misses_some(stiffness, areas, np.delete(exact, lost)[:k])
+
+
+def test_a_plain_body_needs_no_second_attempt(monkeypatch):
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
+    stiffness, areas = assemble_laplacian(bumpy_mesh(4))
+    eigenvalues, _, _ = eigenpairs(bumpy_mesh(4), 100)
+    exact = scipy.linalg.eigh(
+        stiffness.toarray(), np.diag(areas / areas.sum()), eigvals_only=True, subset_by_index=(0, 99)
+    )
+    np.testing.assert_allclose(eigenvalues, exact, rtol=1e-9, atol=1e-9)
 
 
 def test_equals_the_reference_program(shared):

@@ -114,7 +114,9 @@ def test_history_and_early_stop(pair):
     result = match(*pair[:2], **OPTIONS, iterations=30, stop_when_unchanged=True, history=True)
     assert result.iterations < 30
     assert result.history.changed.shape == (30,)
-    assert result.history.changed[0] > 0.1 and result.history.changed[-1] == 0
+    done = result.iterations
+    assert result.history.changed[0] > 0.1 and result.history.changed[done - 1] == 0
+    assert np.isnan(result.history.changed[done:]).all()
     assert match(*pair[:2], **OPTIONS).history is None
 
 

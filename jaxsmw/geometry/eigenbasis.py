@@ -33,8 +33,9 @@ def compute_spectrum(
 
     Computed in float64 on the host, by shift-invert Lanczos with a fixed start vector, so that the same
     mesh gives the same Spectrum; each eigenvector's largest entry is positive. Connected components are
-    solved one by one and merged, so that no multiplicity between them is missed. Residuals and
-    orthonormality are checked. Results are kept on disk (`jaxsmw.geometry.cache`).
+    solved one by one and merged. Residuals and orthonormality are checked, and eigenvalues counted: where
+    a copy of a multiple one is missing, ARPACK takes over. Results are kept on disk
+    (`jaxsmw.geometry.cache`).
 
     **Arguments:**
 
@@ -118,10 +119,7 @@ def _solve_component(
     if n <= _DENSE or 3 * k > n:
         attempts = [lambda: _dense(stiffness, areas, k)]
     else:
-        attempts = [
-            lambda: _lanczos(stiffness, areas, k, tolerance=1e-8, subspace=k + k // 2 + 10),
-            lambda: _lanczos(stiffness, areas, k, tolerance=0.0, subspace=min(n, 3 * k + 50)),
-        ]
+        attempts = [lambda: _lanczos(stiffness, areas, k), lambda: _arpack(stiffness, areas, k)]
     failure = ""
     for attempt in attempts:
         try:
@@ -150,26 +148,98 @@ def _dense(stiffness: sp.csc_matrix, areas: np.ndarray, k: int) -> tuple[np.ndar
     return eigenvalues, scale[:, None] * eigenvectors
 
 
-def _lanczos(
-    stiffness: sp.csc_matrix, areas: np.ndarray, k: int, *, tolerance: float, subspace: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lanczos on A^1/2 (W - shift A)^-1 A^1/2, whose largest eigenvalues are 1 / (lambda - shift)."""
+class _Inverse:
+    """A^1/2 (W - shift A)^-1 A^1/2, symmetric, with eigenvalues 1 / (lambda - shift)."""
+
+    def __init__(self, stiffness: sp.csc_matrix, areas: np.ndarray, shift: float = _SHIFT):
+        # Without symmetric mode this ordering would be slower by orders of magnitude.
+        self.factor = splu(
+            (stiffness - shift * sp.diags(areas)).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        self.root = np.sqrt(areas)
+
+    def __call__(self, vector: np.ndarray) -> np.ndarray:
+        return self.root * self.factor.solve(self.root * vector)
+
+
+def _lanczos(stiffness: sp.csc_matrix, areas: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The Lanczos method on `_Inverse`, from one vector until all k have settled, without restarts.
+
+    About 2.3 k products suffice; keeping every vector orthogonal to all before it costs less than ARPACK's
+    restarts. What one starting vector could miss, copies of a multiple eigenvalue, is counted.
+
+    **Raises:** `RuntimeError` if they do not settle, or some are missing.
+    """
+    n, most = len(areas), min(len(areas) - 1, 4 * k + 50)
+    inverse = _Inverse(stiffness, areas)
+    vectors = np.empty((most + 1, n))
+    vectors[0] = np.random.default_rng(0).standard_normal(n)
+    vectors[0] /= np.linalg.norm(vectors[0])
+    diagonal, beside = np.zeros(most), np.zeros(most)
+    look = 2 * k
+    for last in range(most):
+        following = inverse(vectors[last])
+        diagonal[last] = vectors[last] @ following
+        following -= diagonal[last] * vectors[last]
+        if last:
+            following -= beside[last - 1] * vectors[last - 1]
+        known = vectors[: last + 1]
+        following -= (known @ following) @ known
+        beside[last] = np.linalg.norm(following)
+        if beside[last] <= np.finfo(float).eps * diagonal[0]:
+            raise RuntimeError("the Lanczos vectors span an invariant subspace")
+        vectors[last + 1] = following / beside[last]
+        if last + 1 == min(look, most):
+            wanted = (last + 1 - k, last)
+            inverted, combinations = scipy.linalg.eigh_tridiagonal(
+                diagonal[: last + 1], beside[:last], select="i", select_range=wanted
+            )
+            if (beside[last] * np.abs(combinations[-1]) <= _SETTLED * np.abs(inverted)).all():
+                break
+            look += max(5, k // 20)
+    else:
+        raise RuntimeError("the Lanczos vectors have not settled")
+    # The largest first, which belong to the smallest eigenvalues.
+    eigenvalues = 1 / inverted[::-1] + _SHIFT
+    eigenvectors = vectors[: last + 1].T @ combinations[:, ::-1]
+    if _misses_some(stiffness, areas, eigenvalues):
+        raise RuntimeError("a multiple eigenvalue lacks some of its eigenvectors")
+    return eigenvalues, eigenvectors / inverse.root[:, None]
+
+
+# Relative residual of the inverse at which an eigenvector is settled.
+_SETTLED = 1e-9
+
+
+def _misses_some(stiffness: sp.csc_matrix, areas: np.ndarray, eigenvalues: np.ndarray) -> bool:
+    """Whether there are more eigenvalues than those found, below the widest gap near their end.
+
+    As many as W - shift A has negative pivots lie below the shift (Sylvester's law of inertia).
+    """
+    if len(eigenvalues) == 1:
+        return False
+    gaps = np.diff(eigenvalues[-_NEAR_END:])
+    below = len(eigenvalues) - len(gaps) + int(np.argmax(gaps))
+    shift = float(eigenvalues[below - 1 : below + 1].mean())
+    return int((_Inverse(stiffness, areas, shift).factor.U.diagonal() < 0).sum()) != below
+
+
+_NEAR_END = 12
+
+
+def _arpack(stiffness: sp.csc_matrix, areas: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same by ARPACK, which restarts and takes all the digits it can have."""
     n = len(areas)
-    # Symmetric mode with diagonal pivots: W - shift A is positive definite, and without it this ordering
-    # would be slower by orders of magnitude.
-    factor = splu(
-        (stiffness - _SHIFT * sp.diags(areas)).tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    root = np.sqrt(areas)
-    inverse = LinearOperator((n, n), matvec=lambda u: root * factor.solve(root * u.ravel()), dtype=float)
+    inverse = _Inverse(stiffness, areas)
+    operator = LinearOperator((n, n), matvec=lambda vector: inverse(vector.ravel()), dtype=float)
     start = np.random.default_rng(0).standard_normal(n)
-    inverted, vectors = eigsh(inverse, k, which="LM", ncv=min(n, subspace), tol=tolerance, v0=start)
+    inverted, vectors = eigsh(operator, k, which="LM", ncv=min(n, 3 * k + 50), tol=0, v0=start)
     eigenvalues = 1 / inverted + _SHIFT
     order = np.argsort(eigenvalues, kind="stable")
-    return eigenvalues[order], vectors[:, order] / root[:, None]
+    return eigenvalues[order], vectors[:, order] / inverse.root[:, None]
 
 
 def _check(
