@@ -194,7 +194,9 @@ def search_in_patches(
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
     center_norms = jnp.sum(boxes.center**2, axis=1)
     low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    precision = d * jnp.finfo(queries.dtype).eps
+    # Sums of d products, and the dozen operations that are made of them, each rounded.
+    precision = 2 * (d + 12) * jnp.finfo(queries.dtype).eps
+    radius = boxes.radius * (1 + precision)
     steps = -(-patches // _GROUP)
 
     def search(patch: tuple[Array, Array]) -> tuple[Int32[Array, " block"], Int32[Array, ""]]:
@@ -209,7 +211,7 @@ def search_in_patches(
             outside = along[i] - jnp.clip(along[i], low[i], high[i])
             squared = squared + (outside**2 - along[i] ** 2)
         squared = jnp.where(boxes.counts[:, None], squared, jnp.inf)
-        bounds = jnp.sqrt(jnp.maximum(squared - precision * norms, 0)) - boxes.radius[:, None]
+        bounds = jnp.sqrt(jnp.maximum(squared - precision * norms, 0)) - radius[:, None]
 
         smallest = jnp.min(squared, axis=0)  # and then where, which is three times as fast as argmin
         promising = jnp.max(jnp.where(squared == smallest[None, :], jnp.arange(patches)[:, None], 0), axis=0)
