@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_writable
+from jaxsmw.files import atomic_write, check_writable, make_directory
 
 if TYPE_CHECKING:
     from jaxsmw.core.filters import FilterBank
@@ -370,7 +370,6 @@ def _benchmark(options: argparse.Namespace) -> None:
     from jaxsmw.evaluation.datasets import open_data_set
     from jaxsmw.evaluation.opponents import find_methods, suited_methods
     from jaxsmw.evaluation.workers import open_executor
-    from jaxsmw.files import make_directory
     from jaxsmw.report.tables import markdown_table, write_tables
 
     data_set = open_data_set(options.data)
@@ -395,7 +394,6 @@ def _demo(options: argparse.Namespace) -> None:
 
     check_drawable()
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
-    from jaxsmw.files import make_directory
     from jaxsmw.geometry.creature import creature_pair
     from jaxsmw.geometry.mesh_files import write_mesh
 
@@ -423,7 +421,6 @@ def _match(options: argparse.Namespace) -> None:
 
         check_drawable()
     from jaxsmw.evaluation.ground_truth import read_ground_truth, write_pointwise_map
-    from jaxsmw.files import make_directory
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     truth = None

@@ -11,6 +11,16 @@ from jaxsmw.core.search import make_patches, nearest_neighbor, nearest_neighbor_
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 
 
+def check_against_brute_force(search, m, n, d, *, draws):
+    search = jax.jit(search)
+    for seed in range(draws):
+        generator = np.random.default_rng(seed)
+        queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
+        nearest = search(jnp.asarray(queries), jnp.asarray(database))
+        assert nearest.dtype == jnp.int32
+        np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
+
+
 # Around the sizes of blocks (128) and chunks (64).
 @pytest.mark.parametrize(
     ("m", "n", "d"),
@@ -28,13 +38,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
     ],
 )
 def test_equals_brute_force(m, n, d):
-    search = jax.jit(nearest_neighbor)
-    for seed in range(10):
-        generator = np.random.default_rng(seed)
-        queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
-        nearest = search(jnp.asarray(queries), jnp.asarray(database))
-        assert nearest.dtype == jnp.int32
-        np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
+    check_against_brute_force(nearest_neighbor, m, n, d, draws=10)
 
 
 def test_ties_go_to_the_lowest_index():
@@ -100,14 +104,9 @@ def test_search_never_stores_all_distances():
 
 
 def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_mask=None):
-    masks = (query_mask, database_mask)
-    masks = [
-        jnp.ones(len(rows), bool) if mask is None else mask
-        for mask, rows in zip(masks, (queries, database), strict=True)
-    ]
     patches = (
-        make_patches(rows, mask, size=size, rank=rank)
-        for rows, mask in zip((queries, database), masks, strict=True)
+        make_patches(rows, jnp.ones(len(rows), bool) if mask is None else mask, size=size, rank=rank)
+        for rows, mask in ((queries, query_mask), (database, database_mask))
     )
     return nearest_neighbor_in_patches(queries, database, *patches)
 
@@ -117,13 +116,7 @@ def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_
 )
 def test_patches_find_the_same_anywhere(m, n, d):
     """Also where they have nothing to leave out: points spread evenly in all dimensions."""
-    search = jax.jit(in_patches)
-    for seed in range(5):
-        generator = np.random.default_rng(seed)
-        queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
-        nearest = search(jnp.asarray(queries), jnp.asarray(database))
-        assert nearest.dtype == jnp.int32
-        np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
+    check_against_brute_force(in_patches, m, n, d, draws=5)
 
 
 @pytest.fixture(scope="module")

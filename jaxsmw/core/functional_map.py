@@ -36,25 +36,21 @@ Parseval frame that is filtering alone, eq. (8). `docs/frames.md` derives all of
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
-from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmw.core.frames import frame_function
+from jaxsmw.core.products import product
 from jaxsmw.core.spectrum import Spectrum
 
 Convention = Literal["pullback", "pushforward"]
 PseudoInverse = Literal["area", "least_squares"]
 Norm = Literal["area", "frobenius"]
-
-# GPUs would otherwise multiply in less than float32, and singular systems would pass for regular ones.
-_product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
@@ -69,7 +65,7 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     """
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
-    gram = _product(spectrum.eigenvectors.T, spectrum.eigenvectors)
+    gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)
     return jsp.linalg.cho_solve(jsp.linalg.cho_factor(gram), spectrum.eigenvectors.T).T
 
 
@@ -107,15 +103,15 @@ def project_matches(
     """`encode` with the dual eigenvectors of the shape that C leads to already at hand."""
     # A padded vertex of X has a zero row on its side of the product, whatever its entry of T says.
     if convention == "pullback":
-        return _product(dual_out.T, eigenvectors_in[pointwise_map])
-    return _product(dual_out[pointwise_map].T, eigenvectors_in)
+        return product(dual_out.T, eigenvectors_in[pointwise_map])
+    return product(dual_out[pointwise_map].T, eigenvectors_in)
 
 
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
     """All scales in one: `sum_l g_l(Lambda_out) C g_l(Lambda_in)` is `C` times this kernel, elementwise."""
-    return _product(responses_out.T, responses_in)
+    return product(responses_out.T, responses_in)
 
 
 class QuadraticEnergy(eqx.Module):
@@ -142,9 +138,7 @@ class QuadraticEnergy(eqx.Module):
 
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
         """The energy of a functional map; non-negative up to rounding, being a difference of large sums."""
-        return (
-            jnp.sum(functional_map * (_product(functional_map, self.gram) - 2 * self.cross)) + self.constant
-        )
+        return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
 
     def __add__(self, other: QuadraticEnergy) -> QuadraticEnergy:
         return QuadraticEnergy(
@@ -224,7 +218,7 @@ def wavelet_energy(
             fed = fed * areas_x
             returned = jnp.where(spectrum_x.mask[:, None], returned, 0)
     return QuadraticEnergy(
-        _product((weights * fed).T, fed) * multiscale_kernel(responses_in, responses_in),
-        _product((weights * returned).T, fed) * multiscale_kernel(responses_out, responses_in),
+        product((weights * fed).T, fed) * multiscale_kernel(responses_in, responses_in),
+        product((weights * returned).T, fed) * multiscale_kernel(responses_out, responses_in),
         jnp.sum(weights * returned**2, axis=0) @ frame_function(responses_out),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,8 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-# GPUs would otherwise multiply in less than float32, and the ranking with it.
-_product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+from jaxsmw.core.products import product
 
 # Queries scored at once, and database rows per chunk. Measured on two CPU cores (scripts/benchmark_speed.py):
 # a block of scores has to stay in the cache, and a maximum over a chunk vectorises where an argmax does not.
@@ -49,23 +47,39 @@ def nearest_neighbor(
     rows = jnp.pad(database, ((0, chunks * _CHUNK - n), (0, 0)))
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
-        products = _product(rows, block.T)
+        products = product(rows, block.T)
         # Queries last: a maximum over chunks then runs over them side by side.
         scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, _BLOCK)
         chunk_scores = jnp.max(scores, axis=1)
-        first = jnp.argmax(chunk_scores, axis=0)
-        is_first = jnp.arange(chunks)[:, None] == first[None, :]
-        second = jnp.argmax(jnp.where(is_first, -jnp.inf, chunk_scores), axis=0)
-        best_chunks = jnp.stack([first, second])
+        best_chunks = _two_best(chunk_scores)
         chunk_rows = scores[best_chunks, :, jnp.arange(_BLOCK)[None, :]]
         candidates = best_chunks * _CHUNK + jnp.argmax(chunk_rows, axis=2)
-        distances = jnp.sum((block[None, :, :] - rows[candidates]) ** 2, axis=2)
-        distances = jnp.where(jnp.isinf(half_norms[candidates]), jnp.inf, distances)
-        nearest = jnp.min(distances, axis=0, keepdims=True)
-        return jnp.min(jnp.where(distances == nearest, candidates, n), axis=0).astype(jnp.int32)
+        masked = jnp.isinf(half_norms[candidates])
+        return _nearest(block, rows[candidates], candidates, masked, n).astype(jnp.int32)
 
     padded = jnp.pad(queries, ((0, blocks * _BLOCK - m), (0, 0)))
     return lax.map(search, padded.reshape(blocks, _BLOCK, d)).reshape(-1)[:m]
+
+
+def _two_best(scores: Float[Array, "s block"]) -> Int[Array, "2 block"]:
+    """Which of some scores are the largest and the second largest of each query."""
+    first = jnp.argmax(scores, axis=0)
+    is_first = jnp.arange(scores.shape[0])[:, None] == first[None, :]
+    return jnp.stack([first, jnp.argmax(jnp.where(is_first, -jnp.inf, scores), axis=0)])
+
+
+def _nearest(
+    queries: Float[Array, "block d"],
+    candidates: Float[Array, "c block d"],
+    rows: Int[Array, "c block"],
+    masked: Bool[Array, "c block"],
+    n: int,
+) -> Int[Array, " block"]:
+    """The row of each query's nearest candidate by true distance, the lowest of equals; n if all are NaN."""
+    distances = jnp.sum((queries[None, :, :] - candidates) ** 2, axis=2)
+    distances = jnp.where(masked, jnp.inf, distances)
+    nearest = jnp.min(distances, axis=0, keepdims=True)
+    return jnp.min(jnp.where(distances == nearest, rows, n), axis=0)
 
 
 class Patches(eqx.Module):
@@ -125,10 +139,10 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     _, deviations = _centered(points[rows], valid)
-    products = _product(deviations, jnp.swapaxes(deviations, 1, 2))
+    products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 
     def settle(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
-        return _orthonormal(_product(variations, products))
+        return _orthonormal(product(variations, products))
 
     # The first coordinate of a surface, constant, says nothing of where on a patch a point is: it comes last.
     d = points.shape[1]
@@ -202,7 +216,7 @@ def search_in_patches(
     def search(patch: tuple[Array, Array]) -> tuple[Int32[Array, " block"], Int32[Array, ""]]:
         block, counts = queries[patch[0]], patch[1]
         each = jnp.arange(block.shape[0])
-        products = _product(axes, block.T)
+        products = product(axes, block.T)
         norms = center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
         squared = norms - 2 * products[rank * patches :]
         along = []
@@ -227,12 +241,9 @@ def search_in_patches(
             group = lax.dynamic_slice(listed, (state.step * _GROUP,), (_GROUP,))
             points = boxes.points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
             half_norms = boxes.half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
-            scores = _product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
+            scores = product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
             merged = jnp.concatenate([state.scores, jnp.max(scores, axis=1)])
-            first = jnp.argmax(merged, axis=0)
-            is_first = jnp.arange(2 + _GROUP)[:, None] == first[None, :]
-            second = jnp.argmax(jnp.where(is_first, -jnp.inf, merged), axis=0)
-            best = jnp.stack([first, second])
+            best = _two_best(merged)
             fresh = jnp.maximum(best - 2, 0)
             rows = group[fresh] * size + jnp.argmax(scores[fresh, :, each[None, :]], axis=2).astype(jnp.int32)
             rows = jnp.where(best < 2, jnp.take_along_axis(state.rows, jnp.minimum(best, 1), axis=0), rows)
@@ -243,11 +254,8 @@ def search_in_patches(
         number = jnp.sum(needed, dtype=jnp.int32)
         found = lax.while_loop(lambda state: state.step * _GROUP < number, look, start)
         points = boxes.points.reshape(patches * size, d)[found.rows]
-        distances = jnp.sum((block[None, :, :] - points) ** 2, axis=2)
-        distances = jnp.where(jnp.isinf(found.scores), jnp.inf, distances)
         vertices = database_patches.rows.reshape(-1)[found.rows]
-        nearest = jnp.min(distances, axis=0, keepdims=True)
-        return jnp.min(jnp.where(distances == nearest, vertices, database.shape[0]), axis=0), number
+        return _nearest(block, points, vertices, jnp.isinf(found.scores), database.shape[0]), number
 
     found, numbers = lax.map(search, (query_patches.rows, query_patches.mask))
     # Padding and masked queries are written nowhere.
@@ -278,9 +286,9 @@ def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
     points = database[patches.rows]
     half_norms = jnp.where(patches.mask, 0.5 * jnp.sum(points**2, axis=2), jnp.inf)
     center, deviations = _centered(points, patches.mask)
-    axes = _orthonormal(_product(patches.variations, deviations))
-    local = _product(deviations, jnp.swapaxes(axes, 1, 2))
-    beside = deviations - _product(local, axes)
+    axes = _orthonormal(product(patches.variations, deviations))
+    local = product(deviations, jnp.swapaxes(axes, 1, 2))
+    beside = deviations - product(local, axes)
     radius = jnp.sqrt(jnp.max(jnp.sum(beside**2, axis=2), axis=1))
     low, high = jnp.min(local, axis=1), jnp.max(local, axis=1)
     return _Boxes(points, half_norms, center, axes, local, low, high, radius, jnp.any(patches.mask, axis=1))

@@ -275,7 +275,7 @@ def _run(
     return {name: failed[name] for name in tasks if name in failed}
 
 
-def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int = MOST_EIGENVECTORS) -> list[Row]:
+def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
     """Precompute what all pairs of a shape share, and note how long each part took."""
     name, file = shape
     with recomputing():
@@ -290,9 +290,7 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int = MOST_EI
     return [{"shape": name, "digest": _digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(
-    task: Task, settings: Settings, number_of_eigenvectors: int = MOST_EIGENVECTORS
-) -> list[Row]:
+def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
     """Match a pair with every method and measure the maps; a row for each."""
     data = task.pair
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)

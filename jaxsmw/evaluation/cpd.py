@@ -37,12 +37,10 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.filters import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.products import product
 from jaxsmw.core.refinement import Problem, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
-
-# GPUs would otherwise multiply in less than float32, and differences of squares with it.
-_product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 # Data points whose probabilities are in memory at once.
 _BLOCK = 128
@@ -128,9 +126,9 @@ def kernel_factor(
     ) -> tuple[Float[Array, "rank n"], Float[Array, " n"]]:
         rows, unexplained = state
         pivot = jnp.argmax(unexplained)
-        half_distances = half_norms + half_norms[pivot] - _product(points, points[pivot])
+        half_distances = half_norms + half_norms[pivot] - product(points, points[pivot])
         kernel = jnp.exp(-jnp.maximum(half_distances, 0) / width**2)
-        row = kernel - _product(rows[:, pivot], rows)
+        row = kernel - product(rows[:, pivot], rows)
         row = row / jnp.sqrt(jnp.maximum(unexplained[pivot], rounding))
         row = jnp.where(unexplained > rounding, row, 0)
         return rows.at[step].set(row), (unexplained - row**2).at[pivot].set(0)
@@ -225,7 +223,7 @@ def _drift(
     d, points = data.shape[1], jnp.sum(data_mask).astype(x.dtype)
 
     def step(state: _State) -> _State:
-        moved = y + _product(factor, state.coefficients)
+        moved = y + product(factor, state.coefficients)
         expected = _expectation(x, data_mask, moved, centroids_mask, state.variance, outliers)
         objective = (
             stiffness / 2 * jnp.sum(state.coefficients**2)
@@ -235,7 +233,7 @@ def _drift(
         coefficients = _maximization(expected, y, factor, stiffness * state.variance)
         return _State(
             coefficients,
-            _variance(expected, x, y + _product(factor, coefficients)),
+            _variance(expected, x, y + product(factor, coefficients)),
             objective,
             change=jnp.abs(1 - state.objective / objective),
             iterations=state.iterations + 1,
@@ -255,7 +253,7 @@ def _drift(
         iterations=jnp.asarray(0, jnp.int32),
     )
     end = lax.while_loop(goes_on, step, start)
-    moved = mean[None, :] + scale * (y + _product(factor, end.coefficients))
+    moved = mean[None, :] + scale * (y + product(factor, end.coefficients))
     return Drift(moved, end.variance, end.iterations)
 
 
@@ -309,7 +307,7 @@ def _expectation(
     ) -> tuple[Float[Array, "n extended"], tuple[Float[Array, " block"], Float[Array, " block"]]]:
         points, counts = block
         half_distances = (
-            half_norms[None, :] + 0.5 * jnp.sum(points**2, axis=1)[:, None] - _product(points, centroids.T)
+            half_norms[None, :] + 0.5 * jnp.sum(points**2, axis=1)[:, None] - product(points, centroids.T)
         )
         logs = -jnp.maximum(half_distances, 0) / variance
         shift = jnp.maximum(jnp.max(logs, axis=1), log_noise)
@@ -317,7 +315,7 @@ def _expectation(
         explained = jnp.sum(likelihoods, axis=1)
         total = explained + jnp.exp(log_noise - shift)
         rows = jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1) * (counts / total)[:, None]
-        return moments + _product(likelihoods.T, rows), (
+        return moments + product(likelihoods.T, rows), (
             counts * explained / total,
             counts * (shift + jnp.log(total)),
         )
@@ -336,8 +334,8 @@ def _maximization(
 ) -> Float[Array, "rank d"]:
     """The M-step: the displacement, as coefficients of the kernel's factor."""
     weights = expected.per_centroid[:, None]
-    gram = _product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
-    wanted = _product(factor.T, expected.weighted_data - weights * centroids)
+    gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
+    wanted = product(factor.T, expected.weighted_data - weights * centroids)
     return jsp.linalg.cho_solve(jsp.linalg.cho_factor(gram), wanted)
 
 
