@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse as sp
 from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 
 from jaxsmw.errors import InputError
@@ -177,7 +178,7 @@ def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
     mesh = make_mesh(*sphere_mesh(3))
     calls, arpack = [], eigenbasis._arpack
 
-    def sloppy(*arguments):
+    def sloppy(*arguments, **_):
         calls.append("lanczos")
         values, vectors = arpack(*arguments)
         return values, vectors + 1e-3
@@ -195,18 +196,32 @@ def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
         compute_spectrum(mesh, 20)
 
 
-@pytest.mark.parametrize("k", [2, 30, 100, 150])
-def test_no_copy_of_a_multiple_eigenvalue_is_missing(k):
-    """Those of an icosahedral sphere come in up to five copies, of which Lanczos knows one by itself."""
+@pytest.mark.parametrize("k", [1, 2, 5, 30, 50])
+def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
+    """Those of an icosahedral sphere come in up to five copies, of which one start knows one."""
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
     stiffness, areas = assemble_laplacian(make_mesh(*sphere_mesh(3)))
-    areas = areas / areas.sum()
-    exact = scipy.linalg.eigh(stiffness.toarray(), np.diag(areas), eigvals_only=True)
+    mass = sp.diags(areas / areas.sum()).tocsc()
+    exact = scipy.linalg.eigh(stiffness.toarray(), mass.toarray(), eigvals_only=True)
     found = eigenpairs(make_mesh(*sphere_mesh(3)), k)[0]
     np.testing.assert_allclose(found, exact[:k], rtol=1e-8, atol=1e-8)
-    assert not eigenbasis._misses_some(stiffness, areas, exact[:k])
+    assert not eigenbasis._misses_some(stiffness, mass, exact[:k])
     if k > 30:
         for lost in (5, k // 2):
-            assert eigenbasis._misses_some(stiffness, areas, np.delete(exact, lost)[:k])
+            assert eigenbasis._misses_some(stiffness, mass, np.delete(exact, lost)[:k])
+
+
+@pytest.mark.parametrize("length", [0.01, 1, 1000])
+def test_shapes_far_from_weyls_law(length, monkeypatch):
+    """On a thin strip eigenvalues grow with the square of their number; the shift has to find its place."""
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
+    vertices, faces = grid_mesh(12, 60)
+    vertices = (vertices + 0.003 * np.random.default_rng(0).normal(size=vertices.shape)) * [1, length, 1]
+    mesh = make_mesh(vertices, faces)
+    stiffness, areas = assemble_laplacian(mesh)
+    exact = scipy.linalg.eigh(stiffness.toarray(), np.diag(areas / areas.sum()), eigvals_only=True)
+    eigenvalues = eigenpairs(mesh, 40)[0]
+    np.testing.assert_allclose(eigenvalues, np.maximum(exact[:40], 0), rtol=1e-8, atol=1e-7)
 
 
 def test_a_plain_body_needs_no_second_attempt(monkeypatch):
@@ -217,6 +232,69 @@ def test_a_plain_body_needs_no_second_attempt(monkeypatch):
         stiffness.toarray(), np.diag(areas / areas.sum()), eigvals_only=True, subset_by_index=(0, 99)
     )
     np.testing.assert_allclose(eigenvalues, exact, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("numbering", ["as subdivided", "at random"])
+def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
+    """Eigenvalues from above, within 2 %; orthonormal to rounding; the same again; nearly the same span."""
+    mesh = bumpy_mesh(5)
+    if numbering == "at random":
+        order = np.random.default_rng(1).permutation(len(mesh.vertices))
+        mesh = make_mesh(mesh.vertices[order], np.argsort(order)[mesh.faces])
+    k = 60
+    exact, approximate = (eigenpairs(mesh, k, eigensolver=solver) for solver in ("exact", "approximate"))
+    assert approximate[0][0] == 0
+    excess = approximate[0][1:] / exact[0][1:] - 1
+    assert excess.min() > 0 and excess.max() < 0.02
+    weighted = exact[2][:, None] * approximate[1]
+    np.testing.assert_allclose(approximate[1].T @ weighted, np.eye(k), atol=1e-10)
+    # The last of them mix with neighbours beyond the end.
+    inside = weighted.T @ exact[1][:, : k - 5]
+    assert np.sqrt(1 - np.sum(inside**2, axis=0)).max() < 0.08
+    np.testing.assert_array_equal(approximate[1], eigenpairs(mesh, k, eigensolver="approximate")[1])
+
+
+@pytest.mark.parametrize("subdivisions", [4, 5])
+def test_larger_cells_are_smoothed_longer(subdivisions):
+    """With four times the vertices, at the same number of dimensions, errors stay what they are."""
+    mesh = bumpy_mesh(subdivisions)
+    exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
+    np.testing.assert_allclose(approximate, exact, rtol=0.02)
+
+
+def test_a_multiple_eigenvalue_of_a_subspace_is_found_whole():
+    exact, approximate = (
+        eigenpairs(make_mesh(*sphere_mesh(5)), 49, eigensolver=s)[0] for s in ("exact", "approximate")
+    )
+    np.testing.assert_allclose(approximate, exact, rtol=0.02)
+
+
+def test_which_eigensolver_is_used(monkeypatch):
+    used = []
+
+    def spy(name):
+        solver = getattr(eigenbasis, name)
+
+        def called(*arguments, **options):
+            used.append(name)
+            return solver(*arguments, **options)
+
+        monkeypatch.setattr(eigenbasis, name, called)
+
+    spy("_approximate")
+    spy("_lanczos")
+    mesh = bumpy_mesh(4)
+    eigenpairs(mesh, 20)
+    monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
+    eigenpairs(mesh, 20, eigensolver="exact")
+    # Too small a mesh for so many: exact whatever was asked for.
+    eigenpairs(mesh, 200, eigensolver="approximate")
+    assert used == ["_lanczos", "_lanczos", "_lanczos"]
+    eigenpairs(mesh, 20)
+    assert used[3:] == ["_approximate", "_lanczos"]
+    # Here the type checker is the first to complain.
+    with pytest.raises(Exception, match="fast"):
+        eigenpairs(mesh, 20, eigensolver="fast")
 
 
 def test_equals_the_reference_program(shared):
