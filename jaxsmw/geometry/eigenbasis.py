@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from typing import Literal, get_args
 
@@ -256,44 +257,50 @@ def _lanczos(
     # The first eigenvector, which is known.
     vectors[0] = 1 / np.sqrt(mass.sum())
     projected = np.zeros((most + 1, most + 1))
-    # Where a sequence of vectors was left, and the length of what would have followed.
-    ends: list[tuple[int, float]] = []
-    last, look, following = 0, k + k // 3, _another(generator, inverse, mass, vectors[:1])
-    while last < most:
+    # What comes next: of which vector it is the image, and what of that is orthogonal to all before.
+    pending = deque([(0, _another(generator, inverse, mass, vectors[:1]))])
+    last, look = 0, k + k // 3
+    while last < most and pending:
+        _, following = pending.popleft()
+        if last >= 1 and len(pending):  # then others have come in between
+            following -= (vectors[: last + 1] @ (mass @ following)) @ vectors[: last + 1]
+        length = np.sqrt(following @ (mass @ following))
+        if length <= np.finfo(float).eps * np.abs(projected[1, 1]):
+            continue
         last += 1
-        vectors[last] = following
-        known, near = vectors[: last + 1], slice(max(0, last - 1), last + 1)
+        vectors[last] = following / length
+        known, near = vectors[: last + 1], slice(max(0, last - 1 - len(pending)), last + 1)
         following = inverse.solve(mass @ vectors[last])
-        # First what is large, that of the last two vectors, then what is left: in one go it would swamp that.
+        # First what is large, that of the last vectors, then what is left: in one go it would swamp that.
         large = vectors[near] @ (mass @ following)
         following -= large @ vectors[near]
         overlaps = known @ (mass @ following)
         following -= overlaps @ known
         overlaps[near] += large
         projected[: last + 1, last] = projected[last, : last + 1] = overlaps
-        length = float(np.sqrt(following @ (mass @ following)))
-        ended = length <= np.finfo(float).eps * np.abs(projected[1, 1])
-        if last >= min(look, most):
-            look += max(5, k // 20)
-            inverted, combinations = scipy.linalg.eigh(projected[1 : last + 1, 1 : last + 1])
-            eigenvalues = shift + 1 / inverted
-            # Below zero are images of what is beyond all wanted.
-            wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
-            inverted, combinations = inverted[wanted], combinations[:, wanted]
-            residuals = sum((left * combinations[at - 1]) ** 2 for at, left in [*ends, (last, length)])
-            if (residuals <= (tolerance * inverted) ** 2).all():
-                eigenvalues = np.append(0.0, eigenvalues[wanted])
-                if not _misses_some(stiffness, mass, eigenvalues):
-                    eigenvectors = np.empty((n, k))
-                    eigenvectors[:, :1] = vectors[:1].T
-                    eigenvectors[:, 1:] = vectors[1 : last + 1].T @ combinations
-                    return eigenvalues, eigenvectors
-                look, ended = last + k // 2, True
-        if ended:
-            ends.append((last, length))
-            following = _another(generator, inverse, mass, known)
-        else:
-            following /= length
+        pending.append((last, following))
+        if last < look and last < most:
+            continue
+        look += max(5, k // 20)
+        inverted, combinations = scipy.linalg.eigh(projected[1 : last + 1, 1 : last + 1])
+        eigenvalues = shift + 1 / inverted
+        # Below zero are images of what is beyond all wanted.
+        wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
+        inverted, combinations = inverted[wanted], combinations[:, wanted]
+        residuals = sum(
+            np.sqrt(left @ (mass @ left)) * np.abs(combinations[image - 1])
+            for image, left in pending
+            if image
+        )
+        if (residuals <= tolerance * np.abs(inverted)).all():
+            eigenvalues = np.append(0.0, eigenvalues[wanted])
+            if not _misses_some(stiffness, mass, eigenvalues):
+                eigenvectors = np.empty((n, k))
+                eigenvectors[:, :1] = vectors[:1].T
+                eigenvectors[:, 1:] = vectors[1 : last + 1].T @ combinations
+                return eigenvalues, eigenvectors
+            pending.append((0, _another(generator, inverse, mass, known)))
+            look = last + k // 2
     raise RuntimeError("the Lanczos vectors have not settled")
 
 
