@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.pointwise_map import decode
+from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
@@ -31,7 +31,7 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 
 logger = logging.getLogger("jaxsmw")
@@ -232,30 +232,33 @@ def initial_map(
 ) -> Int64[np.ndarray, " m"]:
     """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
 
-    The spectra are those of `paired_spectra`, and `partial` is what was said there.
+    The spectra are those of `paired_spectra`, and `partial` is what was said there. On a mesh of more than
+    15 000 vertices descriptors are computed and compared at about 10 000 evenly spread ones, and every other
+    vertex of X takes the match of the nearest of them.
 
     **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
     """
-    if isinstance(init, str):
-        if init == "functional":
-            shot = _shot(mesh_x, mesh_y, partial)
-            return _extend_to_unused(mesh_x, _functional_start(mesh_x, mesh_y, spectrum_x, spectrum_y, shot))
-        if init == "shot":
-            features_x, features_y = _shot(mesh_x, mesh_y, partial)
-        elif init in _SIGNATURES:
-            features_x, features_y = (np.asarray(_SIGNATURES[init](s)) for s in (spectrum_x, spectrum_y))
-        else:
-            raise InputError(
-                f"{init!r} is no initial map: choose shot, {', '.join(_SIGNATURES)}, functional, landmarks "
-                "or a map."
-            )
-    else:
+    if not isinstance(init, str):
         given = np.asarray(init)
         if not np.issubdtype(given.dtype, np.integer):
             raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
         if given.ndim == 1:
             return _extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
-        features_x, features_y = _landmark_features(given, mesh_x, mesh_y, partial)
+    samples_x, samples_y = _side_by_side(_compared, mesh_x, mesh_y)
+    x, y = _Thinned.make(mesh_x, samples_x, spectrum_x), _Thinned.make(mesh_y, samples_y, spectrum_y)
+    if not isinstance(init, str):
+        features_x, features_y = _landmark_features(given, x, y, partial)
+    elif init == "shot":
+        features_x, features_y = _shot(x, y, partial)
+    elif init in _SIGNATURES:
+        features_x, features_y = (np.asarray(_SIGNATURES[init](side.spectrum)) for side in (x, y))
+    elif init == "functional":
+        features_x, features_y = _functional_embeddings(x, y, _shot(x, y, partial))
+    else:
+        raise InputError(
+            f"{init!r} is no initial map: choose shot, {', '.join(_SIGNATURES)}, functional, landmarks "
+            "or a map."
+        )
     if not np.isfinite(features_x).all() or not np.isfinite(features_y).all():
         raise InputError(
             f"{mesh_x.name} to {mesh_y.name}: {init!r} descriptors are not defined on these meshes with "
@@ -263,12 +266,39 @@ def initial_map(
         )
     dtype = spectrum_x.eigenvectors.dtype
     nearest = nearest_neighbor(
-        jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=spectrum_y.mask
+        jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=y.spectrum.mask
     )
     start = np.asarray(nearest).astype(np.int64)
+    if y.samples is not None:
+        start = y.samples.vertices[start]
+    if x.samples is not None:
+        start = start[x.samples.nearest]
     if not isinstance(init, str):
         start[given[:, 0]] = given[:, 1]
     return _extend_to_unused(mesh_x, start)
+
+
+class _Thinned(NamedTuple):
+    """A shape, or where it has too many vertices to compare all, samples of it; `spectrum` is theirs."""
+
+    mesh: Mesh
+    samples: Samples | None
+    spectrum: Spectrum
+
+    @classmethod
+    def make(cls, mesh: Mesh, samples: Samples | None, spectrum: Spectrum) -> _Thinned:
+        if samples is not None:
+            spectrum = spectrum.sample(jnp.asarray(samples.vertices))
+        return cls(mesh, samples, spectrum)
+
+
+# Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
+# ten thousand vertices are plenty.
+_COMPARED, _COMPARED_FROM = 10_000, 15_000
+
+
+def _compared(mesh: Mesh) -> Samples | None:
+    return spread_samples(mesh, _COMPARED) if len(mesh.vertices) > _COMPARED_FROM else None
 
 
 def _side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
@@ -287,25 +317,23 @@ def _units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, 
 
 
 def _shot(
-    mesh_x: Mesh, mesh_y: Mesh, partial: bool
+    x: _Thinned, y: _Thinned, partial: bool
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """SHOT of both meshes at one scale."""
-    unit_x, unit_y = _units_of_length(mesh_x, mesh_y, partial)
-    return _side_by_side(
-        lambda side: shot_descriptors(side[0], radius=SHOT_RADIUS * side[1] / side[0].area ** 0.5),
-        (mesh_x, unit_x),
-        (mesh_y, unit_y),
-    )
+    """SHOT of both shapes at one scale."""
+
+    def describe(side: tuple[_Thinned, float]) -> Float[np.ndarray, "n d"]:
+        (mesh, samples, _), unit = side
+        return shot_descriptors(mesh, radius=SHOT_RADIUS * unit / mesh.area**0.5, samples=samples)
+
+    units = _units_of_length(x.mesh, y.mesh, partial)
+    return _side_by_side(describe, (x, units[0]), (y, units[1]))
 
 
-def _functional_start(
-    mesh_x: Mesh,
-    mesh_y: Mesh,
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-    shot: tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]],
-) -> Int64[np.ndarray, " m"]:
-    """The pointwise map of the descriptor-based functional map."""
+def _functional_embeddings(
+    x: _Thinned, y: _Thinned, shot: tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
+) -> tuple[Float[np.ndarray, "m k_x"], Float[np.ndarray, "n k_x"]]:
+    """The `spectral_embeddings` of the functional map that preserves SHOT."""
+    spectrum_x, spectrum_y = x.spectrum, y.spectrum
     dtype = spectrum_x.eigenvectors.dtype
     shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in shot)
     solution = RegularizedLeastSquares(
@@ -317,8 +345,9 @@ def _functional_start(
     )
     functional_map, result = solution.minimize(None, spectrum_x.eigenvalues, spectrum_y.eigenvalues)
     if result != RESULTS.successful:
-        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(result)}")
-    return np.asarray(decode(functional_map, spectrum_x, spectrum_y)).astype(np.int64)
+        raise ArithmeticError(f"{x.mesh.name} to {y.mesh.name}: {sentence(result)}")
+    embedded_x, embedded_y = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
+    return np.asarray(embedded_x), np.asarray(embedded_y)
 
 
 def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
@@ -340,7 +369,7 @@ def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndar
 
 
 def _landmark_features(
-    landmarks: np.ndarray, mesh_x: Mesh, mesh_y: Mesh, partial: bool
+    landmarks: np.ndarray, x: _Thinned, y: _Thinned, partial: bool
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
     """SHOT, and geodesic distances to each landmark."""
     if landmarks.shape[1:] != (2,) or not len(landmarks):
@@ -349,9 +378,9 @@ def _landmark_features(
             "for landmarks."
         )
     features = []
-    sides = zip((mesh_x, mesh_y), landmarks.T, _units_of_length(mesh_x, mesh_y, partial), strict=True)
-    shot = _shot(mesh_x, mesh_y, partial)
-    for (mesh, vertices, unit), described in zip(sides, shot, strict=True):
+    units = _units_of_length(x.mesh, y.mesh, partial)
+    shot = _shot(x, y, partial)
+    for (mesh, samples, _), vertices, unit, described in zip((x, y), landmarks.T, units, shot, strict=True):
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))
         if outside.any() or not mesh.used_vertices[vertices].all():
             wrong = vertices[outside] if outside.any() else vertices[~mesh.used_vertices[vertices]]
@@ -362,6 +391,8 @@ def _landmark_features(
         distances = geodesic_distances(mesh, vertices.astype(np.int64)).T / unit
         # Another component is farther than anything on the landmark's own.
         distances = np.where(np.isfinite(distances), distances, 100.0)
+        if samples is not None:
+            distances = distances[samples.vertices]
         features.append(np.hstack([described, _LANDMARK_WEIGHT * distances]))
     return features[0], features[1]
 

@@ -7,9 +7,10 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
+
+from jaxsmw.geometry.sampling import independent_vertices
 
 Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
@@ -66,29 +67,10 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
     """Which vertex is in which cell, (n, c): with the seed that is the fewest edges away."""
     n = graph.shape[0]
-    seeds = np.flatnonzero(_spread(graph, radius))
+    seeds = independent_vertices(graph, radius)
     _, _, nearest = dijkstra(graph, indices=seeds, unweighted=True, min_only=True, return_predecessors=True)
     cell = np.searchsorted(seeds, nearest)
     return sp.csr_matrix((np.ones(n), cell, np.arange(n + 1)), shape=(n, len(seeds)))
-
-
-def _spread(graph: sp.csr_matrix, radius: int) -> Bool[np.ndarray, " n"]:
-    """Vertices more than `radius` edges apart, as many as fit (Luby, SIAM J. Comput. 1986)."""
-    n = graph.shape[0]
-    rank = np.random.default_rng(0).permutation(n)
-    undecided, chosen = np.ones(n, bool), np.zeros(n, bool)
-    # Every row has its diagonal, so that what is gathered around a vertex includes the vertex.
-    around, start = graph.indices, graph.indptr[:-1]
-    while undecided.any():
-        highest = np.where(undecided, rank, -1)
-        for _ in range(radius):
-            highest = np.maximum.reduceat(highest[around], start)
-        covered = undecided & (highest == rank)
-        chosen |= covered
-        for _ in range(radius):
-            covered = np.logical_or.reduceat(covered[around], start)
-        undecided &= ~covered
-    return chosen
 
 
 class _Smoother:

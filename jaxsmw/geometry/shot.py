@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.sampling import Samples
 
 _AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11
 _DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
@@ -22,7 +23,9 @@ SHOT_RADIUS = 0.06
 _PAIRS_PER_BLOCK = 100_000
 
 
-def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.ndarray, "n 352"]:
+def shot_descriptors(
+    mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: Samples | None = None
+) -> Float64[np.ndarray, "n 352"]:
     """Signatures of histograms of orientations, one per vertex.
 
     Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
@@ -40,9 +43,12 @@ def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.n
 
     - `mesh`: the surface, n vertices, consistently oriented.
     - `radius`: of the neighbourhood, as a fraction of the square root of the area.
+    - `samples`: vertices that stand for all others (`jaxsmw.geometry.sampling`), each with the mean normal of
+      those it is nearest to: only they count as neighbours, and only they get descriptors. Otherwise the time
+      grows with the square of the number of vertices.
 
-    **Returns:** One row per vertex. It is zero for unused vertices and where there are fewer than 3
-    neighbours; a warning says when there are many.
+    **Returns:** One row per vertex, or per sample. It is zero for unused vertices and where there are fewer
+    than 3 neighbours; a warning says when there are many.
 
     **Raises:** `InputError` if the radius is not positive, or holds too few neighbours for most vertices.
     """
@@ -50,9 +56,16 @@ def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.n
         raise InputError(f"the SHOT radius is {radius}, but it must be positive; 0.06 is the usual choice.")
 
     def compute() -> dict[str, np.ndarray]:
-        vertices = np.flatnonzero(mesh.used_vertices)
+        if samples is None:
+            vertices = rows = np.flatnonzero(mesh.used_vertices)
+            normals, number = mesh.vertex_normals[vertices], len(mesh.vertices)
+        else:
+            vertices, number = samples.vertices, len(samples.vertices)
+            rows = np.arange(number)
+            weighted = mesh.vertex_areas[:, None] * mesh.vertex_normals
+            normals = np.stack([np.bincount(samples.nearest, axis, number) for axis in weighted.T], axis=1)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
         positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
-        normals = mesh.vertex_normals[vertices]
         corners = mesh.vertices[mesh.faces] - mesh.vertices[vertices].mean(axis=0)
         if np.linalg.det(corners).sum() < 0:
             normals = -normals
@@ -63,18 +76,19 @@ def shot_descriptors(mesh: Mesh, *, radius: float = SHOT_RADIUS) -> Float64[np.n
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        descriptors = np.zeros((len(mesh.vertices), _DIMENSION))
+        descriptors = np.zeros((number, _DIMENSION))
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
             # Vertices at the same place have no direction to each other.
             pairs = pairs[pairs["v"] > 0]
-            descriptors[vertices[block]] = _describe(
+            descriptors[rows[block]] = _describe(
                 positions, normals, block, pairs["i"], pairs["j"], pairs["v"], radius
             )
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
-    result = cached("shot-descriptors", (mesh.vertices, mesh.faces, radius), compute)
+    chosen = () if samples is None else samples
+    result = cached("shot-descriptors", (mesh.vertices, mesh.faces, radius, *chosen), compute)
     if (lonely := float(result["lonely"])) > 0.01:
         warnings.warn(_too_coarse(mesh, lonely, radius), stacklevel=2)
     return result["descriptors"]
