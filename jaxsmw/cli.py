@@ -210,7 +210,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_bank(spectrum)
     spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
-    _add_laplacian(spectrum)
+    _add_eigenproblem(spectrum)
     _add_reading(spectrum, indices=False)
     _add_common(spectrum, _spectrum)
 
@@ -278,7 +278,7 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--precision", choices=("float32", "float64"), default="float32", help="(default: %(default)s)"
     )
-    _add_laplacian(group)
+    _add_eigenproblem(group)
 
 
 # Names of banks on the command line, and their classes.
@@ -313,12 +313,19 @@ def _add_bank(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def _add_laplacian(parser: argparse._ActionsContainer) -> None:
+def _add_eigenproblem(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--laplacian",
         choices=("auto", "cotangent", "robust"),
         default="auto",
         help="robust takes bad triangles; auto uses it where needed (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--eigensolver",
+        choices=("auto", "exact", "approximate"),
+        default="auto",
+        help="approximate is within 1 to 2 %% of the eigenvalues and fast on large meshes; auto uses it from "
+        "50000 vertices on (default: %(default)s)",
     )
 
 
@@ -457,6 +464,7 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
             iterations=options.iterations,
             number_of_samples=options.samples,
             laplacian=options.laplacian,
+            eigensolver=options.eigensolver,
             partial=options.partial,
             stop_when_unchanged=options.stop_when_unchanged,
         )
@@ -569,7 +577,9 @@ def _spectrum(options: argparse.Namespace) -> None:
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
-    eigenvalues, eigenvectors, vertex_areas = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian)
+    eigenvalues, eigenvectors, vertex_areas = eigenpairs(
+        mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver
+    )
     print("\n".join((*mesh.notes, *diagnose(mesh).sentences())))
     print(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
     for start in range(0, len(eigenvalues), 10):

@@ -27,7 +27,7 @@ from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature,
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
+from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
@@ -93,6 +93,7 @@ def match(
     iterations: int = 3,
     number_of_samples: int | None = None,
     laplacian: Laplacian = "auto",
+    eigensolver: Eigensolver = "auto",
     partial: bool = False,
     stop_when_unchanged: bool = False,
     history: bool = False,
@@ -116,7 +117,7 @@ def match(
     - `iterations`: how many; at least 1.
     - `number_of_samples`: iterate on so many farthest-point samples of each shape (more than k) and search
       all vertices in the last iteration only.
-    - `laplacian`: see `jaxsmw.compute_spectrum`.
+    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
     - `stop_when_unchanged`, `history`: see `jaxsmw.refine`.
 
@@ -140,7 +141,12 @@ def match(
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
         spectrum_x, spectrum_y = paired_spectra(
-            mesh_x, mesh_y, number_of_eigenvectors, laplacian=laplacian, partial=partial
+            mesh_x,
+            mesh_y,
+            number_of_eigenvectors,
+            laplacian=laplacian,
+            eigensolver=eigensolver,
+            partial=partial,
         )
     for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
         if spectrum.eigenvalues[-1] == 0:
@@ -192,6 +198,7 @@ def paired_spectra(
     number_of_eigenvectors: int,
     *,
     laplacian: Laplacian = "auto",
+    eigensolver: Eigensolver = "auto",
     partial: bool = False,
 ) -> tuple[Spectrum, Spectrum]:
     """The spectra of two meshes as they are matched.
@@ -203,7 +210,9 @@ def paired_spectra(
     **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
     """
     pairs = _side_by_side(
-        lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian), mesh_x, mesh_y
+        lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
+        mesh_x,
+        mesh_y,
     )
     # Out here, as threads do not inherit `jax.enable_x64`.
     spectrum_x, spectrum_y = as_spectrum(mesh_x, *pairs[0]), as_spectrum(mesh_y, *pairs[1])

@@ -9,6 +9,7 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
+from jaxsmw import matching
 from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
@@ -49,6 +50,35 @@ def test_finds_the_copy(pair):
     assert result.functional_map.shape == (30, 30)
     assert result.iterations == 3
     assert list(result.seconds) == ["eigenbases", "initial map", "refinement"]
+
+
+@pytest.mark.parametrize("init", ["shot", "wks", "functional", [[0, 0], [900, 900], [2000, 2000]]])
+def test_large_meshes_start_among_samples(pair, init, monkeypatch):
+    """Descriptors of half of the vertices lead where those of all do: to the right map."""
+    mesh_x, mesh_y, truth = pair
+    if not isinstance(init, str):
+        init = np.array([[i, truth[i]] for i, _ in init])
+    spectra = paired_spectra(mesh_x, mesh_y, 30)
+    monkeypatch.setattr(matching, "_COMPARED", 1200)
+    monkeypatch.setattr(matching, "_COMPARED_FROM", 1000)
+    start = initial_map(mesh_x, mesh_y, *spectra, init=init)
+    compared = np.unique(start)
+    assert 100 < len(compared) < 1500
+    if not isinstance(init, str):
+        np.testing.assert_array_equal(start[init[:, 0]], init[:, 1])
+    result = match(mesh_x, mesh_y, init=init, **OPTIONS)
+    assert mean_error(mesh_y, result.pointwise_map, truth) < 0.02
+
+
+def test_the_approximate_eigenbasis_matches_as_well(pair):
+    mesh_x, mesh_y, truth = pair
+    exact, approximate = (
+        match(mesh_x, mesh_y, eigensolver=solver, **OPTIONS) for solver in ("exact", "approximate")
+    )
+    assert (exact.spectrum_x.eigenvalues[1:] < approximate.spectrum_x.eigenvalues[1:]).all()
+    errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (exact, approximate)]
+    # Of a copy, noise aside, all vertices are found exactly.
+    assert errors[1] < errors[0] + 0.003
 
 
 def test_repeats_bit_for_bit(pair):

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import shot
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.sampling import Samples
 from jaxsmw.geometry.shot import shot_descriptors
 
 
@@ -125,3 +127,24 @@ def test_few_lonely_vertices_are_said_aloud():
 def test_radius_must_be_positive(bumpy, radius):
     with pytest.raises(InputError, match="must be positive"):
         shot_descriptors(bumpy, radius=radius)
+
+
+def test_samples_describe_like_a_mesh_of_them(bumpy):
+    """On a finer mesh of the same surface, samples give nearly what all vertices of the coarser one do."""
+    coarse, fine = bumpy, bumpy_mesh(5)
+    n = len(coarse.vertices)
+    np.testing.assert_allclose(fine.vertices[:n], coarse.vertices, atol=1e-12)
+    _, nearest = KDTree(coarse.vertices).query(fine.vertices)
+    described = shot_descriptors(fine, samples=Samples(np.arange(n), nearest))
+    assert described.shape == (n, 352)
+    difference, usual = (
+        np.median(np.linalg.norm(a - described, axis=1))
+        for a in (shot_descriptors(coarse), np.roll(described, 1, axis=0))
+    )
+    assert difference < 0.2 * usual
+
+
+def test_samples_of_all_vertices_change_nothing(bumpy, descriptors):
+    everything = np.arange(len(bumpy.vertices))
+    same = shot_descriptors(bumpy, samples=Samples(everything, everything))
+    np.testing.assert_allclose(same, descriptors, atol=1e-9)
