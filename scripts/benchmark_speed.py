@@ -1,56 +1,74 @@
 """How fast things are, beside what they cannot do without.
 
-    python scripts/benchmark_speed.py [--quick] [--only PART ...] [--output DIR]
+    python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
 
 - `refinement`: three iterations at the paper's setting in float32, at several sizes: with all compared with
   all, in patches, on samples; against three matrix products (m x k) (k x n) alone, in the fastest of
   several ways to have them, and against a plain argmin over stored distances;
-- `eigenbasis`: 100 eigenpairs against SciPy's shift-invert `eigsh` with its defaults, in CPU time;
+- `eigenbasis`: 100 eigenpairs, exact and approximate, against SciPy's shift-invert `eigsh` with its defaults,
+  in CPU time; with the approximate eigenvalues' errors;
 - `stages`: what else the host does for one shape;
-- `command`: from starting Python to the map on the disk, with and without compiled programs from before.
+- `command`: from starting Python to the map on the disk, with and without compiled programs from before;
+- `peers`: from two mesh files to the refined map, and refinement alone, against pyFM and geomfum where they
+  are installed (`jaxsmw[peers]`);
+- `scale`: from two mesh files of up to a million vertices to the refined map, each size in a process of its
+  own: time and peak memory of each stage, accuracy, and the exponents with which they grow.
 
 What is compared runs in turns in one process, so that a busy moment hits all of it; ratios are of medians.
-DIR gets the tables as `speed.md` and all numbers as `speed.json`. Quick does the smallest size only, in two
+Shapes are procedural creatures, for `scale` with edges split and vertices moved at random; with `--data` in
+the last two parts two people of the remeshed FAUST set instead. DIR gets the tables as `speed.md`, all
+numbers as `speed.json`, and a plot over sizes as `speed.png`. Quick does the smallest sizes only, in three
 minutes.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import logging
+import multiprocessing
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Int64
 from scipy.sparse.linalg import eigsh
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.files import make_directory
 from jaxsmw.geometry.creature import creature_pair
-from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
+from jaxsmw.geometry.eigenbasis import Eigensolver, compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import initial_map
+from jaxsmw.matching import initial_map, match
+from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
+LARGE = (100_000, 300_000, 1_000_000)
 # Beyond this many vertices a stored distance matrix would be gigabytes.
 STORED = 10_000
 
@@ -150,8 +168,8 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
 
 def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
     """Of one shape."""
-    for size in options.sizes:
-        mesh = creature_pair(vertices=size).source
+    for size in [*options.sizes, *LARGE[: 0 if options.quick else 1]]:
+        mesh = finer(creature_pair(vertices=min(size, SIZES[-1])).source, size)
         stiffness, areas = assemble_laplacian(mesh)
         masses = sp.diags(areas / areas.sum()).tocsc()
 
@@ -159,13 +177,26 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
             with threadpool_limits(1, "blas"):
                 return eigsh(stiffness, EIGENVECTORS, masses, sigma=-1e-2)
 
-        candidates = {"SciPy's eigsh": usual, "ours": lambda mesh=mesh: eigenpairs(mesh, EIGENVECTORS)}
-        seconds = medians(candidates, 3, time.process_time, warm=False)
+        def ours(solver: Eigensolver, mesh=mesh) -> np.ndarray:
+            return eigenpairs(mesh, EIGENVECTORS, eigensolver=solver)[0]
+
+        seconds = medians(
+            {
+                "SciPy's eigsh": usual,
+                "exact": lambda: ours("exact"),
+                "approximate": lambda: ours("approximate"),
+            },
+            3,
+            time.process_time,
+            warm=False,
+        )
+        excess = ours("approximate")[1:] / ours("exact")[1:] - 1
         yield (
             f"Eigenbasis, {len(mesh.vertices)} vertices",
-            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Ours includes the Laplacian and a check.",
+            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Ours include the Laplacian and a check. "
+            f"Approximate eigenvalues are {excess.mean():.2%} too large ({excess.max():.2%} at most).",
             compared(seconds, "SciPy's eigsh"),
-            {"vertices": len(mesh.vertices), "seconds": seconds},
+            {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
         )
 
 
@@ -239,7 +270,294 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
     )
 
 
-PARTS = {part.__name__: part for part in (refinement, eigenbasis, stages, command)}
+class Truth(NamedTuple):
+    """A pair, and for some vertices of the source the vertices of the target that are the same points."""
+
+    meshes: tuple[Mesh, Mesh]
+    rows: Int64[np.ndarray, " r"]
+    targets: Int64[np.ndarray, " r"]
+
+    def error(self, pointwise_map: np.ndarray, target: Mesh) -> float:
+        """Mean geodesic error in thousandths of the square root of the area.
+
+        The map may be that of finer versions of both meshes: what it finds on such a `target` counts as the
+        nearest vertex here.
+        """
+        coarse = self.meshes[1]
+        _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
+        sources, row = np.unique(self.targets, return_inverse=True)
+        distances = np.empty(len(row))
+        for group in np.array_split(np.arange(len(sources)), -(-len(sources) // 500)):
+            here = np.isin(row, group)
+            found = geodesic_distances(coarse, sources[group])
+            distances[here] = found[row[here] - group[0], nearest[here]]
+        return 1000 * float(distances.mean()) / coarse.area**0.5
+
+
+def pair_with_truth(options: argparse.Namespace) -> Truth:
+    """Two people of the remeshed FAUST set, or two poses of a creature."""
+    if options.data is None:
+        pair = creature_pair(vertices=SIZES[0])
+        return Truth((pair.source, pair.target), np.arange(len(pair.true_map)), pair.true_map)
+    names = "tr_reg_002", "tr_reg_007"
+    x, y = (read_mesh(options.data / "off" / f"{name}.off") for name in names)
+    rows, targets = (
+        np.loadtxt(options.data / "corres" / f"{name}.vts", dtype=np.int64) - 1 for name in names
+    )
+    return Truth((x, y), rows, targets)
+
+
+def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
+    """The mesh with its longest edges split until it has so many vertices, all moved by a tenth of an edge.
+
+    The first vertices are those of the mesh.
+    """
+    vertices, faces = mesh.vertices, mesh.faces.copy()
+    while (missing := number_of_vertices - len(vertices)) > 0:
+        sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        edges, edge_of_side = np.unique(sides, axis=0, return_inverse=True)
+        lengths = np.linalg.norm(np.diff(vertices[edges], axis=1)[:, 0], axis=1)
+        split = np.argsort(-lengths, kind="stable")[:missing]
+        middle = np.full(len(edges), -1)
+        middle[split] = len(vertices) + np.arange(len(split))
+        vertices = np.concatenate([vertices, vertices[edges[split]].mean(axis=1)])
+        middles = middle[edge_of_side].reshape(-1, 3)
+        # One edge after the other; what is split off keeps the edges that are not its own for the next.
+        for _ in range(2):
+            side = np.argmax(middles, axis=1)
+            rows = np.flatnonzero(middles[np.arange(len(faces)), side] >= 0)
+            turn = (side[rows, None] + np.arange(3)) % 3
+            a, b, c = np.take_along_axis(faces[rows], turn, axis=1).T
+            new, *others = np.take_along_axis(middles[rows], turn, axis=1).T
+            none = np.full(len(rows), -1)
+            faces[rows], middles[rows] = np.stack([a, new, c], 1), np.stack([none, none, others[1]], 1)
+            faces = np.concatenate([faces, np.stack([new, b, c], axis=1)])
+            middles = np.concatenate([middles, np.stack([none, others[0], none], axis=1)])
+    if len(vertices) > len(mesh.vertices):
+        edge = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean()
+        vertices = vertices + 0.1 * edge * np.random.default_rng(seed).standard_normal(vertices.shape)
+    return make_mesh(vertices, faces, name=mesh.name)
+
+
+def peak_memory() -> float:
+    """Of this process so far, in GiB."""
+    unit = 2**30 if sys.platform == "darwin" else 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def matched_from_files(files: list[str]) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
+    """Name, seconds and peak memory of each stage; initial and refined map."""
+    stages = [("start", time.perf_counter(), 0.0)]
+
+    class Watch(logging.Handler):
+        """Stages are logged as they begin, which is when those before have ended."""
+
+        def emit(self, record: logging.LogRecord) -> None:
+            stages.append((record.getMessage(), time.perf_counter(), peak_memory()))
+
+    logger = logging.getLogger("jaxsmw")
+    logger.addHandler(Watch())
+    logger.setLevel(logging.INFO)
+    logger.info("reading")
+    meshes = [read_mesh(file) for file in files]
+    result = match(*meshes, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS)
+    logger.info("end")
+    timed = [(name, end - start, peak) for (name, start, _), (_, end, peak) in itertools.pairwise(stages[1:])]
+    return timed, [result.initial_map, result.pointwise_map]
+
+
+def scale(options: argparse.Namespace) -> Iterator[Part]:
+    """Sizes one after the other, each in a new process."""
+    truth = pair_with_truth(options)
+    rows, measured = [], []
+    for size in (10_000, 30_000, *(() if options.quick else LARGE)):
+        meshes = [finer(mesh, size, seed=size + side) for side, mesh in enumerate(truth.meshes)]
+        with tempfile.TemporaryDirectory() as directory:
+            files = [str(Path(directory) / f"{side}.ply") for side in range(2)]
+            for file, mesh in zip(files, meshes, strict=True):
+                write_mesh(Path(file), mesh)
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
+                timed, maps = executor.submit(matched_from_files, files).result()
+        errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in maps]
+        seconds = {name: taken for name, taken, _ in timed}
+        peaks = {name: peak for name, _, peak in timed}
+        measured.append({"vertices": size, "seconds": seconds, "peak_gib": peaks, "errors": errors})
+        rows.append(
+            [str(size)]
+            + [f"{taken:.1f}" for taken in seconds.values()]
+            + [f"{sum(seconds.values()):.1f}", f"{max(peaks.values()):.2f}", *(f"{e:.1f}" for e in errors)]
+        )
+    columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
+
+    def exponent(values: list[float]) -> str:
+        # The smallest size is mostly what does not depend on it.
+        return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
+
+    if len(measured) > 2:
+        stages = [exponent([m["seconds"][name] for m in measured]) for name in measured[0]["seconds"]]
+        total = exponent([sum(m["seconds"].values()) for m in measured])
+        memory = exponent([max(m["peak_gib"].values()) for m in measured])
+        rows.append(["exponent", *stages, total, memory, "", ""])
+    yield (
+        "Scale",
+        f"k = {EIGENVECTORS}, {ITERATIONS} iterations, from two PLY files, compilation included; peak memory "
+        "of the whole process; mean geodesic errors x10^-3.",
+        [["vertices", *columns], *rows],
+        {"measured": measured},
+    )
+
+
+def peers(options: argparse.Namespace) -> Iterator[Part]:
+    """One pair; every library reads the files, computes its eigenbases and refines."""
+    truth = pair_with_truth(options)
+    missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
+    if missing:
+        print(f"\npeers: {' and '.join(missing)} not installed; pip install 'jaxsmw[peers]' for all.")
+    with tempfile.TemporaryDirectory() as directory:
+        files = [str(Path(directory) / f"{side}.off") for side in range(2)]
+        for file, mesh in zip(files, truth.meshes, strict=True):
+            write_mesh(Path(file), mesh)
+        runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {"ours": ours_from_files}
+        if "pyFM" not in missing:
+            runs["pyFM, its defaults"] = pyfm_defaults_from_files
+            runs["pyFM, ZoomOut 20 to 100 from our start"] = pyfm_from_files
+        if "geomfum" not in missing:
+            runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
+        measured: dict[str, dict[str, Any]] = {}
+        for turn in range(2 if options.quick else 4):  # the first compiles
+            for name, run in runs.items():
+                if turn > 1 and name.startswith("geomfum"):
+                    continue  # a minute each
+                start = time.perf_counter()
+                found, refining = run(files)
+                taken = time.perf_counter() - start
+                of = measured.setdefault(name, {"all": [], "refining": [], "error": None})
+                of["all"].append(taken)
+                of["refining"].append(refining)
+                of["error"] = truth.error(found, truth.meshes[1])
+    table = [["", "files to map, seconds", "of ours", "refinement", "of ours", "first time", "error x10^-3"]]
+    ours = [float(np.median(measured["ours"][kind][1:])) for kind in ("all", "refining")]
+    for name, of in measured.items():
+        whole, refining = (float(np.median(of[kind][1:])) for kind in ("all", "refining"))
+        table.append(
+            [
+                name,
+                f"{whole:.2f}",
+                f"{whole / ours[0]:.1f}",
+                f"{refining:.2f}",
+                f"{refining / ours[1]:.1f}",
+                f"{of['all'][0]:.1f}",
+                f"{of['error']:.1f}",
+            ]
+        )
+    m, n = (len(mesh.vertices) for mesh in truth.meshes)
+    yield (
+        f"Peers, {m} x {n} vertices",
+        f"One process, medians; the first time includes compilation. Ours: k = {EIGENVECTORS}, {ITERATIONS} "
+        "iterations from SHOT. Rows from our start leave out the time to compute it.",
+        table,
+        {"measured": measured},
+    )
+
+
+def ours_from_files(files: list[str]) -> tuple[np.ndarray, float]:
+    """The map, and the seconds of refinement alone."""
+    result = match(*map(read_mesh, files), number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS)
+    return result.pointwise_map, result.seconds["refinement"]
+
+
+def our_start(files: list[str], kept: dict[tuple[str, ...], np.ndarray] = {}) -> np.ndarray:  # noqa: B006
+    """The initial map of `match`, kept from call to call: peers are not charged for it."""
+    if tuple(files) not in kept:
+        kept[tuple(files)] = match(*map(read_mesh, files), iterations=1).initial_map
+    return kept[tuple(files)]
+
+
+def pyfm_defaults_from_files(files: list[str]) -> tuple[np.ndarray, float]:
+    """Descriptors, functional map and ZoomOut of `pyFM.functional.FunctionalMapping`, as they come."""
+    from pyFM.functional import FunctionalMapping
+    from pyFM.mesh import TriMesh
+
+    x, y = (TriMesh.load(file) for file in files)
+    model = FunctionalMapping(y, x)
+    model.preprocess()
+    model.fit(verbose=False)
+    start = time.perf_counter()
+    model.zoomout_refine()
+    found = model.get_p2p()
+    return np.asarray(found), time.perf_counter() - start
+
+
+def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
+    """`pyFM.refine.zoomout_refine` in steps of 5."""
+    from pyFM.mesh import TriMesh
+    from pyFM.refine import zoomout_refine
+    from pyFM.spectral import p2p_to_FM
+
+    first = our_start(files)
+    x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
+    start = time.perf_counter()
+    k = EIGENVECTORS - ZOOMOUT_STEPS * 5
+    functional_map = p2p_to_FM(first, y.eigenvectors[:, :k], x.eigenvectors[:, :k], A2=x.A)
+    _, found = zoomout_refine(
+        functional_map,
+        y.eigenvectors[:, :EIGENVECTORS],
+        x.eigenvectors[:, :EIGENVECTORS],
+        nit=ZOOMOUT_STEPS,
+        step=5,
+        A2=x.A,
+        return_p2p=True,
+        n_jobs=-1,
+    )
+    return np.asarray(found), time.perf_counter() - start
+
+
+def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
+    """`geomfum.refine.ZoomOut` in steps of 5."""
+    from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
+    from geomfum.laplacian import LaplacianSpectrumFinder
+    from geomfum.refine import ZoomOut
+    from geomfum.shape import TriangleMesh
+
+    first = our_start(files)
+    find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
+    x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
+    start = time.perf_counter()
+    k = EIGENVECTORS - ZOOMOUT_STEPS * 5
+    functional_map = FmFromP2pConverter()(first, y.truncate(k), x.truncate(k))
+    refined = ZoomOut(nit=ZOOMOUT_STEPS, step=5)(functional_map, y, x)
+    return np.asarray(P2pFromFmConverter()(refined, y, x)), time.perf_counter() - start
+
+
+# From 20 eigenvectors to 100.
+ZOOMOUT_STEPS = 16
+
+
+def draw(numbers: dict[str, Any], file: Path) -> None:
+    """Seconds and memory over sizes, of what was measured at more than one."""
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
+    for axis, part in zip(axes[:2], ("refinement", "eigenbasis"), strict=True):
+        measured = numbers.get(part, [])
+        for name in {name: None for m in measured for name in m["seconds"]}:
+            points = [(np.max(m["vertices"]), m["seconds"][name]) for m in measured if name in m["seconds"]]
+            axis.loglog(*zip(*points, strict=True), "o-", label=name)
+        axis.set_title(part.capitalize())
+    for measured in numbers.get("scale", [])[:1]:
+        sizes = [m["vertices"] for m in measured["measured"]]
+        for name in measured["measured"][0]["seconds"]:
+            axes[2].loglog(sizes, [m["seconds"][name] for m in measured["measured"]], "o-", label=name)
+        peaks = [max(m["peak_gib"].values()) for m in measured["measured"]]
+        axes[2].loglog(sizes, peaks, "k--", label="peak memory, GiB")
+        axes[2].set_title("From files to map")
+    for axis in axes:
+        axis.set_xlabel("vertices")
+        axis.set_ylabel("seconds")
+        if axis.lines:
+            axis.legend(fontsize=8)
+    save_figure(file, figure)
+
+
+PARTS = {part.__name__: part for part in (refinement, eigenbasis, stages, command, peers, scale)}
 
 
 def main() -> None:
@@ -248,6 +566,9 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser.add_argument(
+        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
+    )
     parser.add_argument("--output", type=Path, default=Path("speed"), metavar="DIR")
     options = parser.parse_args()
     options.sizes, options.repeats = (SIZES[:1], 3) if options.quick else (SIZES, 9)
@@ -265,6 +586,7 @@ def main() -> None:
             numbers[name].append(measured)
             (output / "speed.md").write_text("\n\n".join(parts), "utf-8")
             (output / "speed.json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
+            draw(numbers, output / "speed.png")
 
 
 if __name__ == "__main__":
