@@ -41,6 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+            from jaxsmw.geometry.cache import keep_programs
+
+            keep_programs()
             options.run(options)
     except InputError as error:
         _say(f"jaxsmw: {error}")

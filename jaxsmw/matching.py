@@ -274,7 +274,7 @@ def initial_map(
             f"{len(spectrum_x.eigenvalues)} eigenvectors; ask for more, or start from another map."
         )
     dtype = spectrum_x.eigenvectors.dtype
-    nearest = nearest_neighbor(
+    nearest = _nearest_neighbor(
         jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=y.spectrum.mask
     )
     start = np.asarray(nearest).astype(np.int64)
@@ -285,6 +285,10 @@ def initial_map(
     if not isinstance(init, str):
         start[given[:, 0]] = given[:, 1]
     return _extend_to_unused(mesh_x, start)
+
+
+# One program instead of many, and compiled once for shapes of one size.
+_nearest_neighbor = jax.jit(nearest_neighbor)
 
 
 class _Thinned(NamedTuple):

@@ -237,19 +237,21 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         output = str(Path(directory) / "map.txt")
         matching = ["-m", "jaxsmw", "match", *files, "--output", output]
 
-        def started(*arguments: str, programs: str | None = None) -> Callable[[], object]:
-            environment = {**os.environ, "JAXSMW_CACHE": "off"}
-            environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-            if programs:
-                environment["JAX_COMPILATION_CACHE_DIR"] = programs
-            call = [sys.executable, *arguments]
-            return lambda: subprocess.run(call, check=True, capture_output=True, env=environment)
+        def started(*arguments: str, cache: Path | None = None) -> Callable[[], object]:
+            environment = {**os.environ, "JAXSMW_CACHE": str(cache or "off")}
+
+            def run() -> None:
+                for entry in cache.glob("*.npz") if cache else ():
+                    entry.unlink()  # spectra, not programs
+                subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
+
+            return run
 
         def both(meshes: tuple[Mesh, Mesh] = (pair.source, pair.target)) -> object:
             return [eigenpairs(mesh, EIGENVECTORS) for mesh in meshes]
 
-        kept = str(Path(directory) / "programs")
-        started(*matching, programs=kept)()
+        kept = Path(directory) / "kept"
+        started(*matching, cache=kept)()
         seconds = medians(
             {
                 "two eigenbases": both,
@@ -257,7 +259,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
                 "import jaxsmw": started("-c", "import jaxsmw"),
                 "jaxsmw --help": started("-m", "jaxsmw", "--help"),
                 "jaxsmw match": started(*matching),
-                "jaxsmw match, compiled before": started(*matching, programs=kept),
+                "jaxsmw match, compiled before": started(*matching, cache=kept),
             },
             3,
             warm=False,

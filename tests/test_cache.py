@@ -4,14 +4,19 @@ import concurrent.futures
 import errno
 import multiprocessing
 import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic import sphere_mesh
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.cache import cached
+from jaxsmw.geometry.cache import cached, keep_programs
+from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.mesh_files import write_mesh
 
 INPUT = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}
@@ -219,3 +224,32 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
     with concurrent.futures.ProcessPoolExecutor(3, mp_context=context) as pool:
         assert all(pool.map(_work, range(6)))
     assert all(entry.name.startswith("test-") for entry in directory.iterdir())
+
+
+def test_commands_keep_compiled_programs(tmp_path):
+    """Of a processor's own, found again by the next process, and none where no cache is wanted."""
+    mesh = tmp_path / "mesh.off"
+    write_mesh(mesh, make_mesh(*sphere_mesh(2)))
+    command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), "--eigenvectors", "20"]
+    command += ["--init", "wks", "--output", str(tmp_path / "map.txt")]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX")}
+
+    def compiled(place: str) -> list[str]:
+        settings = {"JAXSMW_CACHE": place, "JAX_LOG_COMPILES": "1"}
+        done = subprocess.run(command, env=environment | settings, check=True, capture_output=True, text=True)
+        return [line for line in done.stderr.splitlines() if "Persistent compilation cache hit" in line]
+
+    cache = tmp_path / "cache"
+    assert compiled("off") == [] and not cache.exists()
+    assert compiled(str(cache)) == []
+    (programs,) = cache.glob("programs-*")
+    assert len(list(programs.iterdir())) > 5
+    assert len(compiled(str(cache))) > 5
+
+
+def test_settings_of_the_user_stay(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
+    before = dict(os.environ)
+    keep_programs()
+    assert dict(os.environ) == before

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -50,12 +51,11 @@ def cached(
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number.
     """
-    place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
-    limit = _limit()
-    if place in ("", "off"):
+    place, limit = _place(), _limit()
+    if place is None:
         return compute()
     key = _key(kind, inputs)
-    path = Path(place) / f"{kind}-{key}.npz"
+    path = place / f"{kind}-{key}.npz"
     arrays = None if _recomputing.get() else _load(path, key)
     if arrays is None:
         arrays = compute()
@@ -87,6 +87,44 @@ def recomputing() -> Iterator[None]:
         yield
     finally:
         _recomputing.reset(token)
+
+
+def keep_programs() -> None:
+    """Let JAX, not imported yet, keep what it compiles beside our results, for the next process.
+
+    By settings of its own in the environment, of which those that are there already stay. What is compiled
+    for one kind of processor must not run on another, which JAX does not tell apart, and a cache may be on a
+    shared disk.
+    """
+    place = _place()
+    if place is None:
+        return
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+        processor = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        processor = platform.processor()
+    kind = hashlib.sha256(f"{platform.machine()} {processor}".encode()).hexdigest()[:16]
+    directory = place / f"programs-{kind}"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # `cached` says so
+    settings = {
+        "JAX_COMPILATION_CACHE_DIR": str(directory),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**28),
+        # Many small programs take as long to compile as one large one.
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    if settings.keys().isdisjoint(os.environ):
+        os.environ.update(settings)
+
+
+def _place() -> Path | None:
+    """The directory, if there is to be one."""
+    place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
+    return None if place in ("", "off") else Path(place)
 
 
 def _limit() -> float:
