@@ -28,7 +28,7 @@ from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wav
 from .core.pointwise_map import decode, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
 from .core.results import RESULTS
-from .core.search import nearest_neighbor
+from .core.search import approximate_nearest_neighbor, nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.solutions import (
     DescriptorPair,
@@ -101,6 +101,7 @@ __all__ = [
     "Warped",
     "WaveletPreservation",
     "WaveletProblem",
+    "approximate_nearest_neighbor",
     "compute_spectrum",
     "coverage",
     "creature_pair",

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
 from jaxsmw import matching
+from jaxsmw.core import refinement
 from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
@@ -79,6 +80,17 @@ def test_the_approximate_eigenbasis_matches_as_well(pair):
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (exact, approximate)]
     # Of a copy, noise aside, all vertices are found exactly.
     assert errors[1] < errors[0] + 0.003
+
+
+def test_approximate_search_matches_as_well(pair, monkeypatch):
+    mesh_x, mesh_y, truth = pair
+    options = OPTIONS | {"refiner": WaveletPreservation(bank=Meyer(4), search="approximate")}
+    exact, approximate = match(mesh_x, mesh_y, **OPTIONS), match(mesh_x, mesh_y, **options)
+    assert (exact.pointwise_map == approximate.pointwise_map).mean() > 0.97
+    assert mean_error(mesh_y, approximate.pointwise_map, truth) < 0.02
+    monkeypatch.setattr(refinement, "find_spec", lambda _: None)
+    with pytest.raises(ImportError, match=r"pip install 'jaxsmw\[approximate\]'"):
+        WaveletPreservation(search="approximate")
 
 
 def test_repeats_bit_for_bit(pair):

@@ -6,7 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int32
 
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.search import Patches, make_patches, nearest_neighbor, nearest_neighbor_in_patches
+from jaxsmw.core.search import (
+    Patches,
+    approximate_nearest_neighbor,
+    make_patches,
+    nearest_neighbor,
+    nearest_neighbor_in_patches,
+)
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -38,16 +44,19 @@ def decode(
     *,
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
+    approximate: bool = False,
 ) -> Int32[Array, " m"]:
     """The pointwise map T: X -> Y of a functional map, by nearest neighbours (Algorithm 1, step 3).
 
     For each vertex of X the vertex of Y, masked ones excluded, that is nearest in `spectral_embeddings`;
-    found faster where `search_patches` of the two shapes are given.
+    found faster where `search_patches` of the two shapes are given, or nearly always if approximately
+    (`approximate_nearest_neighbor`).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     if patches is not None:
         return nearest_neighbor_in_patches(queries, database, *patches)
-    return nearest_neighbor(queries, database, database_mask=spectrum_y.mask)
+    search = approximate_nearest_neighbor if approximate else nearest_neighbor
+    return search(queries, database, database_mask=spectrum_y.mask)
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:

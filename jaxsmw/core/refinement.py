@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -107,7 +108,7 @@ class Refinement(eqx.Module):
     history: History | None
 
 
-Search = Literal["auto", "exhaustive", "patches"]
+Search = Literal["auto", "exhaustive", "patches", "approximate"]
 
 # From so many vertices on (in the geometric mean of both shapes) patches save more than compiling them takes.
 _PATCHES_FROM = 15_000
@@ -128,9 +129,10 @@ class WaveletPreservation(Refiner):
       prints, is there for study: on real pairs it fails (`spectral_embeddings` says why).
     - `lambda_max`: where the bank ends: `"own"`, each shape's largest eigenvalue, which makes a difference
       in size cancel; or `"common"`, that of both shapes' eigenvalues taken together.
-    - `search`: how nearest neighbours are found; the same ones in any case. `"exhaustive"` compares all with
-      all; `"patches"` leaves out patches of the target that are too far away, which is several times as
-      fast on a CPU but takes seconds longer to compile; `"auto"` does that on CPUs from 15 000 vertices.
+    - `search`: how nearest neighbours are found. `"exhaustive"` compares all with all; `"patches"` finds the
+      same but leaves out patches of the target that are too far away, which is several times as fast on a
+      CPU but takes seconds longer to compile; `"auto"` does that on CPUs from 15 000 vertices.
+      `"approximate"` misses a few in a thousand (`approximate_nearest_neighbor`, needs FAISS).
     """
 
     bank: FilterBank = Meyer()
@@ -146,6 +148,8 @@ class WaveletPreservation(Refiner):
         check_choice("convention", self.convention, get_args(Convention))
         check_choice("lambda_max", self.lambda_max, ("own", "common"))
         check_choice("search", self.search, get_args(Search))
+        if self.search == "approximate" and not find_spec("faiss"):
+            raise ImportError("search='approximate' needs FAISS: pip install 'jaxsmw[approximate]'")
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
         """The pair with the bank on both shapes' eigenvalues."""
@@ -191,6 +195,7 @@ class WaveletPreservation(Refiner):
             problem.spectrum_y,
             convention=self.convention,
             patches=patches,
+            approximate=self.search == "approximate",
         )
 
     def energy(
