@@ -314,8 +314,8 @@ def approximate_nearest_neighbor(
     Database rows in lists around k-means centers; of each query the lists of the four nearest centers are
     searched (Jégou, Douze, Schmid, "Product quantization for nearest neighbor search", TPAMI 2011, without
     the quantization). On spectral embeddings of surfaces, for a good map, 99.7 to 99.9 % of the queries find
-    the nearest row, the others one at nearly the same distance; for a poor map fewer do. Under `vmap` examples
-    are searched one after the other.
+    the nearest row, the others one at nearly the same distance; for a poor map fewer do. Under `vmap`
+    examples are searched one after the other.
 
     **Arguments:**
 
