@@ -164,7 +164,7 @@ def _solve_component(
     attempts = []
     if eigensolver == "approximate" and n >= _DIMENSIONS_OF_SUBSPACE * k:
         attempts.append(lambda: (*_approximate(stiffness, mass, k), np.inf))
-    if n <= max(_DENSE, _most_vectors(k)):
+    if n <= _DENSE or 3 * k > n:
         attempts.append(lambda: (*_dense(stiffness, areas, k), _RESIDUAL_TOLERANCE))
     else:
         attempts.append(lambda: (*_lanczos(stiffness, mass, k), _RESIDUAL_TOLERANCE))
@@ -250,7 +250,7 @@ def _lanczos(
     **Raises:** `RuntimeError` if they do not settle.
     """
     n = stiffness.shape[0]
-    most = _most_vectors(k)
+    most = min(n - 1, 10 * k + 100)  # five copies of every eigenvalue, as an icosahedron has
     generator = np.random.default_rng(0)
     shift, inverse = _factorized_midway(stiffness, mass, k)
     vectors = np.empty((most + 1, n))
@@ -302,11 +302,6 @@ def _lanczos(
             pending.append((0, _another(generator, inverse, mass, known)))
             look = last + k // 2
     raise RuntimeError("the Lanczos vectors have not settled")
-
-
-def _most_vectors(k: int) -> int:
-    """Enough for five copies of every eigenvalue, as an icosahedron has."""
-    return 10 * k + 100
 
 
 def _another(
