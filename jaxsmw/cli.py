@@ -280,8 +280,8 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "exhaustive", "patches", "approximate"),
         default="auto",
         help="for nearest neighbours: exhaustive and patches find the same ones, patches faster on large "
-        "meshes, and auto takes the faster; approximate misses a few in a thousand (jaxsmw[approximate]; "
-        "default: %(default)s)",
+        "meshes, and auto takes the faster; approximate misses some (jaxsmw[approximate]; default: "
+        "%(default)s)",
     )
     group.add_argument(
         "--stop-when-unchanged", action="store_true", help="end early when no match changes any more"
@@ -335,8 +335,8 @@ def _add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         "--eigensolver",
         choices=("auto", "exact", "approximate"),
         default="auto",
-        help="approximate is within 1 to 2 %% of the eigenvalues and fast on large meshes; auto uses it from "
-        "50000 vertices on (default: %(default)s)",
+        help="approximate is within 1 to 2 %% of the eigenvalues, where triangles are even, and fast on "
+        "large meshes; auto uses it from 50000 vertices on (default: %(default)s)",
     )
 
 

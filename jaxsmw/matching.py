@@ -27,7 +27,7 @@ from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature,
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, eigenpairs
+from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
@@ -209,6 +209,8 @@ def paired_spectra(
 
     **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
     """
+    if eigensolver == "auto":  # the same for both, whose spectra are compared
+        eigensolver = choose_eigensolver(mesh_x, mesh_y)
     pairs = _side_by_side(
         lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
         mesh_x,

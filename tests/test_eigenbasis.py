@@ -1,5 +1,7 @@
 """Eigenbases against closed forms, an independent program, and meshes that make trouble."""
 
+import contextlib
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -267,6 +269,53 @@ def test_a_multiple_eigenvalue_of_a_subspace_is_found_whole():
         eigenpairs(make_mesh(*sphere_mesh(5)), 49, eigensolver=s)[0] for s in ("exact", "approximate")
     )
     np.testing.assert_allclose(approximate, exact, rtol=0.02)
+
+
+def graded_sphere(subdivisions):
+    """Triangles at one end a hundred times as long as at the other."""
+    vertices, faces = sphere_mesh(subdivisions)
+    vertices = vertices + np.array([0, 0, 0.9])
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+
+
+def bipyramid():
+    turn = np.linspace(0, 2 * np.pi, 1500, endpoint=False)
+    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(1500)], axis=1)
+    edge = np.stack([np.arange(1500), np.roll(np.arange(1500), -1)], axis=1)
+    faces = [np.insert(edge, 2, 1500, axis=1), np.insert(edge[:, ::-1], 2, 1501, axis=1)]
+    return np.concatenate([rim, [[0, 0, 1], [0, 0, -1]]]), np.concatenate(faces)
+
+
+def stretched(factor):
+    vertices, faces = grid_mesh(60, 60)
+    return vertices * [1, factor, 1], faces
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [bipyramid(), graded_sphere(5), stretched(5), stretched(20), sphere_mesh(1)],
+    ids=lambda s: len(s[0]),
+)
+def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
+    """Vertices with too many neighbours, triangles of very different sizes, long ones, too few."""
+    mesh = make_mesh(*shape)
+    k = 20 if len(mesh.vertices) > 100 else 1
+    with pytest.warns(RuntimeWarning, match="cannot be approximated") if k > 1 else contextlib.nullcontext():
+        found = eigenpairs(mesh, k, eigensolver="approximate")
+    for a, b in zip(found, eigenpairs(mesh, k, eigensolver="exact"), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("vertices", [(700, 3), (40, 40)])
+def test_the_shift_is_the_one_factorized(vertices):
+    positions, faces = grid_mesh(*vertices)
+    stiffness, areas = assemble_laplacian(make_mesh(positions * [1, 1000, 1], faces), laplacian="cotangent")
+    mass = sp.diags(areas / areas.sum()).tocsc()
+    shift, inverse = eigenbasis._factorized_midway(stiffness, mass, 30)
+    right = np.random.default_rng(0).normal(size=len(areas))
+    np.testing.assert_allclose(
+        stiffness @ inverse.solve(right) - shift * (mass @ inverse.solve(right)), right, atol=1e-4
+    )
 
 
 def test_which_eigensolver_is_used(monkeypatch):

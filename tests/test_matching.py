@@ -15,6 +15,7 @@ from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.errors import InputError
+from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import initial_map, match, paired_spectra
@@ -69,6 +70,17 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
         np.testing.assert_array_equal(start[init[:, 0]], init[:, 1])
     result = match(mesh_x, mesh_y, init=init, **OPTIONS)
     assert mean_error(mesh_y, result.pointwise_map, truth) < 0.02
+
+
+def test_both_shapes_have_the_same_eigensolver(pair, monkeypatch):
+    """Also where one is larger than what is approximated, and the other is not."""
+    mesh_x = pair[0]
+    monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
+    smaller = bumpy_mesh(3)
+    spectrum_x, spectrum_y = paired_spectra(mesh_x, smaller, 10)
+    for mesh, spectrum in ((mesh_x, spectrum_x), (smaller, spectrum_y)):
+        wanted = compute_spectrum(mesh, 10, eigensolver="approximate").eigenvalues
+        np.testing.assert_array_equal(spectrum.eigenvalues, wanted)
 
 
 def test_the_approximate_eigenbasis_matches_as_well(pair):

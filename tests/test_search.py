@@ -215,6 +215,15 @@ def test_approximate_search_under_vmap_and_again(embedding):
     np.testing.assert_array_equal(jax.vmap(approximate_nearest_neighbor, (None, 0))(embedding, both), looped)
 
 
-def test_approximate_search_of_bad_numbers_ends(embedding):
+def test_approximate_search_of_bad_numbers_finds_no_row(embedding):
     found = approximate_nearest_neighbor(embedding, embedding.at[3, 4].set(jnp.nan))
-    assert found.shape == (2562,)
+    np.testing.assert_array_equal(found, 2562)
+    found = approximate_nearest_neighbor(embedding.at[3, 4].set(jnp.nan), embedding)
+    assert found[3] == 2562 and (found[:3] < 2562).all()
+
+
+@pytest.mark.parametrize("rows", [1, 3, 10])
+def test_approximate_search_among_few(embedding, rows):
+    database = embedding[:rows]
+    found = approximate_nearest_neighbor(embedding, database)
+    assert (found == nearest_neighbor(embedding, database)).mean() > 0.9

@@ -132,7 +132,8 @@ class WaveletPreservation(Refiner):
     - `search`: how nearest neighbours are found. `"exhaustive"` compares all with all; `"patches"` finds the
       same but leaves out patches of the target that are too far away, which is several times as fast on a
       CPU but takes seconds longer to compile; `"auto"` does that on CPUs from 15 000 vertices.
-      `"approximate"` misses a few in a thousand (`approximate_nearest_neighbor`, needs FAISS).
+      `"approximate"` misses a few in a thousand of a good map, more of a poor one
+      (`approximate_nearest_neighbor`, needs FAISS).
     """
 
     bank: FilterBank = Meyer()

@@ -337,8 +337,8 @@ def _search_lists(queries: Array, database: Array, mask: Array) -> np.ndarray:
     allowed = np.flatnonzero(mask)
     rows = np.ascontiguousarray(np.asarray(database)[allowed], np.float32)
     if not np.isfinite(rows).all() or not len(rows):
-        return np.zeros(len(queries), np.int32)  # whoever asks has to notice
-    number = max(1, round(_LISTS * len(rows) ** 0.5))
+        return np.full(len(queries), len(mask), np.int32)  # no row, as the exact searches say
+    number = min(len(rows), round(_LISTS * len(rows) ** 0.5))
     dimensions = rows.shape[1]
     lists = faiss.IndexIVFFlat(faiss.IndexFlatL2(dimensions), dimensions, number)
     lists.cp.niter, lists.cp.min_points_per_centroid = _TURNS, 1
@@ -346,7 +346,8 @@ def _search_lists(queries: Array, database: Array, mask: Array) -> np.ndarray:
     lists.add(rows)
     lists.nprobe = _SEARCHED
     _, found = lists.search(np.ascontiguousarray(queries, np.float32), 1)
-    return allowed[found[:, 0]].astype(np.int32)
+    # -1, the last here, is for queries that are no numbers.
+    return np.append(allowed, len(mask))[found[:, 0]].astype(np.int32)
 
 
 # Lists for each square root of the number of rows; how k-means goes to them; how many are searched.

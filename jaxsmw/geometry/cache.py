@@ -92,9 +92,9 @@ def recomputing() -> Iterator[None]:
 def keep_programs() -> None:
     """Let JAX, not imported yet, keep what it compiles beside our results, for the next process.
 
-    By settings of its own in the environment, of which those that are there already stay. What is compiled
-    for one kind of processor must not run on another, which JAX does not tell apart, and a cache may be on a
-    shared disk.
+    By settings of its own in the environment, unless some are there already; at most 0.25 GiB. What is
+    compiled for one kind of processor must not run on another, which JAX does not tell apart, and a cache may
+    be on a shared disk.
     """
     place = _place()
     if place is None:
@@ -112,7 +112,7 @@ def keep_programs() -> None:
         return  # `cached` says so
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
-        "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**28),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
         # Many small programs take as long to compile as one large one.
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -22,13 +23,14 @@ class Coarsening(NamedTuple):
 
     - `prolongation`: P (n, c), from coefficients to values at vertices; its rows sum to one.
     - `stiffness`, `mass`: P^T W P and P^T A P, (c, c).
-    - `smooth`: what was done to make P smooth, for vectors (n, j).
+    - `lift`: from coefficients (c, j) to values (n, j), smoothed once more; in single precision, whose errors
+      are far below those of the subspace.
     """
 
     prolongation: sp.csr_matrix
     stiffness: sp.csc_matrix
     mass: sp.csc_matrix
-    smooth: Callable[[np.ndarray], np.ndarray]
+    lift: Callable[[np.ndarray], np.ndarray]
 
 
 def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> Coarsening:
@@ -44,9 +46,12 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     - `mass`: A (n, n).
     - `dimensions`: how many are wanted; the outcome is near it, and at most about n / 4.
 
-    **Raises:** `RuntimeError` if W has no positive diagonal.
+    **Raises:** `RuntimeError` if W has no positive diagonal, or a vertex so many neighbours that the smoothed
+    indicators would overlap everywhere.
     """
     n = stiffness.shape[0]
+    if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
+        raise RuntimeError(f"a vertex has {most - 1} neighbours")
     # With seeds more than r edges apart a cell has on average about 1.25 (r + 1)² vertices.
     radius = max(1, round((n / (1.25 * dimensions)) ** 0.5) - 1)
     stiffness = stiffness.tocsr()
@@ -56,12 +61,17 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     cells = _cells(edges, radius)
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
     prolongation = smoother(cells, radius + 1)
+    single = prolongation.astype(np.float32)
+    rough = smoother.single()
     return Coarsening(
         prolongation,
         (prolongation.T @ (stiffness @ prolongation)).tocsc(),
         (prolongation.T @ (mass @ prolongation)).tocsc(),
-        lambda vectors: smoother(vectors, radius),
+        lambda coefficients: rough(single @ coefficients.astype(np.float32), radius),
     )
+
+
+_MOST_NEIGHBORS = 100
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
@@ -91,6 +101,12 @@ class _Smoother:
         lowest = highest * min(1.5 / size, 0.5)
         self.center, self.half = (highest + lowest) / 2, (highest - lowest) / 2
         self.operator = sp.diags(1 / diagonal) @ stiffness
+
+    def single(self) -> _Smoother:
+        """The same in single precision."""
+        other = copy(self)
+        other.operator = self.operator.astype(np.float32)
+        return other
 
     def __call__(self, vectors: Matrix, degree: int) -> Matrix:
         """p(D^-1 W) times vectors, p of the degree, by the three-term recurrence."""

@@ -60,7 +60,8 @@ def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     """About so many vertices, spread evenly over the area however dense the mesh is where.
 
     As many as fit no two of which are nearer to each other, in space, than a distance that follows from the
-    area (Poisson-disk sampling); much faster than `farthest_point_samples` when they are many.
+    area (Poisson-disk sampling); much faster than `farthest_point_samples` when they are many. Two sheets
+    nearer to each other than that share their samples.
 
     **Arguments:**
 
