@@ -545,27 +545,30 @@ ZOOMOUT_STEPS = 16
 
 
 def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Seconds and memory over sizes, of what was measured at more than one."""
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
-    for axis, part in zip(axes[:2], ("refinement", "eigenbasis"), strict=True):
-        measured = numbers.get(part, [])
-        for name in {name: None for m in measured for name in m["seconds"]}:
-            points = [(np.max(m["vertices"]), m["seconds"][name]) for m in measured if name in m["seconds"]]
-            axis.loglog(*zip(*points, strict=True), "o-", label=name)
-        axis.set_title(part.capitalize())
-    for measured in numbers.get("scale", [])[:1]:
-        sizes = [m["vertices"] for m in measured["measured"]]
-        for name in measured["measured"][0]["seconds"]:
-            axes[2].loglog(sizes, [m["seconds"][name] for m in measured["measured"]], "o-", label=name)
-        peaks = [max(m["peak_gib"].values()) for m in measured["measured"]]
-        axes[2].loglog(sizes, peaks, "k--", label="peak memory, GiB")
-        axes[2].set_title("From files to map")
-    for axis in axes:
-        axis.set_xlabel("vertices")
-        axis.set_ylabel("seconds")
-        if axis.lines:
-            axis.legend(fontsize=8)
+    """Seconds and memory over sizes, of the parts that have several."""
+    panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for part in ("refinement", "eigenbasis"):
+        for measured in numbers.get(part, []):
+            curves = panels.setdefault(part.capitalize(), {})
+            for name, seconds in measured["seconds"].items():
+                curves.setdefault(name, []).append((int(np.max(measured["vertices"])), seconds))
+    for measured in numbers["scale"][0]["measured"] if numbers.get("scale") else ():
+        curves = panels.setdefault("From files to map", {})
+        peak = max(measured["peak_gib"].values())
+        for name, value in {**measured["seconds"], "peak memory, GiB": peak}.items():
+            curves.setdefault(name, []).append((measured["vertices"], value))
+    if not panels:
+        return
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(5 * len(panels), 4.5), layout="constrained", squeeze=False
+    )
+    for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
+        for name, points in curves.items():
+            axis.loglog(*zip(*points, strict=True), "k--" if "GiB" in name else "o-", label=name)
+        axis.set(title=title, xlabel="vertices", ylabel="seconds")
+        axis.legend(fontsize=8)
     save_figure(file, figure)
+    plt.close(figure)
 
 
 PARTS = {part.__name__: part for part in (refinement, eigenbasis, stages, command, peers, scale)}
