@@ -318,7 +318,7 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
 
     The first vertices are those of the mesh.
     """
-    vertices, faces = mesh.vertices, mesh.faces.copy()
+    vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
         sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
         edges, edge_of_side = np.unique(sides, axis=0, return_inverse=True)
@@ -328,21 +328,36 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
         middle[split] = len(vertices) + np.arange(len(split))
         vertices = np.concatenate([vertices, vertices[edges[split]].mean(axis=1)])
         middles = middle[edge_of_side].reshape(-1, 3)
-        # One edge after the other; what is split off keeps the edges that are not its own for the next.
-        for _ in range(2):
-            side = np.argmax(middles, axis=1)
-            rows = np.flatnonzero(middles[np.arange(len(faces)), side] >= 0)
-            turn = (side[rows, None] + np.arange(3)) % 3
-            a, b, c = np.take_along_axis(faces[rows], turn, axis=1).T
-            new, *others = np.take_along_axis(middles[rows], turn, axis=1).T
-            none = np.full(len(rows), -1)
-            faces[rows], middles[rows] = np.stack([a, new, c], 1), np.stack([none, none, others[1]], 1)
-            faces = np.concatenate([faces, np.stack([new, b, c], axis=1)])
-            middles = np.concatenate([middles, np.stack([none, others[0], none], axis=1)])
+        faces = np.concatenate([split_faces(faces, middles, number) for number in range(4)])
     if len(vertices) > len(mesh.vertices):
         edge = np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean()
         vertices = vertices + 0.1 * edge * np.random.default_rng(seed).standard_normal(vertices.shape)
     return make_mesh(vertices, faces, name=mesh.name)
+
+
+def split_faces(
+    faces: Int64[np.ndarray, "f 3"], middles: Int64[np.ndarray, "f 3"], number: int
+) -> Int64[np.ndarray, "g 3"]:
+    """What becomes of the faces with so many split edges: into four like itself where all three are.
+
+    `middles` has the new vertices on a face's edges, from corner i to the next; -1 where there is none.
+    """
+    chosen = (middles >= 0).sum(axis=1) == number
+    faces, middles = faces[chosen], middles[chosen]
+    # The one that is not split comes last; of a single one that is, first.
+    first = (np.argmin(middles >= 0, axis=1) + 1) % 3
+    if number == 1:
+        first = np.argmax(middles, axis=1)
+    turn = (first[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces, turn, axis=1).T
+    ab, bc, ca = np.take_along_axis(middles, turn, axis=1).T
+    parts = {
+        0: [(a, b, c)],
+        1: [(a, ab, c), (ab, b, c)],
+        2: [(ab, b, bc), (a, ab, bc), (a, bc, c)],
+        3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+    }
+    return np.concatenate([np.stack(corners, axis=1) for corners in parts[number]])
 
 
 def peak_memory() -> float:
