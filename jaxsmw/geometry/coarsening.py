@@ -23,22 +23,24 @@ class Coarsening(NamedTuple):
 
     - `prolongation`: P (n, c), from coefficients to values at vertices; its rows sum to one.
     - `stiffness`, `mass`: P^T W P and P^T A P, (c, c).
-    - `lift`: from coefficients (c, j) to values (n, j), smoothed once more; in single precision, whose errors
-      are far below those of the subspace.
+    - `smooth`: from values (n, j) to what of them cells can show, and a little beyond.
+
+    Prolongation and smoothing are in single precision, whose errors are far below those of the subspace.
     """
 
     prolongation: sp.csr_matrix
     stiffness: sp.csc_matrix
     mass: sp.csc_matrix
-    lift: Callable[[np.ndarray], np.ndarray]
+    smooth: Callable[[np.ndarray], np.ndarray]
 
 
 def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> Coarsening:
     """Smoothed aggregation: vertices in cells around evenly spread ones, the cells' indicators smoothed.
 
     Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-    problems", Computing 1996, in a single step whatever the size of the cells: their radius in edges gives
-    the degree of the Chebyshev polynomial that smooths.
+    problems", Computing 1996, in a single step whatever the size of the cells: one and a half times their
+    radius in edges is the degree of the Chebyshev polynomial that smooths. (The radius alone costs a fifth
+    less, and makes errors of eigenvalues ten times as large.)
 
     **Arguments:**
 
@@ -46,8 +48,8 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     - `mass`: A (n, n).
     - `dimensions`: how many are wanted; the outcome is near it, and at most about n / 4.
 
-    **Raises:** `RuntimeError` if W has no positive diagonal, or a vertex so many neighbours that the smoothed
-    indicators would overlap everywhere.
+    **Raises:** `RuntimeError` if W has no positive diagonal, a vertex so many neighbours that the smoothed
+    indicators would overlap everywhere, or much of the area cells much larger than elsewhere.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
@@ -59,19 +61,25 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
         (np.ones(stiffness.nnz, bool), stiffness.indices, stiffness.indptr), stiffness.shape
     )
     cells = _cells(edges, radius)
+    areas = cells.T @ mass.diagonal()
+    share = areas[areas > _LARGE / dimensions * areas.sum()].sum() / areas.sum()
+    if share > _MOST_IN_LARGE:
+        raise RuntimeError(f"{share:.0%} of its area is in triangles much larger than the others")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
-    prolongation = smoother(cells, radius + 1)
-    single = prolongation.astype(np.float32)
+    degree = round(1.5 * (radius + 1))
+    prolongation = smoother(cells, degree)
     rough = smoother.single()
     return Coarsening(
-        prolongation,
+        prolongation.astype(np.float32),
         (prolongation.T @ (stiffness @ prolongation)).tocsc(),
         (prolongation.T @ (mass @ prolongation)).tocsc(),
-        lambda coefficients: rough(single @ coefficients.astype(np.float32), radius),
+        lambda values: rough(values.astype(np.float32), degree - 1),
     )
 
 
 _MOST_NEIGHBORS = 100
+# A cell is large from four times the area that each would have if all had the same.
+_LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
