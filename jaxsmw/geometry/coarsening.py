@@ -124,6 +124,10 @@ class _Smoother:
         vectors = vectors + step
         for _ in range(degree - 1):
             previous, ratio = ratio, 1 / (2 * slope - ratio)
-            step = step * (ratio * previous) - (self.operator @ vectors) * (2 * ratio / self.half)
-            vectors = vectors + step
+            # In place, where they are dense: these are the largest arrays there are.
+            step *= ratio * previous
+            change = self.operator @ vectors
+            change *= 2 * ratio / self.half
+            step -= change
+            vectors += step
         return vectors

@@ -358,13 +358,13 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
         _, combinations = _arpack(coarse.stiffness, coarse.mass, taken)
     n, single = stiffness.shape[0], combinations.astype(np.float32)
     basis, eigenvectors = np.empty((n, taken)), np.empty((n, k))
-    grams = np.empty((2, taken, taken))
+    grams = np.zeros((2, taken, taken))  # their upper triangles
     for columns in _slices(taken):
         basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
     for columns in _slices(taken):
         for gram, matrix in zip(grams, (stiffness, mass), strict=True):
-            gram[:, columns] = basis.T @ (matrix @ basis[:, columns])
-    eigenvalues, combinations = scipy.linalg.eigh(*grams, subset_by_index=(0, k - 1))
+            gram[: columns.stop, columns] = basis[:, : columns.stop].T @ (matrix @ basis[:, columns])
+    eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
     last = slice(max(1, k - 10), k)
