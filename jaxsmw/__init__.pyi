@@ -1,3 +1,4 @@
+from .compilation import compiler_options
 from .core.batch import refine_pairs, stack
 from .core.filters import (
     ControlPoints,
@@ -102,6 +103,7 @@ __all__ = [
     "WaveletPreservation",
     "WaveletProblem",
     "approximate_nearest_neighbor",
+    "compiler_options",
     "compute_spectrum",
     "coverage",
     "creature_pair",

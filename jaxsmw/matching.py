@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from jaxsmw.compilation import compiled
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
@@ -164,7 +165,7 @@ def match(
                 samples[side] = jnp.asarray(farthest_point_samples(mesh, number_of_samples))
     with _stage("refinement", seconds):
         refinement = jax.block_until_ready(
-            refine(
+            compiled(refine)(
                 spectrum_x,
                 spectrum_y,
                 jnp.asarray(start),
@@ -276,7 +277,7 @@ def initial_map(
             f"{len(spectrum_x.eigenvalues)} eigenvectors; ask for more, or start from another map."
         )
     dtype = spectrum_x.eigenvectors.dtype
-    nearest = _nearest_neighbor(
+    nearest = compiled(nearest_neighbor)(
         jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=y.spectrum.mask
     )
     start = np.asarray(nearest).astype(np.int64)
@@ -287,10 +288,6 @@ def initial_map(
     if not isinstance(init, str):
         start[given[:, 0]] = given[:, 1]
     return _extend_to_unused(mesh_x, start)
-
-
-# One program instead of many, and compiled once for shapes of one size.
-_nearest_neighbor = jax.jit(nearest_neighbor)
 
 
 class _Thinned(NamedTuple):

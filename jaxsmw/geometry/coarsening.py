@@ -62,7 +62,7 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     )
     cells = _cells(edges, radius)
     areas = cells.T @ mass.diagonal()
-    share = areas[areas > _LARGE / dimensions * areas.sum()].sum() / areas.sum()
+    share = areas[areas > _LARGE * areas.sum() / min(dimensions, len(areas))].sum() / areas.sum()
     if share > _MOST_IN_LARGE:
         raise RuntimeError(f"{share:.0%} of its area is in triangles much larger than the others")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
