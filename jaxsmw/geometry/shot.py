@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from jaxtyping import Float64, Int64
+import scipy.sparse as sp
+from jaxtyping import Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
@@ -123,16 +124,23 @@ def _describe(
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
-    histogram = np.zeros(len(block) * _DIMENSION)
-    for azimuth_bin, azimuth_weight in _soft_bins(azimuth, _AZIMUTH, periodic=True):
-        for elevation_bin, elevation_weight in _soft_bins(elevation, _ELEVATION):
-            for shell_bin, shell_weight in _soft_bins(shell, _RADIAL):
-                volume = (azimuth_bin * _ELEVATION + elevation_bin) * _RADIAL + shell_bin
-                start = center * _DIMENSION + volume * _COSINE
-                weight = azimuth_weight * elevation_weight * shell_weight
-                for cosine_bin, cosine_weight in _soft_bins(bin_of_cosine, _COSINE):
-                    histogram += np.bincount(start + cosine_bin, weight * cosine_weight, len(histogram))
-    descriptors = histogram.reshape(len(block), _DIMENSION)
+    # A pair has two bins in each direction. Of elevation and distance there are no more, and every pair has
+    # weights in all of them; azimuth and cosine say to which rows of the histogram these are added.
+    upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
+    shares = np.empty((len(center), _ELEVATION * _RADIAL))
+    for low, of_elevation in enumerate((1 - upper, upper)):
+        for near, of_distance in enumerate((1 - outer, outer)):
+            np.multiply(of_elevation, of_distance, out=shares[:, low * _RADIAL + near])
+    histogram = np.zeros((len(block) * _AZIMUTH * _COSINE, _ELEVATION * _RADIAL))
+    first, each = center.astype(np.int32) * (_AZIMUTH * _COSINE), np.arange(len(center) + 1, dtype=np.int32)
+    for sector, sector_weight in _two_nearest(azimuth):
+        start = first + sector % _AZIMUTH * _COSINE
+        for level, level_weight in _two_nearest(bin_of_cosine):
+            rows = start + np.minimum(level, _COSINE - 1)  # beyond the last bin the weight is zero
+            weights = sector_weight * level_weight
+            histogram += sp.csc_array((weights, rows, each), (len(histogram), len(center))) @ shares
+    shape = len(block), _AZIMUTH, _COSINE, _ELEVATION * _RADIAL
+    descriptors = histogram.reshape(shape).swapaxes(2, 3).reshape(len(block), _DIMENSION)
     descriptors[np.bincount(center, minlength=len(block)) < _FEWEST_NEIGHBORS] = 0
     norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
     return descriptors / np.where(norms > 0, norms, 1)
@@ -164,16 +172,11 @@ def _local_frames(
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _soft_bins(
-    coordinate: Float64[np.ndarray, " p"], bins: int, *, periodic: bool = False
-) -> list[tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, " p"]]]:
-    """The two nearest bins and their linear weights; beyond the outermost centres one bin gets all."""
+def _two_nearest(
+    coordinate: Float64[np.ndarray, " p"],
+) -> list[tuple[Int32[np.ndarray, " p"], Float64[np.ndarray, " p"]]]:
+    """The two nearest bins and their linear weights."""
     lower = np.floor(coordinate)
     upper_weight = coordinate - lower
-    lower_bin = lower.astype(np.int64)
-    if periodic:
-        return [(lower_bin % bins, 1 - upper_weight), ((lower_bin + 1) % bins, upper_weight)]
-    return [
-        (np.clip(lower_bin, 0, bins - 1), 1 - upper_weight),
-        (np.clip(lower_bin + 1, 0, bins - 1), upper_weight),
-    ]
+    bins = lower.astype(np.int32)
+    return [(bins, 1 - upper_weight), (bins + 1, upper_weight)]
