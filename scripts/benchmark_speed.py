@@ -37,6 +37,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -46,12 +47,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Int64
+from jaxtyping import Array, Float32, Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
+from jaxsmw.compilation import compiled
+from jaxsmw.core.refinement import Refiner, Search, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.files import make_directory
 from jaxsmw.geometry.creature import creature_pair
@@ -115,9 +117,16 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
     # In blocks that stay in the processor's cache, of which as little as possible is kept.
     rows = x.eigenvectors
     blocks = jnp.pad(rows, ((0, -rows.shape[0] % 256), (0, 0))).reshape(-1, 256, rows.shape[1])
-    blocked = jax.jit(lambda a, b: jax.lax.map(lambda block: jnp.max(block @ b.T, axis=1), a))
+
+    def blocked(a: Float32[Array, "b 256 k"], b: Float32[Array, "n k"]) -> Float32[Array, "b 256"]:
+        return jax.lax.map(lambda block: jnp.max(block @ b.T, axis=1), a)
+
+    usual, ours = jax.jit(blocked), compiled(blocked)
     found: dict[str, Callable[[], object]] = {
-        "products, JAX in blocks": lambda: [blocked(blocks, y.eigenvectors) for _ in range(ITERATIONS)]
+        "products, JAX in blocks": lambda: [ours(blocks, y.eigenvectors) for _ in range(ITERATIONS)],
+        "products, JAX in blocks, XLA's defaults": lambda: [
+            usual(blocks, y.eigenvectors) for _ in range(ITERATIONS)
+        ],
     }
     if rows.shape[0] <= STORED:
         product = jax.jit(lambda a, b: a @ b.T)
@@ -137,19 +146,22 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         start = jnp.asarray(initial_map(*meshes, x, y, init="shot" if size <= STORED else "wks"))
         samples = [jnp.asarray(farthest_point_samples(mesh, SAMPLES)) for mesh in meshes]
 
-        def refined(refiner: Refiner, *sampled: Any, x=x, y=y, start=start) -> Callable[[], Any]:
+        def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
             chosen = dict(zip(("samples_x", "samples_y"), sampled, strict=False))
-            return lambda: refine(x, y, start, refiner=refiner, iterations=ITERATIONS, **chosen)
+            return lambda: run(x, y, start, refiner=refiner, iterations=ITERATIONS, **chosen)
 
+        ours = compiled(refine)
         exhaustive, patches = (WaveletPreservation(search=search) for search in ("exhaustive", "patches"))
         candidates = {
-            "all with all": refined(exhaustive),
-            "in patches": refined(patches),
-            "on samples": refined(exhaustive, *samples),
-            "on samples, in patches": refined(patches, *samples),
+            "all with all": refined(exhaustive, run=ours),
+            "in patches": refined(patches, run=ours),
+            "all with all, XLA's defaults": refined(exhaustive),
+            "in patches, XLA's defaults": refined(patches),
+            "on samples": refined(exhaustive, *samples, run=ours),
+            "on samples, in patches": refined(patches, *samples, run=ours),
         }
         if size <= STORED:
-            candidates["plain argmin"] = refined(PlainSearch())
+            candidates["plain argmin"] = refined(PlainSearch(), run=ours)
         alone = products(x, y)
         seconds = medians(alone | candidates, options.repeats if size <= STORED else 3)
         floor = min(alone, key=lambda name: seconds[name])
@@ -441,13 +453,16 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         files = [str(Path(directory) / f"{side}.off") for side in range(2)]
         for file, mesh in zip(files, truth.meshes, strict=True):
             write_mesh(Path(file), mesh)
-        runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {"ours": ours_from_files}
+        runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {
+            "ours": ours_from_files,
+            "ours, search in patches": partial(ours_from_files, search="patches"),
+        }
         if "pyFM" not in missing:
             runs["pyFM, its defaults"] = pyfm_defaults_from_files
             runs["pyFM, ZoomOut 20 to 100 from our start"] = pyfm_from_files
         if "geomfum" not in missing:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
-        our_start(files)
+        our_start(*files)
         measured: dict[str, dict[str, Any]] = {}
         for turn in range(2 if options.quick else 4):  # the first compiles
             for name, run in runs.items():
@@ -485,18 +500,22 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     )
 
 
-def ours_from_files(files: list[str]) -> tuple[np.ndarray, float]:
+def ours_from_files(files: list[str], search: Search = "auto") -> tuple[np.ndarray, float]:
     """The map, and the seconds of refinement alone."""
-    result = match(*map(read_mesh, files), number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS)
+    result = match(
+        *map(read_mesh, files),
+        number_of_eigenvectors=EIGENVECTORS,
+        iterations=ITERATIONS,
+        refiner=WaveletPreservation(search=search),
+    )
     return result.pointwise_map, result.seconds["refinement"]
 
 
-def our_start(files: list[str], kept: dict[tuple[str, ...], np.ndarray] = {}) -> np.ndarray:  # noqa: B006
+@cache
+def our_start(*files: str) -> np.ndarray:
     """The initial map of `match`, kept from call to call: peers are not charged for it."""
-    if tuple(files) not in kept:
-        meshes = [read_mesh(file) for file in files]
-        kept[tuple(files)] = initial_map(*meshes, *paired_spectra(*meshes, EIGENVECTORS))
-    return kept[tuple(files)]
+    meshes = [read_mesh(file) for file in files]
+    return initial_map(*meshes, *paired_spectra(*meshes, EIGENVECTORS))
 
 
 def pyfm_defaults_from_files(files: list[str]) -> tuple[np.ndarray, float]:
@@ -520,7 +539,7 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     from pyFM.refine import zoomout_refine
     from pyFM.spectral import p2p_to_FM
 
-    first = our_start(files)
+    first = our_start(*files)
     x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
     start = time.perf_counter()
     k = EIGENVECTORS - ZOOMOUT_STEPS * 5
@@ -545,7 +564,7 @@ def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     from geomfum.refine import ZoomOut
     from geomfum.shape import TriangleMesh
 
-    first = our_start(files)
+    first = our_start(*files)
     find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
     x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
     start = time.perf_counter()
