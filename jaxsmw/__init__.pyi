@@ -1,5 +1,5 @@
-from .compilation import compiler_options
 from .core.batch import refine_pairs, stack
+from .core.compilation import compiler_options
 from .core.filters import (
     ControlPoints,
     CubicSpline,

@@ -335,8 +335,8 @@ def _add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         "--eigensolver",
         choices=("auto", "exact", "approximate"),
         default="auto",
-        help="approximate is within 1 to 2 %% of the eigenvalues, where triangles are even, and fast on "
-        "large meshes; auto uses it from 50000 vertices on (default: %(default)s)",
+        help="approximate is within a few per mille of the eigenvalues, where triangles are even, and fast "
+        "on large meshes; auto uses it from 50000 vertices on (default: %(default)s)",
     )
 
 

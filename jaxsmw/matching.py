@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.compilation import compiled
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence

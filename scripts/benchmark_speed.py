@@ -52,7 +52,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.compilation import compiled
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refiner, Search, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.files import make_directory

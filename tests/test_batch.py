@@ -128,13 +128,13 @@ def test_one_compilation_for_each_combination_of_sizes():
 def test_memory_picks_the_batch_size(monkeypatch):
     spectra, starts = make_problem()
     sizes = []
-    original = batch._refine_batch
+    original = batch.compiled(batch._refine_batch)
 
     def spy(refiner, pairs, *rest):
         sizes.append(len(pairs[-1]))
         return original(refiner, pairs, *rest)
 
-    monkeypatch.setattr(batch, "_refine_batch", spy)
+    monkeypatch.setattr(batch, "compiled", lambda function: spy)
     monkeypatch.setattr(batch, "_one_at_a_time", lambda device: False)
     list(refine_pairs(spectra, PAIRS, starts, memory=10**9))
     assert sorted(sizes) == [1, 2, 4]

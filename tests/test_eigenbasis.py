@@ -1,6 +1,5 @@
 """Eigenbases against closed forms, an independent program, and meshes that make trouble."""
 
-import contextlib
 import warnings
 
 import jax.numpy as jnp
@@ -262,7 +261,7 @@ def test_larger_cells_are_smoothed_longer(subdivisions):
     """With four times the vertices, at the same number of dimensions, errors stay what they are."""
     mesh = bumpy_mesh(subdivisions)
     exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
-    np.testing.assert_allclose(approximate, exact, rtol=0.02)
+    np.testing.assert_allclose(approximate, exact, rtol=0.006)
 
 
 def test_a_multiple_eigenvalue_of_a_subspace_is_found_whole():
@@ -294,33 +293,59 @@ def stretched(factor):
 
 @pytest.mark.parametrize(
     "shape",
-    [bipyramid(), graded_sphere(5), stretched(5), stretched(20), sphere_mesh(1)],
-    ids=lambda s: len(s[0]),
+    [bipyramid(), graded_sphere(5), stretched(20)],
+    ids=["hubs", "graded", "stretched"],
 )
 def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
-    """Vertices with too many neighbours, triangles of very different sizes, long ones, too few."""
+    """Vertices with too many neighbours, triangles of very different sizes, long ones."""
     mesh = make_mesh(*shape)
-    k = 20 if len(mesh.vertices) > 100 else 1
-    with pytest.warns(RuntimeWarning, match="cannot be approximated") if k > 1 else contextlib.nullcontext():
-        found = eigenpairs(mesh, k, eigensolver="approximate")
-    for a, b in zip(found, eigenpairs(mesh, k, eigensolver="exact"), strict=True):
+    with pytest.warns(RuntimeWarning, match="cannot be approximated"):
+        found = eigenpairs(mesh, 20, eigensolver="approximate")
+    for a, b in zip(found, eigenpairs(mesh, 20, eigensolver="exact"), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("noise", [0, 0.1, 0.2, 0.3])
-@pytest.mark.parametrize("factor", [1, 2, 3, 4, 6, 10])
-def test_an_approximation_is_near_or_refused(factor, noise):
-    vertices, faces = stretched(factor)
-    edge = vertices[1, 0] - vertices[0, 0] or vertices[1, 1] - vertices[0, 1]
-    vertices = vertices + noise * abs(edge) * np.random.default_rng(0).normal(size=vertices.shape)
-    mesh = make_mesh(vertices, faces)
+def refused(mesh, k):
+    """Whether the eigenbasis is not approximated but exact; where it is approximated, it must be near."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        approximate, *_ = eigenpairs(mesh, 40, eigensolver="approximate")
-    exact, *_ = eigenpairs(mesh, 40, eigensolver="exact")
-    np.testing.assert_allclose(approximate, exact, rtol=1e-9 if caught else 0.06)
-    if factor == 1:
-        assert not caught
+        warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
+        approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
+    if not caught:
+        np.testing.assert_allclose(approximate, eigenpairs(mesh, k, eigensolver="exact")[0], rtol=0.06)
+    return bool(caught)
+
+
+# With cells of one edge around their seeds, and of three.
+@pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
+@pytest.mark.parametrize("noise", [0, 0.1, 0.3])
+@pytest.mark.parametrize("factor", [1, 2, 4, 6, 20])
+def test_an_approximation_is_near_or_refused(size, k, factor, noise):
+    vertices, faces = grid_mesh(size, size)
+    vertices = vertices * [1, factor, 1]
+    edge = 1 / (size - 1)
+    vertices = vertices + noise * edge * np.random.default_rng(0).normal(size=vertices.shape)
+    verdict = refused(make_mesh(vertices, faces), k)
+    if factor <= 2 or factor == 20:
+        assert verdict == (factor == 20)
+
+
+@pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
+def test_a_region_of_bad_triangles_is_not_overlooked(factor):
+    """A sheet of even triangles, a tenth of its area of long ones."""
+    (width, height), part = (100, 100), 10
+    vertices, faces = grid_mesh(width, height)
+    column = np.arange(len(vertices)) % width
+    steps = np.where(np.arange(1, width) <= width - 1 - part, 1.0, factor)
+    places = np.concatenate([[0], np.cumsum(steps)]) / (height - 1)
+    stretched_sheet = np.stack([places[column], vertices[:, 1], vertices[:, 2]], axis=1)
+    assert not refused(make_mesh(stretched_sheet, faces), 40) or factor > 3
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_the_approximation_of_the_first(k):
+    mesh = bumpy_mesh(4)
+    approximate, exact = (eigenpairs(mesh, k, eigensolver=s)[0] for s in ("approximate", "exact"))
+    np.testing.assert_allclose(approximate, exact, rtol=0.01)
 
 
 @pytest.mark.parametrize("vertices", [(700, 3), (40, 40)])

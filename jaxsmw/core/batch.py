@@ -15,6 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
 
@@ -138,7 +139,7 @@ def refine_pairs(
                     *(stack.rows([pairs[p][side] for p in filled]) for side, stack in enumerate(stacks)),
                     jax.device_put(np.stack(starts).astype(np.int32), NamedSharding(mesh, _DIVIDED)),
                 )
-                refined = _refine_batch(refiner, batch, mesh, settings)
+                refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
                 refined = multihost_utils.process_allgather(refined, tiled=True)
                 for row, position in enumerate(chosen):
                     yield position, _row(refined, row, len(pointwise_maps[position]))
@@ -181,7 +182,6 @@ def _take(leaves: Any, places: Int[Array, " batch"], mesh: Mesh) -> Any:
     return lax.with_sharding_constraint(taken, NamedSharding(mesh, _DIVIDED))
 
 
-@eqx.filter_jit
 def _refine_batch(refiner: Refiner, batch: Any, mesh: Mesh, settings: dict[str, Any]) -> Refinement:
     def one(pair: Any) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), start = pair

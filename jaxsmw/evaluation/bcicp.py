@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -32,6 +31,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -46,8 +46,6 @@ _SMALL_PIECE = 0.05
 _SPECTRAL_STEPS = 2
 # Vertices from which distances are searched at once.
 _SOURCES_AT_ONCE = 256
-
-_search = eqx.filter_jit(nearest_neighbor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +204,9 @@ def _within(graph: csr_array, radius: float) -> csr_array:
 def _nearest(queries: Float[np.ndarray, "m d"], database: Float[np.ndarray, "n d"]) -> np.ndarray:
     """The nearest database row of every query."""
     dtype = jnp.asarray(database).dtype
-    return np.asarray(_search(jnp.asarray(queries, dtype), jnp.asarray(database))).astype(np.int64)
+    return np.asarray(compiled(nearest_neighbor)(jnp.asarray(queries, dtype), jnp.asarray(database))).astype(
+        np.int64
+    )
 
 
 def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

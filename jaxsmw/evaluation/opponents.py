@@ -10,11 +10,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Int64
 
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.filters import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
@@ -162,7 +162,7 @@ class Refined(Method):
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         samples_x, samples_y = pair.sampled(self.number_of_samples)
-        refined = refine(
+        refined = compiled(refine)(
             *pair.truncated(self.number_of_eigenvectors),
             pair.start,
             refiner=self.refiner,
@@ -199,17 +199,15 @@ class ZoomOut(Method):
         samples_x, samples_y = pair.sampled(self.number_of_samples)
         if samples_x is not None:
             refiner, first = _UNFILTERED_ON_SAMPLES, pair.truncated(self.first)
-            pointwise_map = _decode(_encode(pair.start, *first), *_at(first, samples_x, samples_y))
+            functional_map = compiled(encode)(pair.start, *first)
+            pointwise_map = compiled(decode)(functional_map, *_at(first, samples_x, samples_y))
         for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
             spectra = _at(pair.truncated(k), samples_x, samples_y)
-            refined = refine(*spectra, pointwise_map, refiner=refiner, iterations=1)
+            refined = compiled(refine)(*spectra, pointwise_map, refiner=refiner, iterations=1)
             pointwise_map = refined.pointwise_map
         if samples_x is not None:
-            pointwise_map = _decode(refined.functional_map, *pair.truncated(k))
+            pointwise_map = compiled(decode)(refined.functional_map, *pair.truncated(k))
         return pointwise_map, refined.result
-
-
-_encode, _decode = eqx.filter_jit(encode), eqx.filter_jit(decode)
 
 
 def _at(

@@ -24,7 +24,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
 
 # Part of every key: count it up when what is stored under the same inputs changes.
-_FORMAT = 3
+_FORMAT = 4
 
 # The entries, and what a killed process may have left of one.
 _OWN_FILES = re.compile(r"([a-z-]+-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")

@@ -38,9 +38,9 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     """Smoothed aggregation: vertices in cells around evenly spread ones, the cells' indicators smoothed.
 
     Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-    problems", Computing 1996, in a single step whatever the size of the cells: one and a half times their
-    radius in edges is the degree of the Chebyshev polynomial that smooths. (The radius alone costs a fifth
-    less, and makes errors of eigenvalues ten times as large.)
+    problems", Computing 1996, in a single step whatever the size of the cells: one and a half times
+    their reach in edges is the degree of the Chebyshev polynomial that smooths. (Their reach alone costs a
+    fifth less, and makes errors of eigenvalues ten times as large.)
 
     **Arguments:**
 
@@ -66,7 +66,7 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     if share > _MOST_IN_LARGE:
         raise RuntimeError(f"{share:.0%} of its area is in triangles much larger than the others")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
-    degree = round(1.5 * (radius + 1))
+    degree = (3 * (radius + 1) + 1) // 2
     prolongation = smoother(cells, degree)
     rough = smoother.single()
     return Coarsening(

@@ -14,7 +14,7 @@ from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` counts on the twos
 _DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
@@ -136,7 +136,7 @@ def _describe(
     for sector, sector_weight in _two_nearest(azimuth):
         start = first + sector % _AZIMUTH * _COSINE
         for level, level_weight in _two_nearest(bin_of_cosine):
-            rows = start + np.minimum(level, _COSINE - 1)  # beyond the last bin the weight is zero
+            rows = start + np.clip(level, 0, _COSINE - 1)  # beyond the last bin the weight is zero
             weights = sector_weight * level_weight
             histogram += sp.csc_array((weights, rows, each), (len(histogram), len(center))) @ shares
     shape = len(block), _AZIMUTH, _COSINE, _ELEVATION * _RADIAL

@@ -18,9 +18,10 @@ def compiler_options() -> dict[str, str | bool]:
     On CPUs XLA leaves products and sums to a library (YNNPACK) that takes longer to wake its threads than a
     small one lasts: without it a search in patches takes half the time (docs/speed.md). There are none for
     other devices, or where XLA does not know the option. JAX accepts options in the outermost `jax.jit` only,
-    which is why `jaxsmw.refine`, to be called from other compiled functions, does not set them itself.
+    which is why `jaxsmw.refine`, to be called from other compiled functions, does not set them itself. They
+    are for JAX's default backend, whatever `jax.default_device` says.
     """
-    return _options_for(jax.default_backend())
+    return dict(_options_for(jax.default_backend()))
 
 
 @cache
@@ -29,7 +30,7 @@ def _options_for(backend: str) -> dict[str, str | bool]:
         return {}
     try:
         jax.jit(lambda: 0).lower().compile(_OPTIONS)
-    except jax.errors.JaxRuntimeError:
+    except (jax.errors.JaxRuntimeError, ValueError):
         return {}
     return _OPTIONS
 
@@ -37,8 +38,12 @@ def _options_for(backend: str) -> dict[str, str | bool]:
 _OPTIONS: dict[str, str | bool] = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 
-@cache
 def compiled(function: Function) -> Function:
-    """The function compiled with `compiler_options`, to be called from the host."""
+    """The function compiled with `compiler_options`, to be called from the host; the same for the same."""
+    return _compiled(function, jax.default_backend())
+
+
+@cache
+def _compiled(function: Function, backend: str) -> Function:
     # Equinox passes on what it does not know; its types do not say so.
-    return eqx.filter_jit(function, compiler_options=compiler_options())  # type: ignore[call-overload]
+    return eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
