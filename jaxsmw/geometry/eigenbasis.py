@@ -60,7 +60,7 @@ def compute_spectrum(
     - `mesh`: the surface, n vertices.
     - `number_of_eigenvectors`: k, at least 1 and less than the number of used vertices.
     - `laplacian`: which discretisation; see `assemble_laplacian`.
-    - `eigensolver`: `"exact"`, `"approximate"` (for components with too few vertices for it, 400 and 40 for
+    - `eigensolver`: `"exact"`, `"approximate"` (for components with too few vertices for it, 400 and 30 for
       each eigenvector, it is exact), or `"auto"`, approximate from 50 000 vertices on.
 
     **Returns:** A `Spectrum` of JAX's default float type (float32 unless `jax_enable_x64` is set). Vertices
@@ -349,7 +349,7 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     **Raises:** `RuntimeError` where smoothing once more would still lower eigenvalues much: then the subspace
     does not suit the mesh. (How many eigenvalues were missed is not counted: that takes the factors of W.)
     """
-    taken = k + max(10, k // 5)
+    taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
     if coarse.stiffness.shape[0] < 3 * taken:
         raise RuntimeError(f"a subspace of {coarse.stiffness.shape[0]} dimensions is too small")
@@ -379,7 +379,7 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
 
 
 # Of the subspace, for each eigenvector.
-_DIMENSIONS_OF_SUBSPACE = 40
+_DIMENSIONS_OF_SUBSPACE = 30
 # By how much smoothing once more may lower eigenvalues. Errors are up to three times that.
 _MOST_LOWERED = 0.015
 

@@ -82,9 +82,10 @@ def shot_descriptors(
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
             # Vertices at the same place have no direction to each other.
-            pairs = pairs[pairs["v"] > 0]
+            apart = pairs["v"] > 0
+            center, neighbor, distance = (pairs[column][apart] for column in "ijv")
             descriptors[rows[block]] = _describe(
-                positions, normals, block, pairs["i"], pairs["j"], pairs["v"], radius
+                positions, normals, block, center, neighbor, distance, radius
             )
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
@@ -113,10 +114,10 @@ def _describe(
     radius: float,
 ) -> Float64[np.ndarray, "b 352"]:
     """The descriptors of a block of vertices, from pairs (position in the block, vertex, distance)."""
-    offsets = positions[neighbor] - positions[block[center]]
-    frames = _local_frames(offsets, center, radius - distance, len(block))
-    x, y, z = np.einsum("pad,pd->ap", frames[center], offsets)
-    cosine = np.einsum("pd,pd->p", frames[center, 2], normals[neighbor])
+    offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
+    frames = _local_frames(offsets, center, radius - distance, len(block)).take(center, axis=0)
+    x, y, z = np.einsum("pad,pd->ap", frames, offsets)
+    cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
 
     # Coordinates in units of bins, with the centre of bin b at b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
@@ -161,7 +162,7 @@ def _local_frames(
     _, axes = np.linalg.eigh(scatter)
 
     def towards_majority(axis: np.ndarray) -> np.ndarray:
-        height = np.einsum("pd,pd->p", axis[center], offsets)
+        height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
         # Regular meshes do have ties, and the sign that `eigh` happens to give must not decide them.
         tied = majority == 0
