@@ -72,6 +72,7 @@ from jaxsmw.report.tables import markdown
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
 LARGE = (100_000, 300_000, 1_000_000)
+XLA_DEFAULTS = ", XLA's defaults"
 # Beyond this many vertices a stored distance matrix would be gigabytes.
 STORED = 10_000
 
@@ -124,7 +125,7 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
     usual, ours = jax.jit(blocked), compiled(blocked)
     found: dict[str, Callable[[], object]] = {
         "products, JAX in blocks": lambda: [ours(blocks, y.eigenvectors) for _ in range(ITERATIONS)],
-        "products, JAX in blocks, XLA's defaults": lambda: [
+        f"products, JAX in blocks{XLA_DEFAULTS}": lambda: [
             usual(blocks, y.eigenvectors) for _ in range(ITERATIONS)
         ],
     }
@@ -155,8 +156,8 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         candidates = {
             "all with all": refined(exhaustive, run=ours),
             "in patches": refined(patches, run=ours),
-            "all with all, XLA's defaults": refined(exhaustive),
-            "in patches, XLA's defaults": refined(patches),
+            f"all with all{XLA_DEFAULTS}": refined(exhaustive),
+            f"in patches{XLA_DEFAULTS}": refined(patches),
             "on samples": refined(exhaustive, *samples, run=ours),
             "on samples, in patches": refined(patches, *samples, run=ours),
         }
@@ -594,13 +595,18 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     if not panels:
         return
     figure, axes = plt.subplots(
-        1, len(panels), figsize=(5 * len(panels), 4.5), layout="constrained", squeeze=False
+        1, len(panels), figsize=(5 * len(panels), 5.5), layout="constrained", squeeze=False
     )
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
+        colors: dict[str, str] = {}
         for name, points in curves.items():
-            axis.loglog(*zip(*points, strict=True), "k--" if "GiB" in name else "o-", label=name)
+            # One colour with and without our options, whose lack shows as dots.
+            usual = name.removesuffix(XLA_DEFAULTS)
+            color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
+            style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}
+            axis.loglog(*zip(*points, strict=True), label=name, **style)
         axis.set(title=title, xlabel="vertices", ylabel="seconds")
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     save_figure(file, figure)
     plt.close(figure)
 
