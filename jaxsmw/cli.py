@@ -336,7 +336,8 @@ def _add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         choices=("auto", "exact", "approximate"),
         default="auto",
         help="approximate is within a few per mille of the eigenvalues, where triangles are even, and fast "
-        "on large meshes; auto uses it from 50000 vertices on (default: %(default)s)",
+        "on large meshes (where it would be far off, exact takes over with a warning); auto uses it from "
+        "50000 vertices on (default: %(default)s)",
     )
 
 

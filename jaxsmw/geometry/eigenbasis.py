@@ -95,7 +95,7 @@ def eigenpairs(
     if not 1 <= number_of_eigenvectors < len(used):
         raise InputError(
             f"{mesh.name}: {number_of_eigenvectors} eigenvectors were asked for, but a mesh with {len(used)} "
-            f"used vertices has between 1 and {len(used) - 1} to give; ask for fewer or use a finer mesh."
+            f"used vertices has between 1 and {len(used) - 1} to give; ask for as many, or use a finer mesh."
         )
     if eigensolver not in get_args(Eigensolver):
         raise InputError(f"{eigensolver!r} is no eigensolver: choose {', '.join(get_args(Eigensolver))}.")
