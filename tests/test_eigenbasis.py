@@ -331,7 +331,7 @@ def test_an_approximation_is_near_or_refused(size, k, factor, noise):
 
 @pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
 def test_a_region_of_bad_triangles_is_not_overlooked(factor):
-    """A sheet of even triangles, a tenth of its area of long ones."""
+    """A sheet of even triangles but for ten of its columns, which are longer by the factor."""
     (width, height), part = (100, 100), 10
     vertices, faces = grid_mesh(width, height)
     column = np.arange(len(vertices)) % width

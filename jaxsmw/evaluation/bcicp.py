@@ -204,9 +204,8 @@ def _within(graph: csr_array, radius: float) -> csr_array:
 def _nearest(queries: Float[np.ndarray, "m d"], database: Float[np.ndarray, "n d"]) -> np.ndarray:
     """The nearest database row of every query."""
     dtype = jnp.asarray(database).dtype
-    return np.asarray(compiled(nearest_neighbor)(jnp.asarray(queries, dtype), jnp.asarray(database))).astype(
-        np.int64
-    )
+    found = compiled(nearest_neighbor)(jnp.asarray(queries, dtype), jnp.asarray(database))
+    return np.asarray(found).astype(np.int64)
 
 
 def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
