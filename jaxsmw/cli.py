@@ -309,6 +309,7 @@ _BANKS = {
     "gabor": "Gabor",
     "identity": "Identity",
 }
+_NOT_TIGHT = ("cubic-spline", "mexican-hat", "gabor")
 
 
 def _add_bank(parser: argparse._ActionsContainer) -> None:
@@ -452,21 +453,13 @@ def _match(options: argparse.Namespace) -> None:
 
 
 def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Correspondence:
-    import equinox as eqx
     import jax
 
-    from jaxsmw.core.frames import frame_bounds
     from jaxsmw.matching import match
 
     with jax.enable_x64(options.precision == "float64"):
-        # On evenly spaced eigenvalues, as those of a surface nearly are.
-        bounds = eqx.filter_jit(frame_bounds)  # one program instead of forty
-        lower, upper = bounds(_bank(options), jax.numpy.arange(101.0), over="interval")
-        if options.solution == "filtering" and not 0.99 < lower <= upper < 1.01:
-            _say(
-                f"note: {options.bank} is no tight frame (bounds {lower:.2g} and {upper:.2g}), and filtering "
-                "is meant for those; --solution least-squares is exact for any."
-            )
+        if options.solution == "filtering" and options.bank in _NOT_TIGHT:
+            _note_frame_bounds(options)
         return match(
             mesh_x,
             mesh_y,
@@ -480,6 +473,20 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
             partial=options.partial,
             stop_when_unchanged=options.stop_when_unchanged,
         )
+
+
+def _note_frame_bounds(options: argparse.Namespace) -> None:
+    import equinox as eqx
+    import jax.numpy as jnp
+
+    from jaxsmw.core.frames import frame_bounds
+
+    # On evenly spaced eigenvalues, as those of a surface nearly are; one program instead of forty.
+    lower, upper = eqx.filter_jit(frame_bounds)(_bank(options), jnp.arange(101.0), over="interval")
+    _say(
+        f"note: {options.bank} is no tight frame (bounds {lower:.2g} and {upper:.2g}), and filtering is "
+        "meant for those; --solution least-squares is exact for any."
+    )
 
 
 def _conclude(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.compilation import compiled
+from jaxsmw.core.compilation import compile_ahead, compiled
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
@@ -139,6 +139,16 @@ def match(
             f"{number_of_samples} samples cannot tell {number_of_eigenvectors} eigenvectors apart; use more "
             "samples (five per eigenvector is usual) or fewer eigenvectors."
         )
+    settings: dict[str, Any] = {
+        "refiner": refiner,
+        "iterations": iterations,
+        "stop_when_unchanged": stop_when_unchanged,
+        "history": history,
+    }
+    compiling = None
+    if not partial:  # of a part the number of eigenvectors comes out later
+        sizes = (len(mesh_x.vertices), len(mesh_y.vertices), number_of_eigenvectors, number_of_samples)
+        compiling = compile_ahead(refine, lambda: _outlines(*sizes), **settings)
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
         spectrum_x, spectrum_y = paired_spectra(
@@ -150,7 +160,7 @@ def match(
             partial=partial,
         )
     for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
-        if spectrum.eigenvalues[-1] == 0:
+        if np.asarray(spectrum.eigenvalues)[-1] == 0:
             raise InputError(
                 f"{mesh.name}: with {number_of_eigenvectors} eigenvectors nothing is known of it but which "
                 "of its separate parts a vertex belongs to; ask for more of them than it has parts, or join "
@@ -158,23 +168,16 @@ def match(
             )
     with _stage("initial map", seconds):
         start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init, partial=partial)
-    samples: dict[str, Int[Array, " s"]] = {}
+    samples: dict[str, Any] = {}
     if number_of_samples is not None:
         with _stage("samples", seconds):
             for side, mesh in (("samples_x", mesh_x), ("samples_y", mesh_y)):
-                samples[side] = jnp.asarray(farthest_point_samples(mesh, number_of_samples))
+                samples[side] = jax.device_put(farthest_point_samples(mesh, number_of_samples))
     with _stage("refinement", seconds):
+        if compiling is not None:
+            wait([compiling])
         refinement = jax.block_until_ready(
-            compiled(refine)(
-                spectrum_x,
-                spectrum_y,
-                jnp.asarray(start),
-                refiner=refiner,
-                iterations=iterations,
-                stop_when_unchanged=stop_when_unchanged,
-                history=history,
-                **samples,
-            )
+            compiled(refine)(spectrum_x, spectrum_y, jax.device_put(start), **samples, **settings)
         )
     if refinement.result != RESULTS.successful:
         raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(refinement.result)}")
@@ -191,6 +194,15 @@ def match(
         history=refinement.history,
         seconds=seconds,
     )
+
+
+def _outlines(
+    m: int, n: int, k: int, number_of_samples: int | None
+) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Int[Array, " s"]]]:
+    """The arrays that refinement gets, as far as their sizes."""
+    x, y = (Spectrum(jnp.zeros(k), jnp.zeros((v, k)), jnp.zeros(v), jnp.zeros(v, bool)) for v in (m, n))
+    names = () if number_of_samples is None else ("samples_x", "samples_y")
+    return (x, y, jnp.zeros(m, int)), {name: jnp.zeros(number_of_samples, int) for name in names}
 
 
 def paired_spectra(
@@ -278,7 +290,8 @@ def initial_map(
         )
     dtype = spectrum_x.eigenvectors.dtype
     nearest = compiled(nearest_neighbor)(
-        jnp.asarray(features_x, dtype), jnp.asarray(features_y, dtype), database_mask=y.spectrum.mask
+        *(jax.device_put(features.astype(dtype)) for features in (features_x, features_y)),
+        database_mask=y.spectrum.mask,
     )
     start = np.asarray(nearest).astype(np.int64)
     if y.samples is not None:

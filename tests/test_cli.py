@@ -8,11 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import bumpy_mesh, grid_mesh
 
-from jaxsmw.cli import main
+from jaxsmw.cli import _BANKS, _NOT_TIGHT, main
+from jaxsmw.core import filters
+from jaxsmw.core.frames import frame_bounds
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 
@@ -141,6 +144,12 @@ def test_missing_matplotlib_is_told_before_the_work(run, pair, tmp_path, monkeyp
     ):
         assert_refused(run(*arguments, "--quiet"), naming="pip install 'jaxsmw[report]'")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_banks_said_to_be_not_tight_are_those():
+    for name, kind in _BANKS.items():
+        lower, upper = frame_bounds(getattr(filters, kind)(), jnp.arange(101.0), over="interval")
+        assert (0.99 < lower <= upper < 1.01) == (name not in _NOT_TIGHT)
 
 
 def test_a_bank_that_is_not_tight_gets_a_note(run, pair, tmp_path):
@@ -511,8 +520,6 @@ def test_read_mesh_is_exported():
 
 
 def test_every_bank_has_a_name(run, pair, tmp_path):
-    from jaxsmw.cli import _BANKS
-
     pictures = set()
     for name in _BANKS:
         path = tmp_path / f"{name}.png"

@@ -1,5 +1,8 @@
 """Compiler options: what they change, where they are known, and where they are not."""
 
+import logging
+from concurrent.futures import wait
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +10,7 @@ import pytest
 
 from jaxsmw import compiler_options, nearest_neighbor
 from jaxsmw.core import compilation
-from jaxsmw.core.compilation import compiled
+from jaxsmw.core.compilation import compile_ahead, compiled
 
 
 @pytest.fixture
@@ -40,6 +43,32 @@ def test_compiled_gives_the_same_and_once(points):
             expected = nearest_neighbor(*(points[::-1] if reverse else points))
             np.testing.assert_array_equal(found, expected)
     assert traced == [False, True]
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_what_was_compiled_ahead_is_not_compiled_again(caplog, x64):
+    def total(values, *, weights, power):
+        return jnp.sum(weights * values**power)
+
+    with jax.enable_x64(x64):
+        ahead = compile_ahead(total, lambda: ((jnp.zeros(9),), {"weights": jnp.zeros(9)}), power=3)
+        ahead.result()
+        arguments = jax.device_put((np.arange(9.0), np.ones(9)))
+        with jax.log_compiles(), caplog.at_level(logging.WARNING):
+            assert float(compiled(total)(arguments[0], weights=arguments[1], power=3)) == 1296
+            assert "XLA compilation of jit(total)" not in caplog.text
+            assert float(compiled(total)(arguments[0], weights=arguments[1], power=2)) == 204
+            assert "XLA compilation of jit(total)" in caplog.text
+
+
+def test_what_cannot_be_compiled_ahead_is_left_for_the_call_to_say(points):
+    def refusing(queries):
+        raise ValueError("no such search")
+
+    wait([compile_ahead(refusing, lambda: ((jnp.zeros((-1, 2)),), {}))])
+    wait([compile_ahead(refusing, lambda: ((jnp.zeros((1, 2)),), {}))])
+    with pytest.raises(ValueError, match="no such search"):
+        compiled(refusing)(points[0])
 
 
 def test_no_options_where_there_are_none(monkeypatch):

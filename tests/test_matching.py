@@ -2,6 +2,7 @@
 
 import logging
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -109,6 +110,15 @@ def test_repeats_bit_for_bit(pair):
     first, second = (match(*pair[:2], **OPTIONS) for _ in range(2))
     np.testing.assert_array_equal(first.pointwise_map, second.pointwise_map)
     np.testing.assert_array_equal(first.functional_map, second.functional_map)
+
+
+@pytest.mark.parametrize("samples", [None, 200])
+def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
+    jax.clear_caches()
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        match(*pair[:2], **OPTIONS, number_of_samples=samples)
+    # Where messages about compilation are wanted in this thread only, those of another do not appear.
+    assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
 
 def test_scale_and_rotation_do_not_matter(pair):

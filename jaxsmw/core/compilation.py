@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -47,3 +49,34 @@ def compiled(function: Function) -> Function:
 def _compiled(function: Function, backend: str) -> Function:
     # Equinox passes on what it does not know; its types do not say so.
     return eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
+
+
+def compile_ahead(
+    function: Function, arguments: Callable[[], tuple[tuple, dict[str, Any]]], **settings: Any
+) -> Future[object]:
+    """Begin to compile in the background what `compiled(function)` needs for arguments of some sizes.
+
+    Wait for the future before the call, or it compiles once more. What is wrong with the arguments is left
+    for the call to say.
+
+    **Arguments:**
+
+    - `arguments`: makes arrays of these sizes, by position and by name; it is only traced.
+    - `settings`: what else the function gets.
+    """
+    program: Any = compiled(function)
+    x64 = jax.config.read("jax_enable_x64")
+
+    def compile_it() -> object:
+        with jax.enable_x64(x64):  # which threads do not inherit
+            shapes = jax.eval_shape(arguments)
+            # Equinox traces arrays only; these have no memory.
+            positional, named = jax.tree.map(
+                lambda shape: np.broadcast_to(np.zeros((), shape.dtype), shape.shape), shapes
+            )
+            return program.lower(*positional, **named, **settings).compile()
+
+    executor = ThreadPoolExecutor(1)
+    future = executor.submit(compile_it)
+    executor.shutdown(wait=False)
+    return future

@@ -68,7 +68,7 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
     return (
-        make_patches(spectrum_x.eigenvectors, spectrum_x.mask, size=_QUERIES, rank=1),
+        make_patches(spectrum_x.eigenvectors, spectrum_x.mask, size=_QUERIES, rank=0),
         make_patches(spectrum_y.eigenvectors, spectrum_y.mask, size=round(size), rank=_RANK),
     )
 

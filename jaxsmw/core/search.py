@@ -110,7 +110,7 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
     - `points`: for surfaces their eigenvectors, whose first ones are coordinates along the body.
     - `mask`: False for points that do not count.
     - `size`: wanted number of points in a patch; from 0.7 to 1.4 times as many are taken.
-    - `rank`: number of `variations`.
+    - `rank`: number of `variations`; queries need none.
     """
     n = points.shape[0]
     levels = max(0, round(math.log2(n / size)))
@@ -139,6 +139,8 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
     # Ascending, so that the first of equals in a patch is the lowest; padding comes last.
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
+    if rank == 0:
+        return Patches(rows, valid, jnp.zeros((len(rows), 0, width), points.dtype))
     _, deviations = _centered(points[rows], valid)
     products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 

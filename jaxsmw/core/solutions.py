@@ -12,8 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
-import lineax as lx
-import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from jaxsmw.core.checks import as_parameter, check_between, check_choice
@@ -433,6 +431,9 @@ class RegularizedLeastSquares(Solution):
             start = columns.cross * unit**2
         # Full Gauss–Newton steps: on real pairs a trust region never shortened one (and those of optimistix
         # do not take float32 while jax_enable_x64 is set). What cannot be solved is not tried at length.
+        import lineax as lx  # here, as importing them takes as long as an eigenbasis
+        import optimistix as optx
+
         precision = 0.1 * self.tolerance
         inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(k_out, k_in)))
         with jax.default_matmul_precision("highest"):

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Literal, get_args
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
@@ -80,7 +80,7 @@ def as_spectrum(
 ) -> Spectrum:
     """The `eigenpairs` of a mesh for JAX, in its default float type."""
     arrays = eigenvalues, eigenvectors, vertex_areas, mesh.used_vertices
-    return Spectrum(*(jnp.asarray(array) for array in arrays))
+    return Spectrum(*map(jax.device_put, arrays))  # `jnp.asarray` would compile something for every size
 
 
 def eigenpairs(
