@@ -26,7 +26,7 @@ from .core.filters import (
 )
 from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
-from .core.pointwise_map import decode, search_patches
+from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
 from .core.results import RESULTS
 from .core.search import approximate_nearest_neighbor, nearest_neighbor
@@ -41,6 +41,7 @@ from .core.solutions import (
     WaveletProblem,
 )
 from .core.spectrum import Spectrum
+from .core.triangles import nearest_point_on_triangles
 from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
@@ -108,6 +109,7 @@ __all__ = [
     "coverage",
     "creature_pair",
     "decode",
+    "decode_to_triangles",
     "diagnose",
     "encode",
     "farthest_point_samples",
@@ -121,6 +123,7 @@ __all__ = [
     "match",
     "multiscale_kernel",
     "nearest_neighbor",
+    "nearest_point_on_triangles",
     "open_data_set",
     "paired_spectra",
     "read_ground_truth",

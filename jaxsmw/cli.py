@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxsmw.core.refinement import WaveletPreservation
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
+    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.geometry.mesh import Mesh
     from jaxsmw.matching import Correspondence
 
@@ -125,6 +126,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         required=True,
         help="gets one target vertex per source vertex, one per line, counted from 0",
+    )
+    match.add_argument(
+        "--surface-points",
+        metavar="FILE.baryc_gt",
+        help="also gets for each source vertex a point between target vertices: a face, counted from 1, and "
+        "barycentric weights for its corners",
     )
     match.add_argument("--report", metavar="DIR", help="write pictures, a 3D page and a summary there")
     _add_up(match)
@@ -436,11 +443,18 @@ def _match(options: argparse.Namespace) -> None:
     _, _, init_file = options.init.partition(":")
     _keep_inputs(options.output, options.source, options.target, init_file, *(options.ground_truth or ()))
     check_writable(options.output)
+    if options.surface_points:
+        _check_surface_points(options)
     if options.report:
         from jaxsmw.report.figures import check_drawable
 
         check_drawable()
-    from jaxsmw.evaluation.ground_truth import read_ground_truth, write_pointwise_map
+    from jaxsmw.evaluation.ground_truth import (
+        GroundTruth,
+        read_ground_truth,
+        write_ground_truth,
+        write_pointwise_map,
+    )
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     truth = None
@@ -449,7 +463,12 @@ def _match(options: argparse.Namespace) -> None:
     directory = make_directory(options.report) if options.report else None
     correspondence = _run_match(options, mesh_x, mesh_y)
     write_pointwise_map(options.output, correspondence.pointwise_map)
-    _conclude(options, correspondence, truth, directory)
+    points = None
+    if options.surface_points:
+        logging.getLogger("jaxsmw").info("points on the surface")
+        points = correspondence.surface_points()
+        write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points))
+    _conclude(options, correspondence, truth, directory, points)
 
 
 def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Correspondence:
@@ -494,11 +513,15 @@ def _conclude(
     correspondence: Correspondence,
     truth: GroundTruth | None,
     directory: Path | None,
+    points: SurfacePoints | None = None,
 ) -> None:
     """Evaluate, print, and write the report, as far as each is wanted."""
     errors: dict[str, GeodesicError] = {}
     if truth is not None:
-        maps = {"initial": correspondence.initial_map, "refined": correspondence.pointwise_map}
+        maps: dict[str, Any] = {"initial": correspondence.initial_map}
+        if points is not None:
+            maps["surface"] = points
+        maps["refined"] = correspondence.pointwise_map  # the last: the report shows its errors
         errors = _errors(options, correspondence.mesh_y, maps, truth)
     if directory is not None:
         from jaxsmw.report.summary import write_report
@@ -549,6 +572,14 @@ def _keep_inputs(output: str, *inputs: str) -> None:
     """Refuse to write over what is read."""
     if os.path.realpath(output) in (os.path.realpath(path) for path in inputs if path):
         raise InputError(f"{output}: is an input and would be overwritten: choose another name.")
+
+
+def _check_surface_points(options: argparse.Namespace) -> None:
+    path = options.surface_points
+    if Path(path).suffix != ".baryc_gt":
+        raise InputError(f"{path}: points are written as .baryc_gt; choose a name that ends in it.")
+    _keep_inputs(path, options.source, options.target, options.output, *(options.ground_truth or ()))
+    check_writable(path)
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -14,13 +14,14 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Array, Float, Int, Int64, Shaped
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.compilation import compile_ahead, compiled
-from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.functional_map import Convention
+from jaxsmw.core.pointwise_map import decode_to_triangles, spectral_embeddings
 from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
@@ -29,7 +30,7 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
-from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
@@ -82,6 +83,29 @@ class Correspondence:
     iterations: int
     history: History | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def surface_points(self, *, convention: Convention = "pullback") -> SurfacePoints:
+        """For every vertex of X the point of Y that is the same, anywhere on Y's triangles (m points).
+
+        By the functional map; see `jaxsmw.decode_to_triangles`. A vertex of X that no face uses gets the
+        point of the nearest one that a face does use.
+
+        **Arguments:**
+
+        - `convention`: that of the refiner.
+        """
+        faces, traced_weights = compiled(decode_to_triangles)(
+            jax.device_put(self.functional_map),
+            self.spectrum_x,
+            self.spectrum_y,
+            jax.device_put(self.mesh_y.faces),
+            convention=convention,
+        )
+        weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # without rounding errors
+        return SurfacePoints(
+            _extend_to_unused(self.mesh_x, np.asarray(faces).astype(np.int64)),
+            _extend_to_unused(self.mesh_x, weights / weights.sum(axis=1, keepdims=True)),
+        )
 
 
 def match(
@@ -422,14 +446,14 @@ def _landmark_features(
     return features[0], features[1]
 
 
-def _extend_to_unused(mesh_x: Mesh, pointwise_map: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+def _extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
     """Give vertices that no face uses the match of the nearest one that a face does use."""
     used = mesh_x.used_vertices
     if used.all():
-        return pointwise_map
+        return matches
     _, nearest = KDTree(mesh_x.vertices[used]).query(mesh_x.vertices[~used])
-    extended = pointwise_map.copy()
-    extended[~used] = pointwise_map[used][nearest]
+    extended = matches.copy()
+    extended[~used] = matches[used][nearest]
     return extended
 
 

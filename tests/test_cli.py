@@ -16,6 +16,7 @@ from synthetic import bumpy_mesh, grid_mesh
 from jaxsmw.cli import _BANKS, _NOT_TIGHT, main
 from jaxsmw.core import filters
 from jaxsmw.core.frames import frame_bounds
+from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 
@@ -301,6 +302,36 @@ def test_demo(run, tmp_path):
         "--ground-truth", tmp_path / "demo" / "truth.baryc_gt",
     )  # fmt: skip
     assert mean_error(again.output) == pytest.approx(after, abs=2e-4)
+
+
+def test_surface_points_are_written_and_measured(run, pair, tmp_path):
+    x, y, points = pair / "x.off", pair / "y.ply", tmp_path / "points.baryc_gt"
+    call = ["match", x, y, "--output", tmp_path / "map.txt", *SMALL]
+    truth = ["--ground-truth", pair / "truth.txt"]
+    outcome = run(*call, "--surface-points", points, *truth)
+    assert outcome.code == 0, outcome.errors
+    initial, surface, refined = (line for line in outcome.output.splitlines() if "map:" in line)
+    assert surface.startswith("surface map:")
+    # The truth is a vertex everywhere, so that the refined map, of vertices, may hit it exactly.
+    assert mean_error(refined) < mean_error(surface) < 0.02 < mean_error(initial)
+
+    mesh_y = read_mesh(y)
+    written = read_ground_truth(points, read_mesh(x), mesh_y).targets
+    matched = mesh_y.vertices[np.loadtxt(tmp_path / "map.txt", dtype=int)]
+    apart = np.linalg.norm(written.positions(mesh_y) - matched, axis=1)
+    assert 0 < np.median(apart) < 0.05 * mesh_y.area**0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [("points.txt", "ends in it"), ("missing/points.baryc_gt", "missing"), ("truth.baryc_gt", "is an input")],
+)
+def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault):
+    (tmp_path / "truth.baryc_gt").write_text("1 1 0 0\n" * 642)
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL, "--quiet"]
+    outcome = run(*call, "--surface-points", tmp_path / name, "--ground-truth", tmp_path / "truth.baryc_gt")
+    assert_refused(outcome, naming=fault)
+    assert [path.name for path in tmp_path.iterdir()] == ["truth.baryc_gt"]
 
 
 OFF = "OFF\n{} {} 0\n{}\n{}\n"

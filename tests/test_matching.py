@@ -328,3 +328,25 @@ def test_other_starts_of_a_part(part, init):
         init = np.stack([init[:, 0], truth[init[:, 1]]], axis=1)
     found = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}), partial=True, init=init)
     assert mean_error(mesh_y, found.initial_map, truth) < 0.15
+
+
+def test_surface_points_follow_the_map_between_vertices(pair):
+    """To a coarser copy of the body, whose vertices are too few to be where its points belong."""
+    mesh_x, coarse = pair[0], bumpy_mesh(3)
+    result = match(mesh_x, coarse, **OPTIONS)
+    points = result.surface_points()
+    scaled = mesh_x.vertices / mesh_x.area**0.5 * coarse.area**0.5
+    to_vertices = np.linalg.norm(coarse.vertices[result.pointwise_map] - scaled, axis=1).mean()
+    to_points = np.linalg.norm(points.positions(coarse) - scaled, axis=1).mean()
+    assert to_points < 0.6 * to_vertices
+    assert points.weights.min() >= 0
+    np.testing.assert_allclose(points.weights.sum(axis=1), 1, atol=1e-15)
+
+
+def test_unused_vertices_get_surface_points(pair):
+    mesh_x, mesh_y, _ = pair
+    extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
+    points = match(extra, mesh_y, **OPTIONS).surface_points()
+    assert len(points) == len(extra.vertices)
+    assert points.faces[-1] == points.faces[0]
+    np.testing.assert_array_equal(points.weights[-1], points.weights[0])

@@ -4,7 +4,13 @@ import pytest
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum
 
-from jaxsmw.core.pointwise_map import decode, matching_objective, search_patches, spectral_embeddings
+from jaxsmw.core.pointwise_map import (
+    decode,
+    decode_to_triangles,
+    matching_objective,
+    search_patches,
+    spectral_embeddings,
+)
 
 
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
@@ -31,3 +37,18 @@ def test_decode_in_patches_is_the_same():
             for patches in (None, search_patches(x, y))
         )
         np.testing.assert_array_equal(plain, in_patches)
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+def test_decode_to_triangles_is_never_farther_than_decode(convention):
+    x, y = random_spectrum(40, 8, seed=1), random_spectrum(30, 6, seed=2)
+    generator = np.random.default_rng(0)
+    functional_map = jnp.asarray(generator.normal(size=(8, 6) if convention == "pullback" else (6, 8)))
+    faces_y = np.array([np.roll(np.arange(30), -corner) for corner in (0, 1, 7)]).T
+    queries, database = spectral_embeddings(functional_map, x, y, convention=convention)
+    faces, weights = decode_to_triangles(functional_map, x, y, jnp.asarray(faces_y), convention=convention)
+    there = np.einsum("mc,mcd->md", weights, np.asarray(database)[faces_y[np.asarray(faces)]])
+    distances = np.linalg.norm(there - np.asarray(queries), axis=1)
+    to_vertices = cdist(queries, database).min(axis=1)
+    assert (distances <= to_vertices + 1e-12).all()
+    assert (distances < to_vertices - 1e-6).mean() > 0.5

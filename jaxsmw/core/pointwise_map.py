@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.search import (
@@ -14,6 +14,7 @@ from jaxsmw.core.search import (
     nearest_neighbor_in_patches,
 )
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.triangles import nearest_point_on_triangles
 
 
 def spectral_embeddings(
@@ -57,6 +58,32 @@ def decode(
         return nearest_neighbor_in_patches(queries, database, *patches)
     search = approximate_nearest_neighbor if approximate else nearest_neighbor
     return search(queries, database, database_mask=spectrum_y.mask)
+
+
+def decode_to_triangles(
+    functional_map: Float[Array, "k_out k_in"],
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    faces_y: Int[Array, "f 3"],
+    *,
+    convention: Convention = "pullback",
+) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
+    """The map X -> Y of a functional map, to points anywhere on the triangles of Y.
+
+    Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017: for each vertex of X the point
+    nearest in `spectral_embeddings`, where those of Y's vertices are joined by Y's triangles. Neighbours on a
+    fine X need not share a vertex of a coarse Y, so that what is carried along the map, such as a texture,
+    comes out smooth. Takes about as long as ten searches of all by `decode`, a second for 5000 vertices, and
+    grows like them with the product of the sizes.
+
+    **Arguments:**
+
+    - `faces_y`: the triangles of Y.
+
+    **Returns:** A face of Y for each vertex of X (m,), and barycentric weights (m, 3) for its corners.
+    """
+    queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
+    return nearest_point_on_triangles(queries, database, faces_y)
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:

@@ -1,0 +1,117 @@
+"""The nearest point on triangles, against libigl, brute force and what must hold."""
+
+import igl
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+from synthetic import bumpy_mesh
+
+from jaxsmw.core.triangles import nearest_point_on_triangles
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(0)
+
+
+def found(queries, points, faces, **options):
+    """Faces, weights, and how far each query is from its nearest point."""
+    face, weights = nearest_point_on_triangles(
+        jnp.asarray(queries), jnp.asarray(points), jnp.asarray(faces), **options
+    )
+    there = np.einsum("qc,qcd->qd", weights, points[faces[np.asarray(face)]])
+    return np.asarray(face), np.asarray(weights), np.linalg.norm(queries - there, axis=1)
+
+
+def by_brute_force(queries, points, faces):
+    """Distances by non-negative least squares, the weights' sum being made one by a heavy row."""
+    heavy = 1e4
+    distances = []
+    for query in queries:
+        each = []
+        for face in faces:
+            system = np.vstack([points[face].T, np.full(3, heavy)])
+            weights, _ = nnls(system, np.append(query, heavy))
+            each.append(np.linalg.norm(points[face].T @ (weights / weights.sum()) - query))
+        distances.append(min(each))
+    return np.array(distances)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_agrees_with_libigl_in_space(generator, dtype):
+    mesh = bumpy_mesh(3)
+    queries = generator.normal(size=(300, 3))
+    queries[:100] = mesh.vertices[:100]  # corners themselves
+    expected, _, _ = igl.point_mesh_squared_distance(queries, mesh.vertices, mesh.faces)
+    _, weights, distance = found(queries.astype(dtype), mesh.vertices.astype(dtype), mesh.faces)
+    assert weights.dtype == dtype
+    np.testing.assert_allclose(distance, np.sqrt(expected), atol=2e-6 if dtype == np.float32 else 1e-12)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+    assert weights.min() >= (-1e-7 if dtype == np.float32 else -1e-15)
+
+
+@pytest.mark.parametrize("dimensions", [2, 5, 12])
+def test_agrees_with_brute_force_in_any_dimension(generator, dimensions):
+    points, queries = generator.normal(size=(20, dimensions)), generator.normal(size=(40, dimensions))
+    faces = np.array([generator.choice(20, 3, replace=False) for _ in range(30)])
+    _, _, distance = found(queries, points, faces)
+    np.testing.assert_allclose(distance, by_brute_force(queries, points, faces), atol=1e-6)
+
+
+def test_finds_points_of_the_surface_again(generator):
+    mesh = bumpy_mesh(3)
+    points = np.hstack([mesh.vertices, generator.normal(size=(len(mesh.vertices), 4))])
+    faces = generator.integers(len(mesh.faces), size=200)
+    weights = generator.dirichlet([1, 1, 1], size=200)
+    queries = np.einsum("qc,qcd->qd", weights, points[mesh.faces[faces]])
+    face, again, distance = found(queries, points, mesh.faces)
+    np.testing.assert_array_equal(face, faces)
+    np.testing.assert_allclose(again, weights, atol=1e-9)
+    assert distance.max() < 1e-9
+
+
+@pytest.mark.parametrize("corners", [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [0, 1, 3]])
+def test_triangles_without_area(corners):
+    """A point, a segment given twice over, and three points in a row."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 5, 0], [2, 0, 0]])
+    queries = np.array([[0.4, 1, 0], [-1, 0, 0], [3, 0, 0]])
+    _, weights, distance = found(queries, points, np.array([corners]))
+    high = max(points[corners, 0])
+    nearest = np.clip(queries[:, 0], 0, high)
+    np.testing.assert_allclose(distance, np.hypot(queries[:, 0] - nearest, queries[:, 1]), atol=1e-12)
+    assert np.isfinite(weights).all()
+
+
+def test_masked_triangles_are_left_out(generator):
+    mesh = bumpy_mesh(2)
+    queries = generator.normal(size=(50, 3))
+    mask = generator.random(len(mesh.faces)) < 0.5
+    face, _, distance = found(queries, mesh.vertices, mesh.faces, face_mask=jnp.asarray(mask))
+    assert mask[face].all()
+    _, _, expected = found(queries, mesh.vertices, mesh.faces[mask])
+    np.testing.assert_allclose(distance, expected)
+
+
+def test_vmap_is_one_after_the_other(generator):
+    mesh = bumpy_mesh(2)
+    queries = jnp.asarray(generator.normal(size=(3, 40, 3)))
+    points = jnp.asarray(mesh.vertices * np.array([1.0, 1.5, 2.0])[:, None, None])
+    faces = jnp.asarray(mesh.faces)
+    together = jax.vmap(lambda q, p: nearest_point_on_triangles(q, p, faces))(queries, points)
+    for pair in range(3):
+        alone = nearest_point_on_triangles(queries[pair], points[pair], faces)
+        np.testing.assert_array_equal(together[0][pair], alone[0])
+        np.testing.assert_allclose(together[1][pair], alone[1], atol=1e-12)
+
+
+def test_nothing_of_all_queries_and_triangles_is_stored():
+    m, n, f, d = 4000, 3000, 6000, 40
+    shapes = (
+        jax.ShapeDtypeStruct((m, d), jnp.float32),
+        jax.ShapeDtypeStruct((n, d), jnp.float32),
+        jax.ShapeDtypeStruct((f, 3), jnp.int32),
+    )
+    memory = jax.jit(nearest_point_on_triangles).lower(*shapes).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < m * f * 4 / 4
