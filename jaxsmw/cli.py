@@ -430,7 +430,7 @@ def _demo(options: argparse.Namespace) -> None:
     truth = GroundTruth.of_all_vertices(pair.truth)
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
-    write_ground_truth(directory / "truth.baryc_gt", truth)
+    write_ground_truth(directory / "truth.baryc_gt", truth, pair.target)
     options.evaluation_samples, options.geodesics, options.up = None, "strips", "y"
     correspondence = _run_match(options, pair.source, pair.target)
     write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
@@ -441,9 +441,11 @@ def _demo(options: argparse.Namespace) -> None:
 def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
-    _keep_inputs(options.output, options.source, options.target, init_file, *(options.ground_truth or ()))
+    inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
+    _keep_inputs(options.output, *inputs)
     check_writable(options.output)
     if options.surface_points:
+        _keep_inputs(options.surface_points, *inputs)
         _check_surface_points(options)
     if options.report:
         from jaxsmw.report.figures import check_drawable
@@ -467,7 +469,7 @@ def _match(options: argparse.Namespace) -> None:
     if options.surface_points:
         logging.getLogger("jaxsmw").info("points on the surface")
         points = correspondence.surface_points()
-        write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points))
+        write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points), mesh_y)
     _conclude(options, correspondence, truth, directory, points)
 
 
@@ -578,7 +580,8 @@ def _check_surface_points(options: argparse.Namespace) -> None:
     path = options.surface_points
     if Path(path).suffix != ".baryc_gt":
         raise InputError(f"{path}: points are written as .baryc_gt; choose a name that ends in it.")
-    _keep_inputs(path, options.source, options.target, options.output, *(options.ground_truth or ()))
+    if os.path.realpath(path) == os.path.realpath(options.output):
+        raise InputError(f"{path}: is the map's file as well: choose another name for one of them.")
     check_writable(path)
 
 

@@ -87,20 +87,21 @@ class Correspondence:
     def surface_points(self, *, convention: Convention = "pullback") -> SurfacePoints:
         """For every vertex of X the point of Y that is the same, anywhere on Y's triangles (m points).
 
-        By the functional map; see `jaxsmw.decode_to_triangles`. A vertex of X that no face uses gets the
-        point of the nearest one that a face does use.
+        By the functional map; see `jaxsmw.decode_to_triangles`. Faces are rows of `mesh_y.faces`. A vertex of
+        X that no face uses gets the point of the nearest one that a face does use.
 
         **Arguments:**
 
         - `convention`: that of the refiner.
         """
-        faces, traced_weights = compiled(decode_to_triangles)(
-            jax.device_put(self.functional_map),
-            self.spectrum_x,
-            self.spectrum_y,
-            jax.device_put(self.mesh_y.faces),
-            convention=convention,
-        )
+        with jax.enable_x64(self.functional_map.dtype == np.float64):  # as when it was computed
+            faces, traced_weights = compiled(decode_to_triangles)(
+                jax.device_put(self.functional_map),
+                self.spectrum_x,
+                self.spectrum_y,
+                jax.device_put(self.mesh_y.faces),
+                convention=convention,
+            )
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # without rounding errors
         return SurfacePoints(
             _extend_to_unused(self.mesh_x, np.asarray(faces).astype(np.int64)),

@@ -324,14 +324,22 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "fault"),
-    [("points.txt", "ends in it"), ("missing/points.baryc_gt", "missing"), ("truth.baryc_gt", "is an input")],
+    [
+        ("points.txt", "ends in it"),
+        ("missing/points.baryc_gt", "missing"),
+        ("truth.baryc_gt", "is an input"),
+        ("map.baryc_gt", "the map's file as well"),
+        ("start.baryc_gt", "is an input"),
+    ],
 )
 def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault):
     (tmp_path / "truth.baryc_gt").write_text("1 1 0 0\n" * 642)
-    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL, "--quiet"]
-    outcome = run(*call, "--surface-points", tmp_path / name, "--ground-truth", tmp_path / "truth.baryc_gt")
-    assert_refused(outcome, naming=fault)
-    assert [path.name for path in tmp_path.iterdir()] == ["truth.baryc_gt"]
+    (tmp_path / "start.baryc_gt").write_text("0\n" * 642)
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.baryc_gt", *SMALL, "--quiet"]
+    call += ["--init", f"map:{tmp_path / 'start.baryc_gt'}", "--ground-truth", tmp_path / "truth.baryc_gt"]
+    assert_refused(run(*call, "--surface-points", tmp_path / name), naming=fault)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["start.baryc_gt", "truth.baryc_gt"]
+    assert (tmp_path / "start.baryc_gt").read_text() == "0\n" * 642
 
 
 OFF = "OFF\n{} {} 0\n{}\n{}\n"

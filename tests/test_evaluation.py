@@ -112,7 +112,7 @@ class TestReading:
         generator = np.random.default_rng(0)
         points = SurfacePoints(generator.integers(0, 8, 4), generator.dirichlet([0.1, 0.1, 0.1], 4))
         points.weights[0] = [0, 1, 0]
-        write_ground_truth(tmp_path / "truth.baryc_gt", GroundTruth.of_all_vertices(points))
+        write_ground_truth(tmp_path / "truth.baryc_gt", GroundTruth.of_all_vertices(points), Y)
         truth = read_ground_truth(tmp_path / "truth.baryc_gt", X, Y)
         assert (truth.targets.faces == points.faces).all() and (truth.source_vertices == np.arange(4)).all()
         np.testing.assert_allclose(truth.targets.weights, points.weights, rtol=1e-15)
@@ -122,7 +122,16 @@ class TestReading:
         )
         for other in others:
             with pytest.raises(InputError, match="needs a point on a face for each"):
-                write_ground_truth(tmp_path / "other.baryc_gt", other)
+                write_ground_truth(tmp_path / "other.baryc_gt", other, Y)
+
+    def test_faces_are_numbered_as_in_the_file_of_the_mesh(self, tmp_path):
+        repeated = make_mesh(Y.vertices, np.vstack([Y.faces[:1], [[0, 0, 1]], Y.faces]))
+        assert len(repeated.faces) == len(Y.faces)
+        points = SurfacePoints(np.array([0, 1, 7, 2]), np.full((4, 3), 1 / 3))
+        path = tmp_path / "truth.baryc_gt"
+        write_ground_truth(path, GroundTruth.of_all_vertices(points), repeated)
+        assert [line.split()[0] for line in path.read_text().splitlines()] == ["1", "4", "10", "5"]
+        assert (read_ground_truth(path, X, repeated).targets.faces == points.faces).all()
 
     def test_landmarks(self, write):
         path = write("landmarks.txt", "0 8\n3 0\n")

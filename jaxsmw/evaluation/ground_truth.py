@@ -126,7 +126,7 @@ def read_ground_truth(
     return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, base(0)))
 
 
-def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth) -> None:
+def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
     """Write the points that all vertices of X are, as a `.baryc_gt` file (see `read_ground_truth`).
 
     **Arguments:**
@@ -134,6 +134,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth) 
     - `path`: the file to create or to replace; with the suffix `.baryc_gt`, or it will not be read as such.
     - `ground_truth`: of vertices 0, 1, … of X, with `SurfacePoints` as targets. (Where the targets are
       vertices, `write_pointwise_map` writes them.)
+    - `mesh_y`: the target Y. Faces get the numbers of its file, which counts those that reading dropped, too.
 
     **Raises:** `InputError` if the ground truth is another or the file cannot be written.
     """
@@ -142,7 +143,9 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth) 
     if not isinstance(points, SurfacePoints) or not in_order:
         raise InputError(f"{path}: a .baryc_gt file needs a point on a face for each source vertex in order.")
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii") as file:
-        for face, weights in zip(points.faces.tolist(), points.weights.tolist(), strict=True):
+        for face, weights in zip(
+            mesh_y.face_numbers[points.faces].tolist(), points.weights.tolist(), strict=True
+        ):
             file.write(f"{face + 1} {' '.join(map(repr, weights))}\n")
 
 
@@ -253,8 +256,7 @@ class _Table:
         """A column as 0-based faces of a mesh, where the file counts those that cleaning dropped, too."""
         count = len(mesh.faces) + len(mesh.dropped_faces)
         given = self.indices(column, count, f"faces of {mesh.name}", base)
-        kept = np.delete(np.arange(count), mesh.dropped_faces)
-        faces = np.searchsorted(kept, given)
+        faces = np.searchsorted(mesh.face_numbers, given)
         dropped = np.isin(given, mesh.dropped_faces)
         if dropped.any():
             row = int(dropped.argmax())

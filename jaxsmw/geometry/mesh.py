@@ -49,6 +49,11 @@ class Mesh:
     notes: tuple[str, ...] = ()
     dropped_faces: Int64[np.ndarray, " d"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
+    @property
+    def face_numbers(self) -> Int64[np.ndarray, " f"]:
+        """The number (0-based) that each face had among the faces given, as files mean it."""
+        return np.delete(np.arange(len(self.faces) + len(self.dropped_faces)), self.dropped_faces)
+
     @cached_property
     def _area_vectors(self) -> Float64[np.ndarray, "f 3"]:
         """Normals as long as twice the area."""
