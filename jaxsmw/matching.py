@@ -170,9 +170,11 @@ def match(
         "stop_when_unchanged": stop_when_unchanged,
         "history": history,
     }
+    m, n = len(mesh_x.vertices), len(mesh_y.vertices)
     compiling = None
-    if not partial:  # of a part the number of eigenvectors comes out later
-        sizes = (len(mesh_x.vertices), len(mesh_y.vertices), number_of_eigenvectors, number_of_samples)
+    # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
+    if not partial and 0 < number_of_eigenvectors < min(m, n):
+        sizes = m, n, number_of_eigenvectors, number_of_samples
         compiling = compile_ahead(refine, lambda: _outlines(*sizes), **settings)
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
