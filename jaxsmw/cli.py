@@ -442,11 +442,11 @@ def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
     inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
-    _keep_inputs(options.output, *inputs)
-    check_writable(options.output)
     if options.surface_points:
-        _keep_inputs(options.surface_points, *inputs)
         _check_surface_points(options)
+    for path in filter(None, (options.output, options.surface_points)):
+        _keep_inputs(path, *inputs)
+        check_writable(path)
     if options.report:
         from jaxsmw.report.figures import check_drawable
 
@@ -582,7 +582,6 @@ def _check_surface_points(options: argparse.Namespace) -> None:
         raise InputError(f"{path}: points are written as .baryc_gt; choose a name that ends in it.")
     if os.path.realpath(path) == os.path.realpath(options.output):
         raise InputError(f"{path}: is the map's file as well: choose another name for one of them.")
-    check_writable(path)
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

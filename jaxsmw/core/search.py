@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -39,8 +40,8 @@ def nearest_neighbor(
     - `queries`, `database`: points in d dimensions.
     - `database_mask`: rows with False are never chosen. If all are False the result is meaningless.
     """
-    (m, d), n = queries.shape, database.shape[0]
-    chunks, blocks = -(-n // _CHUNK), -(-m // _BLOCK)
+    n = database.shape[0]
+    chunks = -(-n // _CHUNK)
     half_norms = 0.5 * jnp.sum(database**2, axis=1)
     if database_mask is not None:
         half_norms = jnp.where(database_mask, half_norms, jnp.inf)
@@ -58,8 +59,19 @@ def nearest_neighbor(
         masked = jnp.isinf(half_norms[candidates])
         return _nearest(block, rows[candidates], candidates, masked, n).astype(jnp.int32)
 
-    padded = jnp.pad(queries, ((0, blocks * _BLOCK - m), (0, 0)))
-    return lax.map(search, padded.reshape(blocks, _BLOCK, d)).reshape(-1)[:m]
+    return in_blocks(search, queries, _BLOCK)
+
+
+def in_blocks(
+    search: Callable[[Float[Array, "block d"]], Int32[Array, " block"]],
+    queries: Float[Array, "m d"],
+    size: int,
+) -> Int32[Array, " m"]:
+    """What a search finds for all queries, given to it so many at a time; to the last zeros are added."""
+    m, d = queries.shape
+    blocks = -(-m // size)
+    padded = jnp.pad(queries, ((0, blocks * size - m), (0, 0)))
+    return lax.map(search, padded.reshape(blocks, size, d)).reshape(-1)[:m]
 
 
 def _two_best(scores: Float[Array, "s block"]) -> Int[Array, "2 block"]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.products import product
+from jaxsmw.core.search import in_blocks
 
 # Queries whose distances to all triangles are had at once.
 _BLOCK = 32
@@ -52,10 +52,7 @@ def nearest_point_on_triangles(
         squared = jnp.where(masked[:, None], jnp.inf, squared)
         return jnp.argmin(squared, axis=0).astype(jnp.int32)
 
-    m, d = queries.shape
-    blocks = -(-m // _BLOCK)
-    padded = jnp.pad(queries, ((0, blocks * _BLOCK - m), (0, 0)))
-    found = lax.map(search, padded.reshape(blocks, _BLOCK, d)).reshape(-1)[:m]
+    found = in_blocks(search, queries, _BLOCK)
     # Once more from differences, in which nothing cancels.
     away = queries - corners[found, 0]
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
