@@ -1,5 +1,6 @@
 from .core.batch import refine_pairs, stack
 from .core.compilation import compiler_options
+from .core.feature_regression import FeatureRegression
 from .core.filters import (
     ControlPoints,
     CubicSpline,
@@ -53,10 +54,12 @@ from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.mesh_files import read_mesh, write_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
-from .matching import Correspondence, initial_map, match, paired_spectra
+from .matching import Correspondence, describe, initial_map, match, paired_spectra
+from .presets import PRESETS, Stage
 
 __version__: str
 __all__ = [
+    "PRESETS",
     "RESULTS",
     "ControlPoints",
     "Correspondence",
@@ -66,6 +69,7 @@ __all__ = [
     "DataSet",
     "DescriptorPair",
     "ExponentialWindow",
+    "FeatureRegression",
     "FilterBank",
     "Filtering",
     "FrameBounds",
@@ -98,6 +102,7 @@ __all__ = [
     "Solution",
     "SpectralDistribution",
     "Spectrum",
+    "Stage",
     "SurfacePoints",
     "Warp",
     "Warped",
@@ -110,6 +115,7 @@ __all__ = [
     "creature_pair",
     "decode",
     "decode_to_triangles",
+    "describe",
     "diagnose",
     "encode",
     "farthest_point_samples",

@@ -21,7 +21,7 @@ from jaxsmw.files import atomic_write, check_writable, make_directory
 
 if TYPE_CHECKING:
     from jaxsmw.core.filters import FilterBank
-    from jaxsmw.core.refinement import WaveletPreservation
+    from jaxsmw.core.solutions import Solution
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.geometry.geodesics import SurfacePoints
@@ -178,9 +178,9 @@ def _parser() -> argparse.ArgumentParser:
         "--methods",
         metavar="METHOD",
         nargs="+",
-        help="start, mwp, mwp-sampled, no-filter, icp, cpd, bcicp, zoomout, zoomout-sampled; pyfm-zoomout, "
-        "geomfum-zoomout where these are installed; directories with maps X_Y.map made elsewhere (default: "
-        "all that suit the pairs; cpd and bcicp take half a minute per pair)",
+        help="start, mwp, accurate, mwp-sampled, no-filter, icp, cpd, bcicp, zoomout, zoomout-sampled; "
+        "pyfm-zoomout, geomfum-zoomout where these are installed; directories with maps X_Y.map made "
+        "elsewhere (default: all that suit the pairs; cpd and bcicp take half a minute per pair)",
     )
     benchmark.add_argument(
         "--pairs", metavar="N|FILE", help="so many at random, or those of a list (default: all)"
@@ -264,39 +264,57 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
         "%(default)s; it and what builds on it alone tell left from right)",
     )
     group.add_argument(
-        "--eigenvectors", type=_integer(1), default=100, help="per shape (default: %(default)s)"
-    )
-    _add_bank(group)
-    group.add_argument(
-        "--solution",
-        choices=("filtering", "least-squares", "least-squares-frobenius", "regularized"),
-        default="filtering",
-        help="how the functional map is found: filtering is for banks that are tight frames, least-squares "
-        "is exact for all (-frobenius: with every vertex counting the same), regularized adds commutativity "
-        "with the Laplacian and orthogonality (default: %(default)s)",
-    )
-    group.add_argument("--iterations", type=_integer(1), default=3, help="(default: %(default)s)")
-    group.add_argument(
-        "--samples",
-        metavar="N",
-        type=_integer(1),
-        help="iterate on N samples per shape; all in the last step",
-    )
-    group.add_argument(
-        "--search",
-        choices=("auto", "exhaustive", "patches", "approximate"),
-        default="auto",
-        help="for nearest neighbours: exhaustive and patches find the same ones, patches faster on large "
-        "meshes, and auto takes the faster; approximate misses some (jaxsmw[approximate]; default: "
-        "%(default)s)",
-    )
-    group.add_argument(
-        "--stop-when-unchanged", action="store_true", help="end early when no match changes any more"
+        "--preset",
+        choices=("accurate", "paper"),
+        help="how the map is refined: accurate, or as the MWP paper has it, which is faster (default: "
+        "accurate; paper where something is said with the options below)",
     )
     group.add_argument(
         "--precision", choices=("float32", "float64"), default="float32", help="(default: %(default)s)"
     )
     _add_eigenproblem(group)
+    paper = parser.add_argument_group("the paper's method, changed")
+    paper.add_argument("--eigenvectors", type=_integer(1), help="per shape (default: 100)")
+    _add_bank(paper)
+    paper.add_argument(
+        "--solution",
+        choices=("filtering", "least-squares", "least-squares-frobenius", "regularized"),
+        help="how the functional map is found: filtering is for banks that are tight frames, least-squares "
+        "is exact for all (-frobenius: with every vertex counting the same), regularized adds commutativity "
+        "with the Laplacian and orthogonality (default: filtering)",
+    )
+    paper.add_argument("--iterations", type=_integer(1), help="(default: 3)")
+    paper.add_argument(
+        "--samples",
+        metavar="N",
+        type=_integer(1),
+        help="iterate on N samples per shape; all in the last step",
+    )
+    paper.add_argument(
+        "--search",
+        choices=("auto", "exhaustive", "patches", "approximate"),
+        help="for nearest neighbours: exhaustive and patches find the same ones, patches faster on large "
+        "meshes, and auto takes the faster; approximate misses some (jaxsmw[approximate]; default: auto)",
+    )
+    paper.add_argument(
+        "--stop-when-unchanged",
+        action="store_true",
+        default=None,
+        help="end early when no match changes any more",
+    )
+
+
+# Options that change the paper's method.
+_CHANGES = (
+    "eigenvectors",
+    "bank",
+    "filters",
+    "solution",
+    "iterations",
+    "samples",
+    "search",
+    "stop_when_unchanged",
+)
 
 
 # Names of banks on the command line, and their classes.
@@ -316,6 +334,7 @@ _BANKS = {
     "gabor": "Gabor",
     "identity": "Identity",
 }
+_DEFAULT_BANK = "meyer"
 _NOT_TIGHT = ("cubic-spline", "mexican-hat", "gabor")
 
 
@@ -323,9 +342,8 @@ def _add_bank(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--bank",
         choices=tuple(_BANKS),
-        default="meyer",
         metavar="BANK",
-        help=f"the filters, one of {', '.join(_BANKS)} (default: %(default)s)",
+        help=f"the filters, one of {', '.join(_BANKS)} (default: {_DEFAULT_BANK})",
     )
     parser.add_argument(
         "--filters", type=_integer(2), help="how many, where the bank lets choose (default: 6)"
@@ -479,21 +497,55 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
     from jaxsmw.matching import match
 
     with jax.enable_x64(options.precision == "float64"):
-        if options.solution == "filtering" and options.bank in _NOT_TIGHT:
-            _note_frame_bounds(options)
         return match(
             mesh_x,
             mesh_y,
+            preset=_preset(options),
             init=_read_init(options, mesh_x, mesh_y),
-            number_of_eigenvectors=options.eigenvectors,
-            refiner=_refiner(options),
-            iterations=options.iterations,
-            number_of_samples=options.samples,
             laplacian=options.laplacian,
             eigensolver=options.eigensolver,
             partial=options.partial,
-            stop_when_unchanged=options.stop_when_unchanged,
         )
+
+
+def _preset(options: argparse.Namespace) -> Any:
+    """The name of a preset, or a stage where the paper's method is to be changed."""
+    changes = [name for name in _CHANGES if getattr(options, name) is not None]
+    if not changes:
+        return options.preset or "accurate"
+    if options.preset not in (None, "paper"):
+        option = changes[0].replace("_", "-")
+        raise InputError(
+            f"--{option}: changes the paper's method: leave it out, or --preset {options.preset}."
+        )
+    from jaxsmw.core.refinement import WaveletPreservation
+    from jaxsmw.presets import Stage
+
+    chosen = {name: getattr(options, name) for name in changes}
+    solution = chosen.get("solution", "filtering")
+    if solution == "filtering" and options.bank in _NOT_TIGHT:
+        _note_frame_bounds(options)
+    try:
+        refiner = WaveletPreservation(
+            _bank(options), _solution(solution), search=chosen.get("search", "auto")
+        )
+    except ImportError as error:
+        raise InputError(f"--search {options.search}: {error}") from None
+    names = {"eigenvectors": "number_of_eigenvectors", "samples": "number_of_samples"}
+    kept = ("eigenvectors", "samples", "iterations", "stop_when_unchanged")
+    return Stage(refiner, **{names.get(name, name): chosen[name] for name in kept if name in chosen})
+
+
+def _solution(name: str) -> Solution:
+    from jaxsmw.core import solutions
+
+    choices: dict[str, Solution] = {
+        "filtering": solutions.Filtering(),
+        "least-squares": solutions.LeastSquares(),
+        "least-squares-frobenius": solutions.LeastSquares("frobenius"),
+        "regularized": solutions.RegularizedLeastSquares(),
+    }
+    return choices[name]
 
 
 def _note_frame_bounds(options: argparse.Namespace) -> None:
@@ -533,7 +585,6 @@ def _conclude(
         write_report(
             directory,
             correspondence,
-            refiner=_refiner(options),
             errors=errors,
             settings=settings,
             up=options.up,
@@ -617,7 +668,7 @@ def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options)
     if options.output and Path(options.output).suffix != ".npz":
         raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
-    if not options.figure and (options.filters is not None or options.bank != "meyer"):
+    if not options.figure and (options.filters is not None or options.bank is not None):
         raise InputError("--bank and --filters are for --figure: name a figure, or leave them out.")
     bank = _bank(options)
     import numpy as np
@@ -703,34 +754,17 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
 def _bank(options: argparse.Namespace) -> FilterBank:
     from jaxsmw.core import filters
 
-    kind = getattr(filters, _BANKS[options.bank])
+    name = options.bank or _DEFAULT_BANK
+    kind = getattr(filters, _BANKS[name])
     if options.filters is None:
         bank = kind()
     elif "filters" not in kind.__dataclass_fields__:
-        raise InputError(f"--filters: the number of filters of {options.bank} is fixed; leave --filters out.")
+        raise InputError(f"--filters: the number of filters of {name} is fixed; leave --filters out.")
     else:
         try:
             bank = kind(options.filters)
         except ValueError as error:
             raise InputError(f"--filters {options.filters}: {error}; ask for more.") from error
-    if options.bank.startswith("adapted-"):
+    if name.startswith("adapted-"):
         return filters.Warped(bank, filters.SpectralDistribution())
     return bank
-
-
-def _refiner(options: argparse.Namespace) -> WaveletPreservation:
-    from jaxsmw.core import solutions
-    from jaxsmw.core.refinement import WaveletPreservation
-
-    choices: dict[str, solutions.Solution] = {
-        "filtering": solutions.Filtering(),
-        "least-squares": solutions.LeastSquares(),
-        "least-squares-frobenius": solutions.LeastSquares("frobenius"),
-        "regularized": solutions.RegularizedLeastSquares(),
-    }
-    try:
-        return WaveletPreservation(
-            bank=_bank(options), solution=choices[options.solution], search=options.search
-        )
-    except ImportError as error:
-        raise InputError(f"--search {options.search}: {error}") from None

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field
+from functools import partial as partial_function
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
@@ -20,14 +21,14 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.compilation import compile_ahead, compiled
-from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import decode_to_triangles, spectral_embeddings
-from jaxsmw.core.refinement import History, Refiner, WaveletPreservation, refine
+from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.refinement import Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
@@ -35,6 +36,7 @@ from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.presets import Preset, Stage, chosen_stages, common_range, refine_in_stages
 
 logger = logging.getLogger("jaxsmw")
 
@@ -67,10 +69,11 @@ class Correspondence:
     - `initial_map`: what it started from, (m,).
     - `functional_map`: the last C; (k, k), functions on Y to functions on X unless the refiner says
       otherwise.
-    - `spectrum_x`, `spectrum_y`: the spectra it was computed with, for area 1.
-    - `iterations`: how many were done.
-    - `history`: a `jaxsmw.History` if asked for.
-    - `seconds`: wall time of each stage. The first refinement of a size includes its compilation.
+    - `stages`: what it was refined by.
+    - `spectrum_x`, `spectrum_y`: the spectra that the last stage saw, for area 1.
+    - `refinement`: the outcome of the last stage, with its history if asked for.
+    - `iterations`: how many were done, in all stages.
+    - `seconds`: wall time of each part. The first refinement of a size includes its compilation.
     """
 
     mesh_x: Mesh
@@ -78,29 +81,27 @@ class Correspondence:
     pointwise_map: Int64[np.ndarray, " m"]
     initial_map: Int64[np.ndarray, " m"]
     functional_map: Float[np.ndarray, "k_out k_in"]
+    stages: tuple[Stage, ...]
     spectrum_x: Spectrum
     spectrum_y: Spectrum
+    refinement: Refinement
     iterations: int
-    history: History | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def surface_points(self, *, convention: Convention = "pullback") -> SurfacePoints:
+    def surface_points(self) -> SurfacePoints:
         """For every vertex of X the point of Y that is the same, anywhere on Y's triangles (m points).
 
-        By the functional map; see `jaxsmw.decode_to_triangles`. Faces are rows of `mesh_y.faces`. A vertex of
-        X that no face uses gets the point of the nearest one that a face does use.
-
-        **Arguments:**
-
-        - `convention`: that of the refiner.
+        Found like `pointwise_map`, but between Y's vertices as well; see `jaxsmw.decode_to_triangles`. Faces
+        are rows of `mesh_y.faces`. A vertex of X that no face uses gets the point of the nearest one that a
+        face does use.
         """
         with jax.enable_x64(self.functional_map.dtype == np.float64):  # as when it was computed
-            faces, traced_weights = compiled(decode_to_triangles)(
-                jax.device_put(self.functional_map),
+            faces, traced_weights = compiled(_points_on_triangles)(
+                self.stages[-1].refiner,
+                self.refinement.updated,
                 self.spectrum_x,
                 self.spectrum_y,
                 jax.device_put(self.mesh_y.faces),
-                convention=convention,
             )
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # without rounding errors
         return SurfacePoints(
@@ -109,43 +110,44 @@ class Correspondence:
         )
 
 
+def _points_on_triangles(
+    refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: Spectrum, faces_y: Int[Array, "f 3"]
+) -> tuple[Int[Array, " m"], Float[Array, "m 3"]]:
+    queries, database = refiner.embeddings(refiner.prepare(spectrum_x, spectrum_y), updated)
+    return nearest_point_on_triangles(queries, database, faces_y)
+
+
 def match(
     mesh_x: Mesh,
     mesh_y: Mesh,
     *,
+    preset: Preset | Stage | Sequence[Stage] = "accurate",
     init: Start | ArrayLike = "shot",
-    number_of_eigenvectors: int = 100,
-    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = 3,
-    number_of_samples: int | None = None,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
-    stop_when_unchanged: bool = False,
     history: bool = False,
 ) -> Correspondence:
     """Say for every vertex of one mesh which vertex of the other is the same point.
 
-    Spectra of both meshes, an initial map, then `jaxsmw.refine`. Computed in JAX's default float type.
-    Stages are logged to the logger `"jaxsmw"` as they begin.
+    Spectra of both meshes, an initial map, then the stages of a preset. Computed in JAX's default float type.
+    What it is at is logged to the logger `"jaxsmw"`.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
+    - `preset`: how the map is refined: `"accurate"`; `"paper"`, as the MWP paper has it; or stages of your
+      own, for example `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See
+      `jaxsmw.PRESETS`, of which small meshes get as many eigenvectors and samples as they have vertices for.
     - `init`: where to start: `"shot"`, `"wks"`, `"hks"` or `"wavelet"` for nearest neighbours of that
       descriptor (only SHOT tells left from right); `"functional"` for the functional map that preserves
       SHOT and commutes with the Laplacian (section 3.2 of the MWP paper), smoother and much less wrong to
       begin with; an array (m,) of vertices of Y for a map of your own;
       an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
       and in geodesic distance to the landmarks (a few, on both sides of the body).
-    - `number_of_eigenvectors`: k of both shapes.
-    - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
-    - `iterations`: how many; at least 1.
-    - `number_of_samples`: iterate on so many farthest-point samples of each shape (more than k) and search
-      all vertices in the last iteration only.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
-    - `stop_when_unchanged`, `history`: see `jaxsmw.refine`.
+    - `history`: record what happened in the last stage; see `jaxsmw.refine`.
 
     **Returns:** A `Correspondence`. A vertex of X that no face uses gets the match of the nearest one that
     a face does use; unused vertices of Y are never matched.
@@ -153,83 +155,80 @@ def match(
     **Raises:** `InputError` for anything about the arguments that cannot work; `ArithmeticError` if numbers
     went wrong on the way.
     """
-    if not isinstance(refiner, Refiner):
-        raise InputError(
-            f"refiner is {refiner!r}; give a Refiner such as WaveletPreservation(bank=Meyer(8))."
-        )
-    if iterations < 1:
-        raise InputError(f"{iterations} iterations were asked for; at least 1 is needed.")
-    if number_of_samples is not None and number_of_samples < number_of_eigenvectors:
-        raise InputError(
-            f"{number_of_samples} samples cannot tell {number_of_eigenvectors} eigenvectors apart; use more "
-            "samples (five per eigenvector is usual) or fewer eigenvectors."
-        )
-    settings: dict[str, Any] = {
-        "refiner": refiner,
-        "iterations": iterations,
-        "stop_when_unchanged": stop_when_unchanged,
-        "history": history,
-    }
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
-    compiling = None
+    stages = chosen_stages(preset, min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y)))
+    k = max(stage.number_of_eigenvectors for stage in stages)
+    compiling = []
     # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
-    if not partial and 0 < number_of_eigenvectors < min(m, n):
-        sizes = m, n, number_of_eigenvectors, number_of_samples
-        compiling = compile_ahead(refine, lambda: _outlines(*sizes), **settings)
+    if not partial and 0 < k < min(m, n):
+        for stage in stages:
+            outlines = partial_function(_outlines, m, n, stage)
+            compiling.append(compile_ahead(refine, outlines, **stage.settings, history=history))
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
         spectrum_x, spectrum_y = paired_spectra(
-            mesh_x,
-            mesh_y,
-            number_of_eigenvectors,
-            laplacian=laplacian,
-            eigensolver=eigensolver,
-            partial=partial,
+            mesh_x, mesh_y, k, laplacian=laplacian, eigensolver=eigensolver, partial=partial
         )
     for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
         if np.asarray(spectrum.eigenvalues)[-1] == 0:
             raise InputError(
-                f"{mesh.name}: with {number_of_eigenvectors} eigenvectors nothing is known of it but which "
+                f"{mesh.name}: with {k} eigenvectors nothing is known of it but which "
                 "of its separate parts a vertex belongs to; ask for more of them than it has parts, or join "
                 "vertices at the same position (weld=True, on the command line --weld)."
             )
     with _stage("initial map", seconds):
         start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init, partial=partial)
-    samples: dict[str, Any] = {}
-    if number_of_samples is not None:
+    if number_of_descriptors := max(stage.number_of_descriptors for stage in stages):
+        with _stage("descriptors", seconds):
+            spectrum_x, spectrum_y = describe(
+                mesh_x, mesh_y, spectrum_x, spectrum_y, number_of_descriptors, partial=partial
+            )
+    samples = None
+    if number_of_samples := max(stage.number_of_samples or 0 for stage in stages):
         with _stage("samples", seconds):
-            for side, mesh in (("samples_x", mesh_x), ("samples_y", mesh_y)):
-                samples[side] = jax.device_put(farthest_point_samples(mesh, number_of_samples))
+            samples_x, samples_y = _side_by_side(
+                lambda mesh: farthest_point_samples(mesh, number_of_samples), mesh_x, mesh_y
+            )
+            samples = jax.device_put(samples_x), jax.device_put(samples_y)
+    spectra = [stage.view(spectrum_x, spectrum_y, partial=partial) for stage in stages]
     with _stage("refinement", seconds):
-        if compiling is not None:
-            wait([compiling])
-        refinement = jax.block_until_ready(
-            compiled(refine)(spectrum_x, spectrum_y, jax.device_put(start), **samples, **settings)
-        )
-    if refinement.result != RESULTS.successful:
-        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(refinement.result)}")
-    pointwise_map = np.asarray(refinement.pointwise_map).astype(np.int64)
+        wait(compiling)
+        refinements = refine_in_stages(spectra, jax.device_put(start), stages, samples, history=history)
+        last = jax.block_until_ready(refinements[-1])
+    if last.result != RESULTS.successful:
+        raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(last.result)}")
     return Correspondence(
         mesh_x=mesh_x,
         mesh_y=mesh_y,
-        pointwise_map=_extend_to_unused(mesh_x, pointwise_map),
+        pointwise_map=_extend_to_unused(mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=start,
-        functional_map=np.asarray(refinement.functional_map),
-        spectrum_x=spectrum_x,
-        spectrum_y=spectrum_y,
-        iterations=int(refinement.iterations),
-        history=refinement.history,
+        functional_map=np.asarray(last.functional_map),
+        stages=stages,
+        spectrum_x=spectra[-1][0],
+        spectrum_y=spectra[-1][1],
+        refinement=last,
+        iterations=sum(int(refinement.iterations) for refinement in refinements),
         seconds=seconds,
     )
 
 
 def _outlines(
-    m: int, n: int, k: int, number_of_samples: int | None
+    m: int, n: int, stage: Stage
 ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Int[Array, " s"]]]:
-    """The arrays that refinement gets, as far as their sizes."""
-    x, y = (Spectrum(jnp.zeros(k), jnp.zeros((v, k)), jnp.zeros(v), jnp.zeros(v, bool)) for v in (m, n))
-    names = () if number_of_samples is None else ("samples_x", "samples_y")
-    return (x, y, jnp.zeros(m, int)), {name: jnp.zeros(number_of_samples, int) for name in names}
+    """The arrays that a stage's refinement gets, as far as their sizes."""
+    k, d = stage.number_of_eigenvectors, stage.number_of_descriptors
+    x, y = (
+        Spectrum(
+            jnp.zeros(k),
+            jnp.zeros((v, k)),
+            jnp.zeros(v),
+            jnp.zeros(v, bool),
+            jnp.zeros((v, d)) if d else None,
+        )
+        for v in (m, n)
+    )
+    names = () if stage.number_of_samples is None else ("samples_x", "samples_y")
+    return (x, y, jnp.zeros(m, int)), {name: jnp.zeros(stage.number_of_samples, int) for name in names}
 
 
 def paired_spectra(
@@ -245,7 +244,7 @@ def paired_spectra(
 
     Of two whole bodies each is scaled to area 1, so that a difference in size cancels. Where one is a part of
     the other the larger is, and the other by the same factor; then both are cut where the first of them
-    ends (`common_range`), so that k_X and k_Y differ.
+    ends (`jaxsmw.presets.common_range`), so that k_X and k_Y differ.
 
     **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
     """
@@ -264,12 +263,45 @@ def paired_spectra(
     return common_range(spectrum_x.scale(mesh_x.area / larger), spectrum_y.scale(mesh_y.area / larger))
 
 
-def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Two spectra cut at the smaller of their largest eigenvalues (MWP paper, partial shapes)."""
-    spectra = spectrum_x, spectrum_y
-    last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
-    cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]
-    return cut[0], cut[1]
+def describe(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    number_of_descriptors: int,
+    *,
+    partial: bool = False,
+) -> tuple[Spectrum, Spectrum]:
+    """The spectra with descriptors: principal components of SHOT on both shapes together, of mean square 1.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`, `partial`: see `paired_spectra`.
+    - `number_of_descriptors`: d, at most 352; the components in which the shapes' vertices differ most.
+    """
+    sides = [
+        _Thinned.make(mesh, samples, spectrum)
+        for mesh, samples, spectrum in zip(
+            (mesh_x, mesh_y),
+            _side_by_side(_compared, mesh_x, mesh_y),
+            (spectrum_x, spectrum_y),
+            strict=True,
+        )
+    ]
+    shot = _shot(sides[0], sides[1], partial)
+    weights = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
+    both, weight = np.concatenate(shot), np.concatenate([w / w.sum() / 2 for w in weights])
+    centered = both - weight @ both
+    variances, directions = np.linalg.eigh(centered.T @ (weight[:, None] * centered))
+    first = slice(None, -number_of_descriptors - 1, -1)
+    scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
+    components = np.split(centered @ directions[:, first] / scale, [len(shot[0])])
+    described = []
+    for spectrum, side, found in zip((spectrum_x, spectrum_y), sides, components, strict=True):
+        everywhere = found if side.samples is None else found[side.samples.nearest]
+        everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
+        described.append(spectrum.describe(jax.device_put(everywhere.astype(spectrum.eigenvectors.dtype))))
+    return described[0], described[1]
 
 
 def initial_map(

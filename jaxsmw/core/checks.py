@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
     """A continuous setting as an array of the default float type, so that it is traced."""
     return jnp.asarray(value, dtype=float)
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether there is neither NaN nor infinity in any array of a pytree."""
+    inexact = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

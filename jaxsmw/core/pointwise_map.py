@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.core.functional_map import Convention
@@ -100,20 +100,17 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     )
 
 
+def chosen_patches(search: str, spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches] | None:
+    """`search_patches` where a method is to search `"patches"`, or `"auto"` and they pay; None elsewhere."""
+    sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
+    pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
+    if search == "patches" or (search == "auto" and pays):
+        return search_patches(spectrum_x, spectrum_y)
+    return None
+
+
+# From so many vertices on (in the geometric mean of both shapes) patches save more than compiling them takes.
+_PATCHES_FROM = 15_000
 # Measured with scripts/benchmark_speed.py.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000
-
-
-def matching_objective(
-    functional_map: Float[Array, "k_out k_in"],
-    pointwise_map: Int32[Array, " m"],
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-    *,
-    convention: Convention = "pullback",
-) -> Float[Array, ""]:
-    """What `decode` minimises over T: the area-weighted mean squared distance between matched embeddings."""
-    queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
-    squared_distances = jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)
-    return jnp.sum(spectrum_x.vertex_areas * squared_distances) / jnp.sum(spectrum_x.vertex_areas)

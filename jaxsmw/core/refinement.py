@@ -8,15 +8,14 @@ from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import all_finite, check_choice
 from jaxsmw.core.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import decode, matching_objective, search_patches
+from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
@@ -30,14 +29,22 @@ class Problem(eqx.Module):
     prepared: Any = None
 
 
+Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
+"""Vertices of X and of Y that stand for all."""
+
+
 class Refiner(eqx.Module):
-    """One method of refinement: how a functional map follows from a pointwise map, and the way back."""
+    """One method of refinement: how a functional map follows from a pointwise map, and the way back.
+
+    `refine` hands on between the half-steps whatever pytree `update` makes; for most methods that is the
+    functional map itself, otherwise `functional_map` says how to get it.
+    """
 
     @abc.abstractmethod
-    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool) -> Problem:
-        """Compute what stays the same in all iterations.
+    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
+        """Compute what stays the same in all iterations: among all vertices, or on samples of them.
 
-        `sampled` says that the spectra are sampled ones, whose eigenvectors are not orthonormal.
+        The problem's `spectrum_x` is that of the vertices to be matched.
         """
 
     @abc.abstractmethod
@@ -45,28 +52,41 @@ class Refiner(eqx.Module):
         self,
         problem: Problem,
         pointwise_map: Int[Array, " m"],
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: Any,
+    ) -> tuple[Any, RESULTS]:
         """The functional map that follows from a pointwise map, and how its computation ended.
 
-        `previous` is the functional map of the iteration before; None in the first.
+        `previous` is the one that the pointwise map was recovered from; None in the first iteration.
         """
 
     @abc.abstractmethod
-    def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
+    def recover(self, problem: Problem, updated: Any) -> Int32[Array, " m"]:
         """The pointwise map that follows from a functional map."""
 
     @abc.abstractmethod
-    def energy(
-        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
-    ) -> Float[Array, ""]:
+    def energy(self, problem: Problem, updated: Any, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
         """What the method wants to be small, for the history."""
 
-    @abc.abstractmethod
-    def objective(
-        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
-    ) -> Float[Array, ""]:
-        """What `recover` minimises, for the history."""
+    def functional_map(self, updated: Any) -> Float[Array, "k_out k_in"]:
+        """The functional map in what `update` made."""
+        return updated
+
+    def embeddings(self, problem: Problem, updated: Any) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+        """Two point sets, of the vertices to be matched and of all of Y, in which matches lie close together.
+
+        In the units of the method. Points on triangles are found between them.
+        """
+        return spectral_embeddings(self.functional_map(updated), problem.spectrum_x, problem.spectrum_y)
+
+    def objective(self, problem: Problem, updated: Any, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
+        """The area-weighted mean squared distance between matched embeddings, for the history."""
+        queries, database = self.embeddings(problem, updated)
+        areas = problem.spectrum_x.vertex_areas
+        return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
+
+    def is_settled(self, updated: Any) -> Bool[Array, ""]:
+        """Whether matches that no longer change will stay as they are: not while settings still vary."""
+        return jnp.asarray(True)
 
 
 class History(eqx.Module):
@@ -96,6 +116,7 @@ class Refinement(eqx.Module):
 
     - `pointwise_map`: T: X -> Y (m,), one vertex of Y per vertex of X; -1 throughout on failure.
     - `functional_map`: the C that gave it.
+    - `updated`: what the refiner's last update made, for its other methods; often C itself.
     - `result`: a member of `RESULTS`; compare with `RESULTS.successful`.
     - `iterations`: how many were done (fewer than asked for after an early stop).
     - `history`: a `History` when asked for, else None.
@@ -103,15 +124,13 @@ class Refinement(eqx.Module):
 
     pointwise_map: Int32[Array, " m"]
     functional_map: Float[Array, "k_out k_in"]
+    updated: Any
     result: RESULTS
     iterations: Int32[Array, ""]
     history: History | None
 
 
 Search = Literal["auto", "exhaustive", "patches", "approximate"]
-
-# From so many vertices on (in the geometric mean of both shapes) patches save more than compiling them takes.
-_PATCHES_FROM = 15_000
 
 
 class WaveletPreservation(Refiner):
@@ -167,14 +186,12 @@ class WaveletPreservation(Refiner):
             sampled,
         )
 
-    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool) -> Problem:
+    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
         """Prepare the bank's responses, what the solution wants to be prepared, and the search."""
-        wavelets = self.problem(spectrum_x, spectrum_y, sampled=sampled)
-        sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
-        pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
-        patches = None
-        if self.search == "patches" or (self.search == "auto" and pays):
-            patches = search_patches(spectrum_x, spectrum_y)
+        if samples is not None:
+            spectrum_x, spectrum_y = spectrum_x.sample(samples[0]), spectrum_y.sample(samples[1])
+        wavelets = self.problem(spectrum_x, spectrum_y, sampled=samples is not None)
+        patches = chosen_patches(self.search, spectrum_x, spectrum_y)
         return Problem(spectrum_x, spectrum_y, (wavelets, self.solution.prepare(wavelets), patches))
 
     def update(
@@ -187,11 +204,11 @@ class WaveletPreservation(Refiner):
         wavelets, prepared, _ = problem.prepared
         return self.solution.solve(wavelets, prepared, pointwise_map, previous)
 
-    def recover(self, problem: Problem, functional_map: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
+    def recover(self, problem: Problem, updated: Float[Array, "k_out k_in"]) -> Int32[Array, " m"]:
         """Nearest neighbours; see `decode`."""
         _, _, patches = problem.prepared
         return decode(
-            functional_map,
+            updated,
             problem.spectrum_x,
             problem.spectrum_y,
             convention=self.convention,
@@ -200,18 +217,18 @@ class WaveletPreservation(Refiner):
         )
 
     def energy(
-        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
+        self, problem: Problem, updated: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
         """Eq. (5), area-weighted; see `wavelet_energy`."""
         wavelets, _, _ = problem.prepared
-        return wavelets.energy(pointwise_map)(functional_map)
+        return wavelets.energy(pointwise_map)(updated)
 
-    def objective(
-        self, problem: Problem, functional_map: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
-    ) -> Float[Array, ""]:
-        """The mean squared distance found by the search; see `matching_objective`."""
-        return matching_objective(
-            functional_map, pointwise_map, problem.spectrum_x, problem.spectrum_y, convention=self.convention
+    def embeddings(
+        self, problem: Problem, updated: Float[Array, "k_out k_in"]
+    ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+        """See `spectral_embeddings`."""
+        return spectral_embeddings(
+            updated, problem.spectrum_x, problem.spectrum_y, convention=self.convention
         )
 
 
@@ -233,8 +250,8 @@ def refine(
     Pure and jit-compiled; compiled again only when sizes or static settings change. For many pairs of
     equal size use `jax.vmap`, or `jax.lax.map` where memory counts.
 
-    With samples this is the MWP authors' fast variant: the first functional map comes from all vertices,
-    then the turns are taken between the samples alone, and the last search is over all vertices.
+    With samples the first functional map comes from all vertices, then turns are taken on the samples, and
+    the last search is over all vertices. With `WaveletPreservation` this is the MWP authors' fast variant.
 
     **Arguments:**
 
@@ -269,38 +286,42 @@ def refine(
             "the same jax_enable_x64"
         )
 
-    whole = working = refiner.prepare(spectrum_x, spectrum_y, sampled=False)
+    whole = working = refiner.prepare(spectrum_x, spectrum_y)
     working_map = pointwise_map = pointwise_map.astype(jnp.int32)
     if samples_x is not None and samples_y is not None:
-        working = refiner.prepare(spectrum_x.sample(samples_x), spectrum_y.sample(samples_y), sampled=True)
+        working = refiner.prepare(spectrum_x, spectrum_y, (samples_x, samples_y))
         working_map = jnp.full(samples_x.shape, -1, jnp.int32)
     undefined = jnp.asarray(jnp.nan, dtype)
     keeps_maps = history and samples_x is None
 
-    def search(problem: Problem, functional_map: Array, before: Array) -> tuple[Array, Array, Array]:
-        after = refiner.recover(problem, functional_map)
+    def search(problem: Problem, updated: Any, before: Array) -> tuple[Array, Array, Array]:
+        after = refiner.recover(problem, updated)
         mask = problem.spectrum_x.mask
         changed = jnp.sum((after != before) & mask) / jnp.sum(mask)
-        objective = refiner.objective(problem, functional_map, after) if history else undefined
+        objective = refiner.objective(problem, updated, after) if history else undefined
         return after, changed.astype(dtype), objective
 
-    def energy(problem: Problem, functional_map: Array, pointwise_map: Array) -> Array:
-        return refiner.energy(problem, functional_map, pointwise_map) if history else undefined
+    def checked(updated: Any, result: RESULTS) -> RESULTS:
+        return _checked(updated, refiner.functional_map(updated), result)
+
+    def energy(problem: Problem, updated: Any, pointwise_map: Array) -> Array:
+        return refiner.energy(problem, updated, pointwise_map) if history else undefined
 
     def turn(state: _State, last: Bool[Array, ""]) -> tuple[_State, _Record]:
-        after, changed, objective = search(working, state.functional_map, state.pointwise_map)
+        after, changed, objective = search(working, state.updated, state.pointwise_map)
         record = changed, state.energy, objective, after if keeps_maps else None
 
-        def follow() -> tuple[Array, RESULTS, Array, Array]:
-            functional_map, result = refiner.update(working, after, state.functional_map)
-            result = where(state.result == RESULTS.successful, _checked(functional_map, result), state.result)
-            return functional_map, result, energy(working, functional_map, after), state.iterations + 1
+        def follow() -> tuple[Any, RESULTS, Array, Array]:
+            updated, result = refiner.update(working, after, state.updated)
+            result = where(state.result == RESULTS.successful, checked(updated, result), state.result)
+            return updated, result, energy(working, updated, after), state.iterations + 1
 
-        def keep() -> tuple[Array, RESULTS, Array, Array]:
-            return state.functional_map, state.result, state.energy, state.iterations
+        def keep() -> tuple[Any, RESULTS, Array, Array]:
+            return state.updated, state.result, state.energy, state.iterations
 
-        functional_map, result, preserved, done = lax.cond(last, keep, follow)
-        return _State(after, functional_map, result, preserved, done, changed == 0, last), record
+        updated, result, preserved, done = lax.cond(last, keep, follow)
+        unchanged = (changed == 0) & refiner.is_settled(state.updated)
+        return _State(after, updated, result, preserved, done, unchanged, last), record
 
     def stay(state: _State, _: Bool[Array, ""]) -> tuple[_State, _Record]:
         return state, (undefined, undefined, undefined, state.pointwise_map if keeps_maps else None)
@@ -310,12 +331,12 @@ def refine(
             return turn(state, last)
         return lax.cond(state.finished, stay, turn, state, last | state.unchanged)
 
-    functional_map, result = refiner.update(whole, pointwise_map, None)
+    updated, result = refiner.update(whole, pointwise_map, None)
     state = _State(
         working_map,
-        functional_map,
-        _checked(functional_map, result),
-        energy(whole, functional_map, pointwise_map),
+        updated,
+        checked(updated, result),
+        energy(whole, updated, pointwise_map),
         iterations=jnp.asarray(1, jnp.int32),
         unchanged=jnp.asarray(False),
         finished=jnp.asarray(False),
@@ -327,7 +348,7 @@ def refine(
         refined = state.pointwise_map
     else:
         state, records = lax.scan(step, state, jnp.zeros(iterations - 1, bool))
-        refined, _, objective = search(whole, state.functional_map, pointwise_map)
+        refined, _, objective = search(whole, state.updated, pointwise_map)
         # Nothing to compare the first samples' map with, nor the last one of all vertices.
         changed, energies, objectives, _ = records
         records = (
@@ -347,7 +368,8 @@ def refine(
             recorded = dataclasses.replace(recorded, pointwise_maps=maps)
     return Refinement(
         jnp.where(successful, refined, -1),
-        state.functional_map,
+        refiner.functional_map(state.updated),
+        state.updated,
         result,
         state.iterations,
         recorded,
@@ -358,7 +380,7 @@ class _State(NamedTuple):
     """What one turn of the loop hands to the next."""
 
     pointwise_map: Int32[Array, " s"]
-    functional_map: Float[Array, "k_out k_in"]
+    updated: Any
     result: RESULTS
     energy: Float[Array, ""]
     iterations: Int32[Array, ""]
@@ -370,10 +392,10 @@ _Record = tuple[Array, Array, Array, Array | None]
 """What one turn adds to the four series of `History`."""
 
 
-def _checked(functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
-    """How a functional map came out: a failure that its computation reported says more than a NaN."""
+def _checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
+    """How an update came out: a failure that its computation reported says more than a NaN."""
     went_well = result == RESULTS.successful
-    finite, zero = jnp.all(jnp.isfinite(functional_map)), jnp.all(functional_map == 0)
+    finite, zero = all_finite(updated), jnp.all(functional_map == 0)
     result = where(went_well & zero, RESULTS.undetermined_functional_map, result)
     return where(went_well & ~finite, RESULTS.nonfinite_functional_map, result)
 
@@ -385,9 +407,5 @@ def _diagnose(
     vertices_y = spectrum_y.mask.shape[0]
     in_range = (pointwise_map >= 0) & (pointwise_map < vertices_y)
     valid = in_range & spectrum_y.mask[jnp.clip(pointwise_map, 0, vertices_y - 1)]
-    finite_spectra = jnp.asarray(True)
-    for spectrum in (spectrum_x, spectrum_y):
-        for leaf in (spectrum.eigenvalues, spectrum.eigenvectors, spectrum.vertex_areas):
-            finite_spectra &= jnp.all(jnp.isfinite(leaf))
     result = where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
-    return where(finite_spectra, result, RESULTS.nonfinite_spectrum)
+    return where(all_finite((spectrum_x, spectrum_y)), result, RESULTS.nonfinite_spectrum)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -23,30 +25,36 @@ class Spectrum(eqx.Module):
     - `eigenvectors`: (n, k).
     - `vertex_areas`: (n,), in units of length²; zero where masked.
     - `mask`: (n,), True for vertices of the surface.
+    - `descriptors`: (n, d), what else is known of each vertex, or None. Comparable between shapes; zero where
+      masked. Only methods that say so look at them.
     """
 
     eigenvalues: Float[Array, " k"]
     eigenvectors: Float[Array, "n k"]
     vertex_areas: Float[Array, " n"]
     mask: Bool[Array, " n"]
+    descriptors: Float[Array, "n d"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
         """The same shape with its first eigenpairs only."""
-        return Spectrum(
-            self.eigenvalues[:number_of_eigenvectors],
-            self.eigenvectors[:, :number_of_eigenvectors],
-            self.vertex_areas,
-            self.mask,
+        return dataclasses.replace(
+            self,
+            eigenvalues=self.eigenvalues[:number_of_eigenvectors],
+            eigenvectors=self.eigenvectors[:, :number_of_eigenvectors],
         )
 
     def scale(self, factor: float) -> Spectrum:
         """The same shape with every area multiplied by a factor, every length by its square root."""
-        return Spectrum(
-            self.eigenvalues / factor,
-            self.eigenvectors / factor**0.5,
-            self.vertex_areas * factor,
-            self.mask,
+        return dataclasses.replace(
+            self,
+            eigenvalues=self.eigenvalues / factor,
+            eigenvectors=self.eigenvectors / factor**0.5,
+            vertex_areas=self.vertex_areas * factor,
         )
+
+    def describe(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
+        """The same shape with other descriptors, or none."""
+        return dataclasses.replace(self, descriptors=descriptors)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
         """The same shape with masked vertices up to a given number.
@@ -61,6 +69,7 @@ class Spectrum(eqx.Module):
             jnp.pad(self.eigenvectors, ((0, rows), (0, 0))),
             jnp.pad(self.vertex_areas, (0, rows)),
             jnp.pad(self.mask, (0, rows)),
+            None if self.descriptors is None else jnp.pad(self.descriptors, ((0, rows), (0, 0))),
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
@@ -75,4 +84,5 @@ class Spectrum(eqx.Module):
             self.eigenvectors[vertices],
             jnp.full(vertices.shape, share),
             self.mask[vertices],
+            None if self.descriptors is None else self.descriptors[vertices],
         )

@@ -49,7 +49,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import Start, initial_map, paired_spectra
+from jaxsmw.matching import Start, describe, initial_map, paired_spectra
 from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
@@ -297,9 +297,15 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
-    both_directions = any(method.both_directions for method in task.methods.values())
+    methods = task.methods.values()
     pair = prepare_pair(
-        data, mesh_x, mesh_y, settings.init, number_of_eigenvectors, both_directions=both_directions
+        data,
+        mesh_x,
+        mesh_y,
+        settings.init,
+        number_of_eigenvectors,
+        number_of_descriptors=max(method.number_of_descriptors for method in methods),
+        both_directions=any(method.both_directions for method in methods),
     )
     rows = []
     for name, method in task.methods.items():
@@ -354,11 +360,14 @@ def prepare_pair(
     init: str,
     number_of_eigenvectors: int,
     *,
+    number_of_descriptors: int = 0,
     both_directions: bool = False,
 ) -> PreparedPair:
     """Spectra, start and samples, padded so that few programs serve all pairs."""
     meshes = mesh_x, mesh_y
     spectra = paired_spectra(*meshes, number_of_eigenvectors, partial=data.partial)
+    if number_of_descriptors:
+        spectra = describe(*meshes, *spectra, number_of_descriptors, partial=data.partial)
     start = _start(data.names, meshes, spectra, init, data.partial)
     reverse = None
     if both_directions:

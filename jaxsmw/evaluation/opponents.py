@@ -28,7 +28,7 @@ from jaxsmw.evaluation.cpd import DriftRecovery
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching import common_range
+from jaxsmw.presets import PRESETS, Stage, refine_in_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +55,13 @@ class PreparedPair:
     names: tuple[str, str] = ("X", "Y")
     partial: bool = False
 
+    def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
+        """Both spectra as a stage sees them; of a partial pair with the eigenvectors in common."""
+        return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
+
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
         """Both spectra with k eigenvectors; of a partial pair with those that they have in common."""
-        spectra = self.spectrum_x.truncate(k), self.spectrum_y.truncate(k)
-        return common_range(*spectra) if self.partial else spectra
+        return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
         """The first samples of both, or none."""
@@ -72,6 +75,7 @@ class Method(abc.ABC):
     **Attributes:**
 
     - `number_of_eigenvectors`: the largest number it uses.
+    - `number_of_descriptors`: the largest number it uses of what `PreparedPair` has.
     - `reference`: where it is published, with what settings.
     - `both_directions`: whether it needs `PreparedPair.reverse_start`.
     - `whole_only`: whether it makes no sense where one shape is a part of the other.
@@ -79,6 +83,7 @@ class Method(abc.ABC):
 
     number_of_eigenvectors: int
     reference: str
+    number_of_descriptors: int = 0
     both_directions: bool = False
     whole_only: bool = False
 
@@ -161,16 +166,42 @@ class Refined(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
-        samples_x, samples_y = pair.sampled(self.number_of_samples)
-        refined = compiled(refine)(
-            *pair.truncated(self.number_of_eigenvectors),
-            pair.start,
-            refiner=self.refiner,
-            iterations=self.iterations,
-            samples_x=samples_x,
-            samples_y=samples_y,
+        return _refined(
+            pair,
+            Stage(
+                self.refiner,
+                self.number_of_eigenvectors,
+                iterations=self.iterations,
+                number_of_samples=self.number_of_samples,
+            ),
         )
-        return refined.pointwise_map, refined.result
+
+
+@dataclass(frozen=True)
+class InStages(Method):
+    """One of `jaxsmw.presets`."""
+
+    reference: str
+    stages: tuple[Stage, ...]
+
+    @property
+    def number_of_eigenvectors(self) -> int:  # type: ignore[override]
+        """That of the stage with most of them."""
+        return max(stage.number_of_eigenvectors for stage in self.stages)
+
+    @property
+    def number_of_descriptors(self) -> int:  # type: ignore[override]
+        """That of the stage with most of them."""
+        return max(stage.number_of_descriptors for stage in self.stages)
+
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        return _refined(pair, *self.stages)
+
+
+def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESULTS]:
+    spectra = [pair.seen_in(stage) for stage in stages]
+    refined = refine_in_stages(spectra, pair.start, stages, pair.samples)[-1]
+    return refined.pointwise_map, refined.result
 
 
 # ZoomOut's published sizes of C.
@@ -241,6 +272,7 @@ MOST_SAMPLES = 1000
 METHODS: dict[str, Method] = {
     "start": Start("nearest neighbours of the descriptors, from which all others start"),
     "mwp": Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations"),
+    "accurate": InStages("this library's preset, from the outcome of mwp", PRESETS["accurate"]),
     "mwp-sampled": Refined("Hu, Li, Liu, Liu 2021: the same on 500 samples", number_of_samples=500),
     "no-filter": Refined("MWP without filters: k = 100, 3 iterations", _UNFILTERED),
     "icp": Refined(

@@ -37,7 +37,6 @@ def write_report(
     directory: str | os.PathLike[str],
     correspondence: Correspondence,
     *,
-    refiner: WaveletPreservation,
     errors: Mapping[str, GeodesicError] | None = None,
     settings: Mapping[str, Any] | None = None,
     up: Axis | None = None,
@@ -47,10 +46,9 @@ def write_report(
     **Arguments:**
 
     - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the figures),
-      `correspondence.png`, `functional_map.png`, `filters.png`, `quality.png` (with errors only) and
-      `summary.json`.
+      `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has any), `quality.png` (with
+      errors only) and `summary.json`.
     - `correspondence`: the match.
-    - `refiner`: what refined it.
     - `errors`: geodesic errors by name, the last of them that of `correspondence.pointwise_map`.
     - `settings`: what else to note in the summary.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
@@ -70,13 +68,17 @@ def write_report(
             errors=per_vertex,
             up=up,
         ),
-        "functional_map": draw_functional_map(correspondence.functional_map, convention=refiner.convention),
-        "filters": draw_bank(refiner.bank, np.asarray(correspondence.spectrum_x.eigenvalues)),
+        "functional_map": draw_functional_map(
+            correspondence.functional_map,
+            convention=getattr(correspondence.stages[-1].refiner, "convention", "pullback"),
+        ),
     }
-    captions = {
-        "functional_map": "The functional map C.",
-        "filters": "The filters over the eigenvalues of the source (area 1).",
-    }
+    captions = {"functional_map": "The functional map C."}
+    for stage in correspondence.stages:
+        if isinstance(stage.refiner, WaveletPreservation):
+            eigenvalues = np.asarray(correspondence.spectrum_x.eigenvalues)[: stage.number_of_eigenvectors]
+            figures["filters"] = draw_bank(stage.refiner.bank, eigenvalues)
+            captions["filters"] = "The filters over the eigenvalues of the source (area 1)."
     if errors:
         figures["quality"] = draw_errors(errors)
         captions["quality"] = "The share of vertices within a geodesic error."

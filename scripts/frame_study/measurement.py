@@ -315,7 +315,7 @@ def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list
 
 @eqx.filter_jit
 def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Problem:
-    return method.prepare(spectrum_x, spectrum_y, sampled=False)
+    return method.prepare(spectrum_x, spectrum_y)
 
 
 @eqx.filter_jit
