@@ -193,7 +193,9 @@ def match(
     spectra = [stage.view(spectrum_x, spectrum_y, partial=partial) for stage in stages]
     with _stage("refinement", seconds):
         wait(compiling)
-        refinements = refine_in_stages(spectra, jax.device_put(start), stages, samples, history=history)
+        refinements = refine_in_stages(
+            spectra, jax.device_put(start), stages, samples, meshes=(mesh_x, mesh_y), history=history
+        )
         last = jax.block_until_ready(refinements[-1])
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(last.result)}")

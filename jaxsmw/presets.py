@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import jax
 import numpy as np
 from jaxtyping import Array, Int
 
@@ -15,6 +16,8 @@ from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreserva
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.faults import reversed_orientation, stretch, torn_off
+from jaxsmw.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,8 @@ class Stage:
     - `iterations`: how many; at least 1.
     - `number_of_samples`: take turns on so many samples of each shape, and search all vertices at the end.
     - `stop_when_unchanged`: see `jaxsmw.refine`.
+    - `mending`: where the outcome swaps limbs, do it again up to so many times without their matches: see
+      `refine_in_stages`.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -39,6 +44,7 @@ class Stage:
     iterations: int = 3
     number_of_samples: int | None = None
     stop_when_unchanged: bool = False
+    mending: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.refiner, Refiner):
@@ -83,9 +89,9 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
     return cut[0], cut[1]
 
 
-def _regression(levels: tuple[int, ...], number_of_samples: int) -> Stage:
+def _regression(levels: tuple[int, ...], number_of_samples: int, mending: int = 0) -> Stage:
     """Feature regression, once per level."""
-    return Stage(FeatureRegression(levels), max(levels), 30, len(levels), number_of_samples)
+    return Stage(FeatureRegression(levels), max(levels), 30, len(levels), number_of_samples, mending=mending)
 
 
 Preset = Literal["paper", "accurate"]
@@ -94,7 +100,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "paper": _PAPER,
     "accurate": (
         *_PAPER,
-        _regression((20, 20, 20, 26, 26, 26, 35, 35, 35, 50, 50, 50), 1000),
+        _regression((20, 20, 20, 26, 26, 26, 35, 35, 35, 50, 50, 50), 1000, mending=4),
         _regression((100, 200), 1000),
     ),
 }
@@ -132,14 +138,21 @@ def refine_in_stages(
     stages: Sequence[Stage],
     samples: Samples | None = None,
     *,
+    meshes: tuple[Mesh, Mesh] | None = None,
     history: bool = False,
 ) -> list[Refinement]:
     """Refine by one stage after the other, as long as they go well: the outcome of each.
+
+    Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
+    left and right, and for where it joins the body. A stage that is to mend this looks for both
+    (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
+    faulty part had no say in. The least stretched map it came by is its outcome.
 
     **Arguments:**
 
     - `spectra`: of X and Y as each stage sees them (`Stage.view`).
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
+    - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
     - `history`: see `jaxsmw.refine`.
     """
     refinements: list[Refinement] = []
@@ -148,11 +161,56 @@ def refine_in_stages(
         if stage.number_of_samples is not None and samples is not None:
             for side, vertices in zip(("samples_x", "samples_y"), samples, strict=True):
                 chosen[side] = vertices[: stage.number_of_samples]
-        refinement = compiled(refine)(
-            spectrum_x, spectrum_y, pointwise_map, **chosen, **stage.settings, history=history
-        )
+
+        def run(
+            spectrum_x: Spectrum,
+            pointwise_map: Int[Array, " m"],
+            spectrum_y: Spectrum = spectrum_y,
+            settings: dict[str, Any] = chosen | stage.settings,
+        ) -> Refinement:
+            return compiled(refine)(spectrum_x, spectrum_y, pointwise_map, **settings, history=history)
+
+        refinement = run(spectrum_x, pointwise_map)
+        if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
+            refinement = _mended(refinement, spectrum_x, run, meshes, stage.mending)
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
         pointwise_map = refinement.pointwise_map
     return refinements
+
+
+def _mended(
+    refinement: Refinement,
+    spectrum_x: Spectrum,
+    run: Callable[[Spectrum, Int[Array, " m"]], Refinement],
+    meshes: tuple[Mesh, Mesh],
+    rounds: int,
+) -> Refinement:
+    """The least stretched of a refinement and of others, each begun without what was faulty in the last."""
+    m = len(meshes[0].vertices)
+    areas = np.asarray(spectrum_x.vertex_areas)
+    eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
+    best, least = refinement, np.inf
+    criteria = (
+        lambda found: reversed_orientation(*meshes, found, eigenvectors),
+        lambda found: torn_off(*meshes, found),
+    )
+    for done in range(rounds + 1):
+        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
+        stretched = stretch(*meshes, found)
+        if stretched < least:
+            best, least = refinement, stretched
+        faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
+        faults = [fault for fault in faults if areas[:m][fault].sum() > _NEGLIGIBLE * areas.sum()]
+        if done == rounds or not faults:
+            return best
+        sound = jax.device_put(np.where(np.pad(faults[0], (0, len(areas) - m)), 0, areas))
+        refinement = run(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
+        if refinement.result != RESULTS.successful:
+            return best
+    return best
+
+
+# Smaller parts of the area are let be: fingertips come and go.
+_NEGLIGIBLE = 0.002

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -83,6 +83,12 @@ class Mesh:
         # Without cancellation the length is near twice the area of the faces around: six vertex areas.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
+
+    @cached_property
+    def is_inside_out(self) -> bool:
+        """Whether normals point inwards, by the sign of the volume that faces and centroid enclose."""
+        corners = self.vertices[self.faces] - self.vertices[self.used_vertices].mean(axis=0)
+        return bool(np.linalg.det(corners).sum() < 0)
 
     @cached_property
     def used_vertices(self) -> Bool[np.ndarray, " n"]:
@@ -223,11 +229,11 @@ def diagnose(mesh: Mesh) -> Diagnosis:
     A `Diagnosis`.
     """
     unused = int((~mesh.used_vertices).sum())
-    boundary_chain = _connected(mesh.boundary_edges, len(mesh.vertices))[1]
+    boundary_chain = connected_pieces(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
-        components=_connected(mesh.edges, len(mesh.vertices))[0] - unused,
+        components=connected_pieces(mesh.edges, len(mesh.vertices))[0] - unused,
         unused_vertices=unused,
         boundary_edges=len(mesh.boundary_edges),
         boundary_loops=len(np.unique(boundary_chain[mesh.boundary_edges])),
@@ -238,7 +244,8 @@ def diagnose(mesh: Mesh) -> Diagnosis:
     )
 
 
-def _connected(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, np.ndarray]:
+def connected_pieces(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
+    """How many pieces n vertices with some edges form, and which one each vertex belongs to."""
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)
 

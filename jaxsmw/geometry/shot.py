@@ -67,8 +67,7 @@ def shot_descriptors(
             normals = np.stack([np.bincount(samples.nearest, axis, number) for axis in weighted.T], axis=1)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
         positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
-        corners = mesh.vertices[mesh.faces] - mesh.vertices[vertices].mean(axis=0)
-        if np.linalg.det(corners).sum() < 0:
+        if mesh.is_inside_out:
             normals = -normals
 
         tree = KDTree(positions)
