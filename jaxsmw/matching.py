@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -180,9 +181,15 @@ def match(
         start = initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, init=init, partial=partial)
     if number_of_descriptors := max(stage.number_of_descriptors for stage in stages):
         with _stage("descriptors", seconds):
-            spectrum_x, spectrum_y = describe(
-                mesh_x, mesh_y, spectrum_x, spectrum_y, number_of_descriptors, partial=partial
-            )
+            try:
+                spectrum_x, spectrum_y = describe(
+                    mesh_x, mesh_y, spectrum_x, spectrum_y, number_of_descriptors, partial=partial
+                )
+            except InputError as error:
+                if not isinstance(preset, str):
+                    raise
+                warnings.warn(f"refinement goes on without descriptors: {error}", stacklevel=2)
+                stages = tuple(replace(stage, number_of_descriptors=0) for stage in stages)
     samples = None
     if number_of_samples := max(stage.number_of_samples or 0 for stage in stages):
         with _stage("samples", seconds):

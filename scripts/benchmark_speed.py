@@ -65,6 +65,7 @@ from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.matching import initial_map, match, paired_spectra
+from jaxsmw.presets import Stage
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
@@ -276,6 +277,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
                 "import jaxsmw": started("-c", "import jaxsmw"),
                 "jaxsmw --help": started("-m", "jaxsmw", "--help"),
                 "jaxsmw match": started(*matching),
+                "jaxsmw match --preset paper": started(*matching, "--preset", "paper"),
                 "jaxsmw match, compiled before": started(*matching, cache=kept),
             },
             3,
@@ -397,7 +399,7 @@ def matched_from_files(files: list[str]) -> tuple[list[tuple[str, float, float]]
     logger.setLevel(logging.INFO)
     logger.info("reading")
     meshes = [read_mesh(file) for file in files]
-    result = match(*meshes, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS)
+    result = match(*meshes, preset=Stage(number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS))
     logger.info("end")
     timed = [(name, end - start, peak) for (name, start, _), (_, end, peak) in itertools.pairwise(stages[1:])]
     return timed, [result.initial_map, result.pointwise_map]
@@ -505,9 +507,7 @@ def ours_from_files(files: list[str], search: Search = "auto") -> tuple[np.ndarr
     """The map, and the seconds of refinement alone."""
     result = match(
         *map(read_mesh, files),
-        number_of_eigenvectors=EIGENVECTORS,
-        iterations=ITERATIONS,
-        refiner=WaveletPreservation(search=search),
+        preset=Stage(WaveletPreservation(search=search), EIGENVECTORS, iterations=ITERATIONS),
     )
     return result.pointwise_map, result.seconds["refinement"]
 

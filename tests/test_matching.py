@@ -1,6 +1,7 @@
 """One pair from meshes to correspondence."""
 
 import logging
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from synthetic import bumpy_mesh
 
 from jaxsmw import matching
 from jaxsmw.core import refinement
+from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
@@ -20,8 +22,10 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import initial_map, match, paired_spectra
+from jaxsmw.presets import Stage, chosen_stages
 
-OPTIONS = {"number_of_eigenvectors": 30, "refiner": WaveletPreservation(bank=Meyer(4))}
+STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
+OPTIONS = {"preset": STAGE}
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +101,8 @@ def test_the_approximate_eigenbasis_matches_as_well(pair):
 
 def test_approximate_search_matches_as_well(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
-    options = OPTIONS | {"refiner": WaveletPreservation(bank=Meyer(4), search="approximate")}
-    exact, approximate = match(mesh_x, mesh_y, **OPTIONS), match(mesh_x, mesh_y, **options)
+    searching = replace(STAGE, refiner=WaveletPreservation(bank=Meyer(4), search="approximate"))
+    exact, approximate = match(mesh_x, mesh_y, **OPTIONS), match(mesh_x, mesh_y, preset=searching)
     assert (exact.pointwise_map == approximate.pointwise_map).mean() > 0.97
     assert mean_error(mesh_y, approximate.pointwise_map, truth) < 0.02
     monkeypatch.setattr(refinement, "find_spec", lambda _: None)
@@ -116,7 +120,7 @@ def test_repeats_bit_for_bit(pair):
 def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
     jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        match(*pair[:2], **OPTIONS, number_of_samples=samples)
+        match(*pair[:2], preset=replace(STAGE, number_of_samples=samples))
     # Where messages about compilation are wanted in this thread only, those of another do not appear.
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
@@ -156,11 +160,13 @@ def test_landmarks_are_matched_to_each_other(pair):
 @pytest.mark.parametrize(
     "options",
     [
-        {"iterations": 1},
-        {"number_of_eigenvectors": 25},
-        {"refiner": WaveletPreservation(bank=Meyer(6))},
-        {"refiner": WaveletPreservation(bank=Meyer(4), solution=LeastSquares())},
-        {"number_of_samples": 150},
+        {"preset": replace(STAGE, iterations=1)},
+        {"preset": replace(STAGE, number_of_eigenvectors=25)},
+        {"preset": replace(STAGE, refiner=WaveletPreservation(bank=Meyer(6)))},
+        {"preset": replace(STAGE, refiner=WaveletPreservation(bank=Meyer(4), solution=LeastSquares()))},
+        {"preset": replace(STAGE, number_of_samples=150)},
+        {"preset": "accurate"},
+        {"preset": "paper"},
         {"laplacian": "robust"},
     ],
     ids=str,
@@ -175,13 +181,14 @@ def test_every_option_changes_the_result(pair, options):
 
 
 def test_history_and_early_stop(pair):
-    result = match(*pair[:2], **OPTIONS, iterations=30, stop_when_unchanged=True, history=True)
+    patient = replace(STAGE, iterations=30, stop_when_unchanged=True)
+    result = match(*pair[:2], preset=patient, history=True)
     assert result.iterations < 30
-    assert result.history.changed.shape == (30,)
-    done = result.iterations
-    assert result.history.changed[0] > 0.1 and result.history.changed[done - 1] == 0
-    assert np.isnan(result.history.changed[done:]).all()
-    assert match(*pair[:2], **OPTIONS).history is None
+    changed = result.refinement.history.changed
+    assert changed.shape == (30,)
+    assert changed[0] > 0.1 and changed[result.iterations - 1] == 0
+    assert np.isnan(changed[result.iterations :]).all()
+    assert match(*pair[:2], **OPTIONS).refinement.history is None
 
 
 def test_unused_vertices_on_either_side(pair):
@@ -198,18 +205,17 @@ def test_unused_vertices_on_either_side(pair):
 
 def test_stages_are_logged(pair, caplog):
     with caplog.at_level(logging.INFO, "jaxsmw"):
-        match(*pair[:2], **OPTIONS, number_of_samples=100)
+        match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
     assert caplog.messages == ["eigenbases", "initial map", "samples", "refinement"]
 
 
 @pytest.mark.parametrize(
     ("options", "fault"),
     [
-        ({"iterations": 0}, "at least 1"),
-        ({"number_of_eigenvectors": 0}, "eigenvectors were asked for"),
-        ({"number_of_eigenvectors": 10**6}, "eigenvectors were asked for"),
-        ({"number_of_samples": 10}, "cannot tell 30 eigenvectors apart"),
-        ({"number_of_samples": 10**6}, "samples were asked for"),
+        ({"preset": replace(STAGE, number_of_eigenvectors=0)}, "eigenvectors were asked for"),
+        ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
+        ({"preset": replace(STAGE, number_of_samples=10**6)}, "samples were asked for"),
+        ({"preset": ()}, "give one of paper, accurate, or stages"),
         ({"init": "shoot"}, "choose shot"),
         ({"init": [0, 1]}, "has 2 entries"),
         ({"init": np.zeros(2562)}, "must be integer"),
@@ -243,7 +249,7 @@ def test_numbers_that_went_wrong_are_not_returned(pair):
             return functional_map * jnp.nan, result
 
     with pytest.raises(ArithmeticError, match="NaN or infinite"):
-        match(*pair[:2], number_of_eigenvectors=20, refiner=Broken())
+        match(*pair[:2], preset=Stage(Broken(), number_of_eigenvectors=20))
 
 
 def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
@@ -266,16 +272,54 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
     assert functional < 0.5 * nearest
 
 
-def test_a_bank_is_no_refiner(pair):
-    with pytest.raises((InputError, TypeCheckError), match="refiner"):
-        match(*pair[:2], refiner=Meyer())
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        ({"refiner": Meyer()}, "refiner"),
+        ({"iterations": 0}, "at least 1"),
+        ({"number_of_samples": 10}, "cannot tell 100 eigenvectors apart"),
+    ],
+    ids=str,
+)
+def test_stages_that_cannot_work(settings, fault):
+    with pytest.raises((InputError, TypeCheckError), match=fault):
+        Stage(**settings)
+
+
+def test_presets_find_the_copy(pair):
+    mesh_x, mesh_y, truth = pair
+    accurate, paper = match(mesh_x, mesh_y), match(mesh_x, mesh_y, preset="paper")
+    errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (accurate, paper)]
+    assert max(errors) < 0.002  # of a copy
+    assert accurate.iterations == 3 + 8 + 2 and accurate.functional_map.shape == (200, 200)
+    assert list(accurate.seconds) == ["eigenbases", "initial map", "descriptors", "samples", "refinement"]
+    points = accurate.surface_points()
+    distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
+    assert np.median(distances) < 0.01 * mesh_y.area**0.5
+
+
+def test_presets_fit_small_meshes():
+    """Of 162 vertices there are no 200 eigenvectors, nor 1000 samples."""
+    mesh = bumpy_mesh(2)
+    with pytest.warns(UserWarning, match="goes on without descriptors: .* coarse"):
+        found = match(mesh, mesh, init=np.arange(162))
+    assert found.functional_map.shape == (81, 81)
+    last = found.stages[-1]
+    assert last.number_of_samples is None and last.number_of_descriptors == 0
+    with pytest.raises(InputError, match="coarse"):
+        match(mesh, mesh, init=np.arange(162), preset=Stage(FeatureRegression(), 30, 20))
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(InputError, match="'exact' is no preset: choose from paper, accurate"):
+        chosen_stages("exact", 1000)
 
 
 def test_a_soup_of_triangles_is_named(pair):
     mesh = pair[0]
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
     with pytest.raises(InputError, match=r"with 30 eigenvectors nothing is known of it .* --weld"):
-        match(soup, mesh, number_of_eigenvectors=30)
+        match(soup, mesh, preset=Stage(number_of_eigenvectors=30))
 
 
 @pytest.fixture(scope="module")
@@ -312,8 +356,8 @@ def test_spectra_of_a_part_keep_the_unit_of_the_whole(part):
 
 def test_a_part_is_found_in_the_whole(part):
     mesh_x, mesh_y, truth = part
-    found = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}), partial=True)
-    as_wholes = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}))
+    found = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), partial=True)
+    as_wholes = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40))
     k_x, k_y = found.functional_map.shape
     assert k_x < k_y == 40
     assert mean_error(mesh_y, found.initial_map, truth) < mean_error(mesh_y, as_wholes.initial_map, truth)
@@ -326,7 +370,7 @@ def test_other_starts_of_a_part(part, init):
     mesh_x, mesh_y, truth = part
     if not isinstance(init, str):
         init = np.stack([init[:, 0], truth[init[:, 1]]], axis=1)
-    found = match(mesh_x, mesh_y, **(OPTIONS | {"number_of_eigenvectors": 40}), partial=True, init=init)
+    found = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), partial=True, init=init)
     assert mean_error(mesh_y, found.initial_map, truth) < 0.15
 
 

@@ -12,9 +12,10 @@ import pytest
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
+from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
-from jaxsmw.core.pointwise_map import decode, matching_objective
+from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
@@ -54,6 +55,10 @@ REFINERS = {
     "pushforward": WaveletPreservation(convention="pushforward"),
     "common": WaveletPreservation(lambda_max="common"),
     "three filters": WaveletPreservation(bank=Meyer(3)),
+}
+ALL_REFINERS = REFINERS | {
+    "regression": FeatureRegression(),
+    "regression, coarse to fine": FeatureRegression((4, 8)),
 }
 
 
@@ -96,7 +101,7 @@ def test_every_option_changes_the_result(name):
     assert jnp.max(jnp.abs(default - other)) > 1e-3
 
 
-@pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
+@pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_signs_of_eigenvectors_do_not_matter(pair, refiner):
     x, y, start, _ = pair
     generator = np.random.default_rng(4)
@@ -144,7 +149,7 @@ def test_common_scale_does_not_matter(pair, factor):
     np.testing.assert_array_equal(refine(*scaled, start).pointwise_map, refine(x, y, start).pointwise_map)
 
 
-@pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
+@pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_padding_changes_nothing(pair, refiner):
     x, y, start, _ = pair
 
@@ -185,7 +190,8 @@ def test_history_is_what_it_says(pair):
         c = refine(x, y, start, iterations=i + 1).functional_map
         energy = refiner.problem(x, y).energy(maps[i])(c)
         np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
-        np.testing.assert_allclose(history.objective[i], matching_objective(c, maps[i + 1], x, y), rtol=1e-9)
+        objective = refiner.objective(refiner.prepare(x, y), c, maps[i + 1])
+        np.testing.assert_allclose(history.objective[i], objective, rtol=1e-9)
         np.testing.assert_array_equal(history.pointwise_maps[i], maps[i + 1])
     assert refine(x, y, start).history is None
 

@@ -90,7 +90,7 @@ class FeatureRegression(Refiner):
         """Which of a shape's eigenvectors count in an iteration."""
         levels = [-(-min(level, largest) * size // largest) for level in (*self.levels, largest)]
         level = jnp.asarray(np.array(levels, np.int32))[jnp.minimum(iteration, len(self.levels))]
-        return jnp.arange(size) < level
+        return jnp.arange(size, dtype=jnp.int32) < level
 
     def recover(self, problem: Problem, updated: Any) -> Int32[Array, " m"]:
         """The most likely vertices."""
@@ -199,9 +199,9 @@ def _regress(
     k_x, k_y = counts_x.shape[0], counts_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
     keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (counts_x, counts_y))
-    xx = jnp.where(keep_x[:, None] & keep_x, moments.xx, 0)
-    xy = jnp.where(keep_x[:, None] & keep_y, moments.xy, 0)
-    yy = jnp.where(keep_y[:, None] & keep_y, moments.yy, 0)
+    xx = jnp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
+    xy = jnp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
+    yy = jnp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
     functional_map = _least_squares(xy[:k_x, :k_y], yy[:k_y, :k_y])
     matrix = jsp.linalg.block_diag(functional_map, _least_squares(xy[k_x:, k_y:], yy[k_y:, k_y:]))
     explained = product(matrix, xy.T)
