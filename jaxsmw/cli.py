@@ -511,9 +511,11 @@ def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Corre
 def _preset(options: argparse.Namespace) -> Any:
     """The name of a preset, or a stage where the paper's method is to be changed."""
     changes = [name for name in _CHANGES if getattr(options, name) is not None]
+    # Written back for the report's summary.
+    options.preset = options.preset or ("paper" if changes else "accurate")
     if not changes:
-        return options.preset or "accurate"
-    if options.preset not in (None, "paper"):
+        return options.preset
+    if options.preset != "paper":
         option = changes[0].replace("_", "-")
         raise InputError(
             f"--{option}: changes the paper's method: leave it out, or --preset {options.preset}."

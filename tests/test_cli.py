@@ -231,10 +231,24 @@ def test_report(run, pair, tmp_path):
         "correspondence.png", "filters.png", "functional_map.png", "quality.png", "report.html", "summary.json",
     ]  # fmt: skip
     summary = json.loads((report / "summary.json").read_text())
-    assert summary["settings"]["eigenvectors"] == 20
+    assert summary["settings"]["eigenvectors"] == 20 and summary["settings"]["preset"] == "paper"
     assert summary["result"]["vertices"] == "642 to 642"
     assert summary["provenance"]["jax"]
     assert "x.off to y.ply" in (report / "report.html").read_text()
+
+
+def test_presets(run, pair, tmp_path):
+    """Accurate by default; options that change the paper's method are for that alone."""
+    maps = {}
+    for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100")):
+        outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", *options)
+        assert outcome.code == 0, outcome.errors
+        maps[options] = (tmp_path / "m").read_text()
+    default, accurate, paper, changed = maps.values()
+    assert default == accurate != paper == changed
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
+    outcome = run(*call, "--preset", "accurate", "--stop-when-unchanged")
+    assert_refused(outcome, naming="--stop-when-unchanged: changes the paper's method")
 
 
 def test_evaluate_writes_figures_and_numbers(run, pair, tmp_path):
