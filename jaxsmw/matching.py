@@ -288,16 +288,8 @@ def describe(
     - `spectrum_x`, `spectrum_y`, `partial`: see `paired_spectra`.
     - `number_of_descriptors`: d, at most 352; the components in which the shapes' vertices differ most.
     """
-    sides = [
-        _Thinned.make(mesh, samples, spectrum)
-        for mesh, samples, spectrum in zip(
-            (mesh_x, mesh_y),
-            _side_by_side(_compared, mesh_x, mesh_y),
-            (spectrum_x, spectrum_y),
-            strict=True,
-        )
-    ]
-    shot = _shot(sides[0], sides[1], partial)
+    sides = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
+    shot = _shot(*sides, partial)
     weights = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
     both, weight = np.concatenate(shot), np.concatenate([w / w.sum() / 2 for w in weights])
     centered = both - weight @ both
@@ -336,8 +328,7 @@ def initial_map(
             raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
         if given.ndim == 1:
             return _extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
-    samples_x, samples_y = _side_by_side(_compared, mesh_x, mesh_y)
-    x, y = _Thinned.make(mesh_x, samples_x, spectrum_x), _Thinned.make(mesh_y, samples_y, spectrum_y)
+    x, y = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
     if not isinstance(init, str):
         features_x, features_y = _landmark_features(given, x, y, partial)
     elif init == "shot":
@@ -388,6 +379,13 @@ class _Thinned(NamedTuple):
 # Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
 # ten thousand vertices are plenty.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
+
+
+def _thinned(
+    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> tuple[_Thinned, _Thinned]:
+    samples_x, samples_y = _side_by_side(_compared, mesh_x, mesh_y)
+    return _Thinned.make(mesh_x, samples_x, spectrum_x), _Thinned.make(mesh_y, samples_y, spectrum_y)
 
 
 def _compared(mesh: Mesh) -> Samples | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -158,19 +159,7 @@ def refine_in_stages(
     """
     refinements: list[Refinement] = []
     for (spectrum_x, spectrum_y), stage in zip(spectra, stages, strict=True):
-        chosen: dict[str, Any] = {}
-        if stage.number_of_samples is not None and samples is not None:
-            for side, vertices in zip(("samples_x", "samples_y"), samples, strict=True):
-                chosen[side] = vertices[: stage.number_of_samples]
-
-        def run(
-            spectrum_x: Spectrum,
-            pointwise_map: Int[Array, " m"],
-            spectrum_y: Spectrum = spectrum_y,
-            settings: dict[str, Any] = chosen | stage.settings,
-        ) -> Refinement:
-            return compiled(refine)(spectrum_x, spectrum_y, pointwise_map, **settings, history=history)
-
+        run = partial(_run, stage, spectrum_y, samples, history)
         refinement = run(spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
             refinement = _mended(refinement, spectrum_x, run, meshes, stage.mending)
@@ -179,6 +168,24 @@ def refine_in_stages(
             break
         pointwise_map = refinement.pointwise_map
     return refinements
+
+
+def _run(
+    stage: Stage,
+    spectrum_y: Spectrum,
+    samples: Samples | None,
+    history: bool,
+    spectrum_x: Spectrum,
+    pointwise_map: Int[Array, " m"],
+) -> Refinement:
+    """One pass through a stage's iterations."""
+    chosen: dict[str, Any] = {}
+    if stage.number_of_samples is not None and samples is not None:
+        for side, vertices in zip(("samples_x", "samples_y"), samples, strict=True):
+            chosen[side] = vertices[: stage.number_of_samples]
+    return compiled(refine)(
+        spectrum_x, spectrum_y, pointwise_map, **chosen, **stage.settings, history=history
+    )
 
 
 def _mended(
@@ -202,11 +209,15 @@ def _mended(
         stretched = stretch(*meshes, found)
         if stretched < least:
             best, least = refinement, stretched
-        faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
-        faults = [fault for fault in faults if areas[:m][fault].sum() > _NEGLIGIBLE * areas.sum()]
-        if done == rounds or not faults:
+        if done == rounds:
             return best
-        sound = jax.device_put(np.where(np.pad(faults[0], (0, len(areas) - m)), 0, areas))
+        for criterion in criteria[done % 2 :] + criteria[: done % 2]:
+            fault = criterion(found)
+            if areas[:m][fault].sum() > _NEGLIGIBLE * areas.sum():
+                break
+        else:
+            return best
+        sound = jax.device_put(np.where(np.pad(fault, (0, len(areas) - m)), 0, areas))
         refinement = run(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
         if refinement.result != RESULTS.successful:
             return best
