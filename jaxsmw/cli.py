@@ -133,6 +133,12 @@ def _parser() -> argparse.ArgumentParser:
         help="also gets for each source vertex a point between target vertices: a face, counted from 1, and "
         "barycentric weights for its corners",
     )
+    match.add_argument(
+        "--expected-error",
+        metavar="FILE",
+        help="also gets for each source vertex how far from the truth its match may be, in square roots "
+        "of the target's area",
+    )
     match.add_argument("--report", metavar="DIR", help="write pictures, a 3D page and a summary there")
     _add_up(match)
     match.add_argument(
@@ -460,10 +466,15 @@ def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
     inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
-    if options.surface_points:
-        _check_surface_points(options)
-    for path in filter(None, (options.output, options.surface_points)):
+    if options.surface_points and Path(options.surface_points).suffix != ".baryc_gt":
+        raise InputError(
+            f"{options.surface_points}: points are written as .baryc_gt; choose a name that ends in it."
+        )
+    outputs = [*filter(None, (options.output, options.surface_points, options.expected_error))]
+    for number, path in enumerate(outputs):
         _keep_inputs(path, *inputs)
+        if os.path.realpath(path) in map(os.path.realpath, outputs[:number]):
+            raise InputError(f"{path}: is named for two outputs: choose another name for one of them.")
         check_writable(path)
     if options.report:
         from jaxsmw.report.figures import check_drawable
@@ -488,6 +499,11 @@ def _match(options: argparse.Namespace) -> None:
         logging.getLogger("jaxsmw").info("points on the surface")
         points = correspondence.surface_points()
         write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points), mesh_y)
+    if options.expected_error:
+        import numpy as np
+
+        with atomic_write(options.expected_error) as temporary:
+            np.savetxt(temporary, correspondence.expected_error(), "%.6f")
     _conclude(options, correspondence, truth, directory, points)
 
 
@@ -627,14 +643,6 @@ def _keep_inputs(output: str, *inputs: str) -> None:
     """Refuse to write over what is read."""
     if os.path.realpath(output) in (os.path.realpath(path) for path in inputs if path):
         raise InputError(f"{output}: is an input and would be overwritten: choose another name.")
-
-
-def _check_surface_points(options: argparse.Namespace) -> None:
-    path = options.surface_points
-    if Path(path).suffix != ".baryc_gt":
-        raise InputError(f"{path}: points are written as .baryc_gt; choose a name that ends in it.")
-    if os.path.realpath(path) == os.path.realpath(options.output):
-        raise InputError(f"{path}: is the map's file as well: choose another name for one of them.")
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -22,19 +22,20 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.compilation import compile_ahead, compiled
-from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
 from jaxsmw.core.refinement import Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
-from jaxsmw.core.search import nearest_neighbor
+from jaxsmw.core.search import nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
+from jaxsmw.geometry.faults import expected_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.mesh import Mesh, units_of_length
 from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.presets import Preset, Stage, chosen_stages, common_range, refine_in_stages
@@ -74,6 +75,7 @@ class Correspondence:
     - `spectrum_x`, `spectrum_y`: the spectra that the last stage saw, for area 1.
     - `refinement`: the outcome of the last stage, with its history if asked for.
     - `iterations`: how many were done, in all stages.
+    - `partial`: whether one shape is a part of the other.
     - `seconds`: wall time of each part. The first refinement of a size includes its compilation.
     """
 
@@ -87,6 +89,7 @@ class Correspondence:
     spectrum_y: Spectrum
     refinement: Refinement
     iterations: int
+    partial: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
 
     def surface_points(self) -> SurfacePoints:
@@ -96,19 +99,44 @@ class Correspondence:
         are rows of `mesh_y.faces`. A vertex of X that no face uses gets the point of the nearest one that a
         face does use.
         """
-        with jax.enable_x64(self.functional_map.dtype == np.float64):  # as when it was computed
-            faces, traced_weights = compiled(_points_on_triangles)(
-                self.stages[-1].refiner,
-                self.refinement.updated,
-                self.spectrum_x,
-                self.spectrum_y,
-                jax.device_put(self.mesh_y.faces),
-            )
+        faces, traced_weights = self._recovered(_points_on_triangles, self.mesh_y.faces)
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # without rounding errors
         return SurfacePoints(
             _extend_to_unused(self.mesh_x, np.asarray(faces).astype(np.int64)),
             _extend_to_unused(self.mesh_x, weights / weights.sum(axis=1, keepdims=True)),
         )
+
+    def expected_error(self) -> Float[np.ndarray, " m"]:
+        """For every vertex of X how far its match may be from the truth, in square roots of Y's area.
+
+        No truth is needed: `jaxsmw.geometry.faults.expected_error` explains, the way back is what the last
+        stage finds. A vertex of X that no face uses gets that of the nearest one that a face does use.
+        """
+        way_back = np.asarray(self._recovered(_way_back)).astype(np.int64)
+        expected = expected_error(
+            self.mesh_x, self.mesh_y, self.pointwise_map, way_back, self.spectrum_x, partial=self.partial
+        )
+        return _extend_to_unused(self.mesh_x, expected)
+
+    def _recovered(self, recover: Callable[..., Result], *arrays: np.ndarray) -> Result:
+        """What a traced function makes of the outcome of the last stage."""
+        with jax.enable_x64(self.functional_map.dtype == np.float64):  # as when it was computed
+            return compiled(recover)(
+                self.stages[-1].refiner,
+                self.refinement.updated,
+                self.spectrum_x,
+                self.spectrum_y,
+                *jax.device_put(arrays),
+            )
+
+
+def _way_back(refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Int[Array, " n"]:
+    queries, database = refiner.embeddings(refiner.prepare(spectrum_x, spectrum_y), updated)
+    patches = chosen_patches("auto", spectrum_y, spectrum_x)
+    if patches is None:
+        return nearest_neighbor(database, queries, database_mask=spectrum_x.mask)
+    k = spectrum_x.eigenvalues.shape[0]
+    return nearest_neighbor_in_patches(database[:, :k], queries[:, :k], *patches)
 
 
 def _points_on_triangles(
@@ -201,7 +229,13 @@ def match(
     with _stage("refinement", seconds):
         wait(compiling)
         refinements = refine_in_stages(
-            spectra, jax.device_put(start), stages, samples, meshes=(mesh_x, mesh_y), history=history
+            spectra,
+            jax.device_put(start),
+            stages,
+            samples,
+            meshes=(mesh_x, mesh_y),
+            partial=partial,
+            history=history,
         )
         last = jax.block_until_ready(refinements[-1])
     if last.result != RESULTS.successful:
@@ -217,6 +251,7 @@ def match(
         spectrum_y=spectra[-1][1],
         refinement=last,
         iterations=sum(int(refinement.iterations) for refinement in refinements),
+        partial=partial,
         seconds=seconds,
     )
 
@@ -401,12 +436,6 @@ def _side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[
     return result_x, result_y
 
 
-def _units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
-    """What descriptors measure lengths in: the square root of each area, of a partial pair the larger's."""
-    areas = mesh_x.area, mesh_y.area
-    return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
-
-
 def _shot(
     x: _Thinned, y: _Thinned, partial: bool
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
@@ -416,7 +445,7 @@ def _shot(
         (mesh, samples, _), unit = side
         return shot_descriptors(mesh, radius=SHOT_RADIUS * unit / mesh.area**0.5, samples=samples)
 
-    units = _units_of_length(x.mesh, y.mesh, partial)
+    units = units_of_length(x.mesh, y.mesh, partial)
     return _side_by_side(describe, (x, units[0]), (y, units[1]))
 
 
@@ -469,7 +498,7 @@ def _landmark_features(
             "for landmarks."
         )
     features = []
-    units = _units_of_length(x.mesh, y.mesh, partial)
+    units = units_of_length(x.mesh, y.mesh, partial)
     shot = _shot(x, y, partial)
     for (mesh, samples, _), vertices, unit, described in zip((x, y), landmarks.T, units, shot, strict=True):
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))

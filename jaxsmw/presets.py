@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial as partial_function
 from typing import Any, Literal
 
 import jax
@@ -141,6 +141,7 @@ def refine_in_stages(
     samples: Samples | None = None,
     *,
     meshes: tuple[Mesh, Mesh] | None = None,
+    partial: bool = False,
     history: bool = False,
 ) -> list[Refinement]:
     """Refine by one stage after the other, as long as they go well: the outcome of each.
@@ -155,14 +156,15 @@ def refine_in_stages(
     - `spectra`: of X and Y as each stage sees them (`Stage.view`).
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
+    - `partial`: one shape is a part of the other, in the same unit of length.
     - `history`: see `jaxsmw.refine`.
     """
     refinements: list[Refinement] = []
     for (spectrum_x, spectrum_y), stage in zip(spectra, stages, strict=True):
-        run = partial(_run, stage, spectrum_y, samples, history)
+        run = partial_function(_run, stage, spectrum_y, samples, history)
         refinement = run(spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            refinement = _mended(refinement, spectrum_x, run, meshes, stage.mending)
+            refinement = _mended(refinement, spectrum_x, run, meshes, partial, stage.mending)
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
@@ -193,6 +195,7 @@ def _mended(
     spectrum_x: Spectrum,
     run: Callable[[Spectrum, Int[Array, " m"]], Refinement],
     meshes: tuple[Mesh, Mesh],
+    partial: bool,
     rounds: int,
 ) -> Refinement:
     """The least stretched of a refinement and of others, each begun without what was faulty in the last."""
@@ -201,12 +204,12 @@ def _mended(
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
     best, least = refinement, np.inf
     criteria = (
-        lambda found: reversed_orientation(*meshes, found, eigenvectors),
-        lambda found: torn_off(*meshes, found),
+        lambda found: reversed_orientation(*meshes, found, eigenvectors, partial=partial),
+        lambda found: torn_off(*meshes, found, partial=partial),
     )
     for done in range(rounds + 1):
         found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-        stretched = stretch(*meshes, found)
+        stretched = stretch(*meshes, found, partial=partial)
         if stretched < least:
             best, least = refinement, stretched
         if done == rounds:

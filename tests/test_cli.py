@@ -337,13 +337,21 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
     assert 0 < np.median(apart) < 0.05 * mesh_y.area**0.5
 
 
+def test_the_expected_error_is_written(run, pair, tmp_path):
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
+    assert run(*call, "--expected-error", tmp_path / "expected.txt").code == 0
+    expected = np.loadtxt(tmp_path / "expected.txt")
+    assert expected.shape == (642,) and expected.min() >= 0 and expected.mean() < 0.02
+    assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="is named for two outputs")
+
+
 @pytest.mark.parametrize(
     ("name", "fault"),
     [
         ("points.txt", "ends in it"),
         ("missing/points.baryc_gt", "missing"),
         ("truth.baryc_gt", "is an input"),
-        ("map.baryc_gt", "the map's file as well"),
+        ("map.baryc_gt", "is named for two outputs"),
         ("start.baryc_gt", "is an input"),
     ],
 )

@@ -6,7 +6,7 @@ from scipy.spatial import KDTree
 from synthetic import bumpy_mesh
 
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.faults import reversed_orientation, stretch, torn_off
+from jaxsmw.geometry.faults import expected_error, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
 
 
@@ -18,6 +18,11 @@ def body():
     length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))
     mesh = make_mesh(directions * length[:, None], sphere.faces)
     return mesh, np.asarray(compute_spectrum(mesh, 60).eigenvectors)
+
+
+@pytest.fixture(scope="module")
+def spectrum(body):
+    return compute_spectrum(body[0], 60)
 
 
 def test_the_identity_has_no_faults(body):
@@ -62,3 +67,46 @@ def test_swapped_limbs_are_torn_off_and_reversed(body):
 def test_coarse_meshes_are_not_torn_by_their_own_edges():
     mesh = bumpy_mesh(1)
     assert not torn_off(mesh, mesh, np.arange(len(mesh.vertices))).any()
+
+
+def test_of_a_perfect_map_no_error_is_expected(body, spectrum):
+    mesh, _ = body
+    identity = np.arange(len(mesh.vertices))
+    assert expected_error(mesh, mesh, identity, identity, spectrum).max() == 0
+
+
+def test_errors_are_expected_where_they_are(body, spectrum):
+    """Where limbs are swapped, and where matches are scattered."""
+    mesh, _ = body
+    identity = np.arange(len(mesh.vertices))
+    arms = np.abs(mesh.vertices[:, 0]) > 1
+    _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    swapped = np.where(arms, mirrored, identity)
+    expected = expected_error(mesh, mesh, swapped, swapped, spectrum)
+    assert expected[arms].min() > 0.25 > np.median(expected[~arms])
+
+    top = mesh.vertices[:, 2] > np.quantile(mesh.vertices[:, 2], 0.8)
+    distance = 0.05 * mesh.area**0.5
+    moved = mesh.vertices + distance * np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    _, scattered = KDTree(mesh.vertices).query(moved)
+    found = np.where(top, scattered, identity)
+    expected = expected_error(mesh, mesh, found, identity, spectrum)
+    truly = np.linalg.norm(mesh.vertices[found] - mesh.vertices, axis=1) / mesh.area**0.5
+    worst = expected >= np.quantile(expected, 0.8)
+    assert truly[worst].sum() > 0.8 * truly.sum()
+    assert 0.3 < expected[top].mean() / truly[top].mean() < 3
+
+
+def test_lengths_of_a_part_are_measured_like_the_whole(body):
+    """A part in the same unit is not stretched; compared by area it would be."""
+    mesh, _ = body
+    kept = mesh.vertices[:, 0] < 1
+    old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
+    part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))
+    assert stretch(part, mesh, old, partial=True) == pytest.approx(1)
+    assert stretch(part, mesh, old) < 0.95
+    spectrum = compute_spectrum(part, 40).scale(part.area / mesh.area)
+    eigenvectors = np.asarray(spectrum.eigenvectors)
+    assert not reversed_orientation(part, mesh, old, eigenvectors, partial=True).any()
+    back = KDTree(part.vertices).query(mesh.vertices)[1]
+    assert expected_error(part, mesh, old, back, spectrum, partial=True).max() == pytest.approx(0, abs=1e-12)

@@ -1,6 +1,7 @@
 """One pair from meshes to correspondence."""
 
 import logging
+from concurrent.futures import Future
 from dataclasses import replace
 
 import jax
@@ -293,13 +294,17 @@ def test_presets_find_the_copy(pair):
     assert max(errors) < 0.002  # of a copy
     assert accurate.iterations == 3 + 8 + 2 and accurate.functional_map.shape == (200, 200)
     assert list(accurate.seconds) == ["eigenbases", "initial map", "descriptors", "samples", "refinement"]
+    assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
     assert np.median(distances) < 0.01 * mesh_y.area**0.5
 
 
-def test_presets_fit_small_meshes():
+def test_presets_fit_small_meshes(monkeypatch):
     """Of 162 vertices there are no 200 eigenvectors, nor 1000 samples."""
+    # Beartype, which only tests use, catches warnings of its own, and in a thread beside this one then ours.
+    monkeypatch.setattr("jaxsmw.matching.compile_ahead", lambda *_, **__: Future())
+    monkeypatch.setattr("jaxsmw.matching.wait", lambda _: None)
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="goes on without descriptors: .* coarse"):
         found = match(mesh, mesh, init=np.arange(162))
@@ -387,10 +392,13 @@ def test_surface_points_follow_the_map_between_vertices(pair):
     np.testing.assert_allclose(points.weights.sum(axis=1), 1, atol=1e-15)
 
 
-def test_unused_vertices_get_surface_points(pair):
+def test_unused_vertices_get_surface_points_and_expected_errors(pair):
     mesh_x, mesh_y, _ = pair
     extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
-    points = match(extra, mesh_y, **OPTIONS).surface_points()
+    found = match(extra, mesh_y, **OPTIONS)
+    expected = found.expected_error()
+    assert expected[-1] == expected[0] and np.isfinite(expected).all()
+    points = found.surface_points()
     assert len(points) == len(extra.vertices)
     assert points.faces[-1] == points.faces[0]
     np.testing.assert_array_equal(points.weights[-1], points.weights[0])

@@ -321,7 +321,7 @@ def test_correspondence_with_errors() -> None:
     n = len(TALL.vertices)
     errors = np.where(TALL.vertices[:, 1] > 0, 0.3, 0.0)
     errors[0] = np.nan
-    figure = draw_correspondence(TALL, TALL, np.arange(n), errors=errors)
+    figure = draw_correspondence(TALL, TALL, np.arange(n), errors={"Error": errors})
     image = panels(figure)["Error on the source"].astype(int)
     height = image.shape[0]
     upper, lower = image[height // 4], image[3 * height // 4]
@@ -329,10 +329,14 @@ def test_correspondence_with_errors() -> None:
     assert upper[:, 1].max() < lower[:, 1].min()
     scale = next(axes for axes in figure.axes if axes.get_label() == "error scale")
     assert scale.get_ylim() == pytest.approx((0, 0.3))
-    wider = draw_correspondence(TALL, TALL, np.arange(n), errors=errors, error_limit=1.0)
+    wider = draw_correspondence(TALL, TALL, np.arange(n), errors={"Error": errors}, error_limit=1.0)
     assert np.abs(panels(wider)["Error on the source"].astype(int) - image).max() > 50
-    silent = draw_correspondence(TALL, TALL, np.arange(n), errors=np.full(n, np.nan))
+    silent = draw_correspondence(TALL, TALL, np.arange(n), errors={"Error": np.full(n, np.nan)})
     assert len(panels(silent)) == 3
+    both = draw_correspondence(TALL, TALL, np.arange(n), errors={"Error": errors, "Doubt": 2 * errors})
+    assert list(panels(both))[2:] == ["Error on the source", "Doubt on the source"]
+    scale = next(axes for axes in both.axes if axes.get_label() == "error scale")
+    assert scale.get_ylim() == pytest.approx((0, 0.6))
 
 
 @pytest.mark.usefixtures("small")
@@ -491,10 +495,10 @@ def test_bad_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
             show(TALL, TALL, bad)
     for errors in (np.zeros(n - 1), np.full(n, -0.1)):
         with pytest.raises(InputError, match="non-negative"):
-            show(TALL, TALL, good, errors=errors)
+            show(TALL, TALL, good, errors={"Error": errors})
     for limit in (0, -1, np.nan, np.inf):
         with pytest.raises(InputError, match="positive"):
-            show(TALL, TALL, good, errors=np.zeros(n), error_limit=limit)
+            show(TALL, TALL, good, errors={"Error": np.zeros(n)}, error_limit=limit)
 
 
 # ---- The page, as a file
@@ -515,16 +519,19 @@ def decode(text: str, dtype: str) -> np.ndarray:
 def test_page_holds_the_data_and_nothing_from_elsewhere(tmp_path: Path) -> None:
     other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
     errors = np.linspace(0, 0.1, len(number))
-    write_page(tmp_path / "page.html", TALL, other, number, title="One", errors=errors, error_limit=0.05)
+    named = {"Error": errors, "Expected <error>": errors / 2}
+    write_page(tmp_path / "page.html", TALL, other, number, title="One", errors=named, error_limit=0.05)
     page = (tmp_path / "page.html").read_text("utf-8")
     data = embedded(page)
     for side, standing in zip("xy", stand_pair(TALL, other), strict=True):
         assert np.allclose(decode(data[side]["vertices"], "<f4").reshape(-1, 3), standing.vertices, atol=1e-6)
         assert np.array_equal(decode(data[side]["faces"], "<u4").reshape(-1, 3), standing.faces)
     assert np.array_equal(decode(data["map"], "<u4"), number)
-    assert np.allclose(decode(data["errors"], "<f4"), errors)
-    expected = np.round(255 * colors.error_colors(errors, 0.05))
-    assert np.array_equal(decode(data["errorColors"], "u1").reshape(-1, 3), expected)
+    for (name, values), shown in zip(named.items(), data["errors"], strict=True):
+        assert shown["name"] == name and np.allclose(decode(shown["values"], "<f4"), values)
+        expected = np.round(255 * colors.error_colors(values, 0.05))
+        assert np.array_equal(decode(shown["colors"], "u1").reshape(-1, 3), expected)
+    assert 'value="error-1">Expected &lt;error&gt;<' in page
     assert "someone" not in page and "other.off · 642 vertices" in page and "≥ 0.05 √area" in page
     assert "{{" not in page.split("<script>")[0]
     # The one address is the name of a namespace, which nobody fetches.
@@ -537,7 +544,9 @@ def test_page_of_a_usual_mesh_is_small(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     n = 7000
     mesh = Mesh(generator.normal(size=(n, 3)), generator.integers(0, n, (2 * n, 3)))
-    write_page(tmp_path / "page.html", mesh, mesh, np.arange(n), title="t", errors=generator.random(n))
+    write_page(
+        tmp_path / "page.html", mesh, mesh, np.arange(n), title="t", errors={"Error": generator.random(n)}
+    )
     assert (tmp_path / "page.html").stat().st_size < 1.6e6
 
 
@@ -688,8 +697,9 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     errors = np.linspace(0, 0.2, len(NUMBER))
     errors[visible_vertices()[1]] = np.nan
     write_page(
-        path, SOURCE, TARGET, crowded_map(), title="Two bodies", errors=errors, statistics={"Mean": "0.1"}
-    )
+        path, SOURCE, TARGET, crowded_map(), title="Two bodies", statistics={"Mean": "0.1"},
+        errors={"Error": errors, "Expected error": np.linspace(0.2, 0, len(NUMBER))},
+    )  # fmt: skip
     return path
 
 
@@ -728,7 +738,8 @@ def test_clicks_on_the_source(page: OpenPage) -> None:
         target = int(crowded_map()[vertex])
         assert page.state["source"] == [vertex] and page.state["target"] == [target]
         assert page.readout.startswith(f"Source vertex {vertex} → target vertex {target} · error")
-        assert ("not known" in page.readout) == (vertex == visible_vertices()[1])
+        assert ("error not known" in page.readout) == (vertex == visible_vertices()[1])
+        assert f" · expected error {0.2 * (1 - vertex / (len(NUMBER) - 1)):.4f}" in page.readout
     # The mark is seen where the map says.
     x, y = page.place("y", target)
     box = page.find("#canvas-y").rect
@@ -772,9 +783,11 @@ def test_pointing_marks_until_a_click_pins(page: OpenPage) -> None:
 def test_colorings(page: OpenPage) -> None:
     transfer = {side: page.view(side) for side in "xy"}
     assert not page.find(".scale").is_displayed()
-    page.choose("error")
+    page.choose("error-0")
     error = {side: page.view(side) for side in "xy"}
-    assert page.state["coloring"] == "error" and page.find(".scale").is_displayed()
+    assert page.state["coloring"] == "error-0" and page.find(".scale").is_displayed()
+    page.choose("error-1")
+    assert page.find(".scale").is_displayed() and differ(error["x"], page.view("x")) > 0.1
     page.choose("plain")
     plain = {side: page.view(side) for side in "xy"}
     for side in "xy":
@@ -877,7 +890,7 @@ def test_hostile_texts_are_only_texts(browser: Any, tmp_path: Path) -> None:
     assert page.run("return document.querySelector('.figures img').naturalWidth") == 6
     assert page.run("return [window.hacked, document.images.length]") == [None, 1]
     assert page.find(".body span").text.startswith("<\\script><\\title><img src=x onerror=")
-    assert not browser.find_elements("css selector", "input[value=error]")
+    assert not browser.find_elements("css selector", "input[value^=error]")
     assert browser.get_log("browser") == []
     # Were a text to get through after all, the page still runs no script but its own.
     page.run("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hacked=1\">')")

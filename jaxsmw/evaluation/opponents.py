@@ -200,7 +200,9 @@ class InStages(Method):
 
 def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESULTS]:
     spectra = [pair.seen_in(stage) for stage in stages]
-    refined = refine_in_stages(spectra, pair.start, stages, pair.samples, meshes=pair.meshes)[-1]
+    refined = refine_in_stages(
+        spectra, pair.start, stages, pair.samples, meshes=pair.meshes, partial=pair.partial
+    )[-1]
     return refined.pointwise_map, refined.result
 
 

@@ -5,31 +5,40 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.geometry.mesh import Mesh, connected_pieces
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.mesh import Mesh, connected_pieces, units_of_length
 
 # Neighbours whose matches are farther apart than this, in square roots of the area, and than so many times
 # their own distance, are torn apart. Matches of neighbours are 0.03 apart on bodies of 5000 vertices.
 _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
+# What `expected_error` thinks of a vertex on a limb that is swapped, in square roots of the area.
+_MISPLACED = 0.3
+# The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
+_HEAT_TIME = 1e-3
 
 
-def stretch(mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"]) -> float:
+def stretch(
+    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"], *, partial: bool = False
+) -> float:
     """The squared distances of neighbours' matches, over those of the neighbours: a Dirichlet energy.
 
-    In Euclidean distance, on surfaces scaled to area 1. About 1 for the true map between poses of one body;
-    maps that tear or scatter have more.
+    In Euclidean distance, on surfaces scaled to area 1, or if `partial` by one factor. About 1 for the true
+    map between poses of one body; maps that tear or scatter have more.
     """
-    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map)
+    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map, partial)
     return float(np.sum(after**2) / np.sum(before**2))
 
 
-def torn_off(mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+def torn_off(
+    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"], *, partial: bool = False
+) -> Bool[np.ndarray, " m"]:
     """True for vertices of X outside the largest piece that is left where edges that the map tears are cut.
 
     Limbs that are swapped as a whole come off so.
     """
-    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map)
+    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map, partial)
     kept = mesh_x.edges[after < np.maximum(_TORN, _STRETCHED * before)]
     _, piece = connected_pieces(kept, len(mesh_x.vertices))
     return piece != np.argmax(np.bincount(piece, mesh_x.vertex_areas))
@@ -40,33 +49,74 @@ def reversed_orientation(
     mesh_y: Mesh,
     pointwise_map: Int64[np.ndarray, " m"],
     eigenvectors_x: Float[np.ndarray, "m k"],
+    *,
+    partial: bool = False,
 ) -> Bool[np.ndarray, " m"]:
     """True for vertices of X around which the map turns left into right, as where limbs are swapped.
 
     **Arguments:**
 
-    - `eigenvectors_x`: of X, of area 1: in the span of these the area that triangles cover on Y, negative
-      where they come to lie upside down, is smoothed.
+    - `eigenvectors_x`: of X, scaled like lengths: in the span of these the area that triangles cover on Y,
+      negative where they come to lie upside down, is smoothed.
     """
+    unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
     corners = pointwise_map[mesh_x.faces]
     a, b, c = (mesh_y.vertices[corner] for corner in corners.T)
     normals = mesh_y.vertex_normals[corners].sum(axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-    covered = 0.5 * np.sum(np.cross(b - a, c - a) * normals, axis=1) / mesh_y.area
+    covered = 0.5 * np.sum(np.cross(b - a, c - a) * normals, axis=1) / unit_y**2
     if mesh_x.is_inside_out != mesh_y.is_inside_out:
         covered = -covered
     # One triangle that is torn wide open should not outvote all around it.
-    most = 2 * mesh_x.face_areas / mesh_x.area
+    most = 2 * mesh_x.face_areas / unit_x**2
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
     density = eigenvectors_x @ (eigenvectors_x.T @ at_vertices)
     return density < _REVERSED
 
 
+def expected_error(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_map: Int64[np.ndarray, " m"],
+    way_back: Int64[np.ndarray, " n"],
+    spectrum_x: Spectrum,
+    *,
+    partial: bool = False,
+) -> Float[np.ndarray, " m"]:
+    """How far from the truth matches may be, as far as the map gives it away, in square roots of Y's area.
+
+    Two signs, evened out over the surroundings: how far from where it began one comes back to, there and
+    `way_back`; and how much distances between neighbours change. Where limbs are swapped (`torn_off`,
+    `reversed_orientation`) more is expected. docs/accuracy.md tells how well this ranks vertices. A map that
+    is wrong and consistent throughout, as of a body to its mirror image, passes for right.
+
+    **Arguments:**
+
+    - `way_back`: a map Y -> X.
+    - `spectrum_x`: of X; heat flowing in it evens out the signs.
+    - `partial`: whether one mesh is a part of the other, in the same unit of length.
+    """
+    units = units_of_length(mesh_x, mesh_y, partial)
+    detour = np.linalg.norm(mesh_x.vertices - mesh_x.vertices[way_back[pointwise_map]], axis=1) / units[0]
+    change = np.abs(np.subtract(*_edge_lengths(mesh_x, mesh_y, pointwise_map, partial)))
+    ends, m = mesh_x.edges.ravel(), len(mesh_x.vertices)
+    distortion = np.bincount(ends, np.repeat(change, 2), m) / np.maximum(np.bincount(ends, minlength=m), 1)
+    eigenvalues, eigenvectors, areas = (
+        np.asarray(part, np.float64)
+        for part in (spectrum_x.eigenvalues, spectrum_x.eigenvectors, spectrum_x.vertex_areas)
+    )
+    heat = np.exp(-_HEAT_TIME * eigenvalues) * (eigenvectors.T @ (areas * (detour + distortion)))
+    misplaced = torn_off(mesh_x, mesh_y, pointwise_map, partial=partial)
+    misplaced |= reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
+    return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced
+
+
 def _edge_lengths(
-    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"]
+    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"], partial: bool
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Lengths of the edges of X, and distances of their ends' matches, on surfaces of area 1."""
-    placed = (mesh_x.vertices / mesh_x.area**0.5, mesh_y.vertices[pointwise_map] / mesh_y.area**0.5)
+    """Lengths of the edges of X, and distances of their ends' matches, in `units_of_length`."""
+    unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
+    placed = (mesh_x.vertices / unit_x, mesh_y.vertices[pointwise_map] / unit_y)
     before, after = (np.linalg.norm(np.diff(v[mesh_x.edges], axis=1)[:, 0], axis=1) for v in placed)
     return before, after

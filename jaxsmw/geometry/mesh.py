@@ -250,6 +250,12 @@ def connected_pieces(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int3
     return connected_components(graph, directed=False)
 
 
+def units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
+    """In what lengths on two shapes compare: the square root of each area, of a partial pair the larger's."""
+    areas = mesh_x.area, mesh_y.area
+    return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
+
+
 def count_of(number: int, noun: str) -> str:
     if number != 1:
         noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"

@@ -42,7 +42,7 @@ def draw_correspondence(
     mesh_y: Mesh,
     pointwise_map: Int[np.ndarray | Array, " m"],
     *,
-    errors: Float[np.ndarray | Array, " m"] | None = None,
+    errors: Mapping[str, Float[np.ndarray | Array, " m"]] = MappingProxyType({}),
     error_limit: float | None = None,
     up: Axis | None = None,
     azimuth: float | None = None,
@@ -56,9 +56,9 @@ def draw_correspondence(
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `pointwise_map`: for every vertex of X a vertex of Y.
-    - `errors`: for every vertex of X the geodesic error of its match, as a fraction of sqrt(area of Y); NaN
-      where it is not known. Adds a panel that shows them on X.
-    - `error_limit`: where the scale of errors ends; by default at their 98th percentile.
+    - `errors`: by name, for every vertex of X the error of its match, as a fraction of sqrt(area of Y); NaN
+      where it is not known. Each adds a panel that shows them on X.
+    - `error_limit`: where the scale of errors ends; by default at the largest 98th percentile.
     - `up`: the axis of the files that points up; see `jaxsmw.report.rendering.stand` for the default.
     - `azimuth`: where the viewer stands, in degrees from the front of the body towards its left; by default
       where both bodies show well.
@@ -71,12 +71,13 @@ def draw_correspondence(
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
     colors_y = position_colors(shown_y)
     panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
-    if errors is None:
+    if not errors:
         return _draw_panels(panels, azimuth)
-    values, limit = check_errors(mesh_x, errors, error_limit)
-    panels.append(_Panel("Error on the source", shown_x, error_colors(values, limit)))
+    checked, limit = check_errors(mesh_x, errors, error_limit)
+    for name, values in checked.items():
+        panels.append(_Panel(f"{name} on the source", shown_x, error_colors(values, limit)))
     figure = _draw_panels(panels, azimuth, right_margin=150)
-    _draw_error_scale(figure, limit, bool(np.any(values > limit)))
+    _draw_error_scale(figure, limit, any(np.any(values > limit) for values in checked.values()))
     return figure
 
 

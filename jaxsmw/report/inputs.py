@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -38,26 +39,29 @@ def check_map(
 
 
 def check_errors(
-    mesh_x: Mesh, errors: Float[np.ndarray | Array, " m"], limit: float | None
-) -> tuple[Float64[np.ndarray, " m"], float]:
-    """The errors as NumPy numbers, and where their colour scale ends.
+    mesh_x: Mesh, errors: Mapping[str, Float[np.ndarray | Array, " m"]], limit: float | None
+) -> tuple[dict[str, Float64[np.ndarray, " m"]], float]:
+    """The errors as NumPy numbers by name, and where the colour scale of all ends.
 
     **Raises:** `InputError` unless there is one error for every vertex of X, non-negative or NaN (not known),
     and the limit, where given, is positive.
     """
-    values = np.asarray(errors, dtype=float)
-    m = len(mesh_x.vertices)
-    if values.shape != (m,) or np.any(values < 0):
-        raise InputError(
-            f"the errors must be {m} non-negative numbers, one for each vertex of {mesh_x.name} (NaN where "
-            f"it is not known), but they have shape {values.shape} and {np.sum(values < 0)} are negative."
-        )
+    m, checked = len(mesh_x.vertices), {}
+    for name, of_vertices in errors.items():
+        values = checked[name] = np.asarray(of_vertices, dtype=float)
+        if values.shape != (m,) or np.any(values < 0):
+            raise InputError(
+                f"{name}: there must be {m} non-negative numbers, one for each vertex of {mesh_x.name} (NaN "
+                f"where it is not known), but they have shape {values.shape} and {np.sum(values < 0)} are "
+                "negative."
+            )
     if limit is None:
-        finite = values[np.isfinite(values)]
-        limit = max(_SMALLEST_LIMIT, float(np.percentile(finite, _PERCENTILE)) if len(finite) else 0)
+        finite = [values[np.isfinite(values)] for values in checked.values()]
+        ends = [float(np.percentile(values, _PERCENTILE)) for values in finite if len(values)]
+        limit = max(_SMALLEST_LIMIT, *ends, 0)
     if not 0 < limit < np.inf:
         raise InputError(f"the error scale must end at a positive number, not at {limit}.")
-    return values, limit
+    return checked, limit
 
 
 def describe(mesh: Mesh) -> tuple[str, str]:

@@ -30,7 +30,7 @@ def write_page(
     *,
     title: str,
     statistics: Mapping[str, str] = MappingProxyType({}),
-    errors: Float[np.ndarray | Array, " m"] | None = None,
+    errors: Mapping[str, Float[np.ndarray | Array, " m"]] = MappingProxyType({}),
     error_limit: float | None = None,
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
@@ -45,9 +45,9 @@ def write_page(
     - `pointwise_map`: for every vertex of X a vertex of Y.
     - `title`: the heading.
     - `statistics`: what to state below the bodies, a label and a value each.
-    - `errors`: for every vertex of X the geodesic error of its match, as a fraction of sqrt(area of Y); NaN
-      where it is not known. Adds a colouring by error.
-    - `error_limit`: where the scale of errors ends; by default at their 98th percentile.
+    - `errors`: by name, for every vertex of X the error of its match, as a fraction of sqrt(area of Y); NaN
+      where it is not known. Each adds a colouring.
+    - `error_limit`: where the scale of errors ends; by default at the largest 98th percentile.
     - `figures`: captions and PNG files to show at the end.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
 
@@ -66,12 +66,22 @@ def write_page(
         "elevation": ELEVATION,
         "wide": bool(max(reach[0], reach[2]) > reach[1]),
     }
-    error_choice, scale_end = "", ""
-    if errors is not None:
-        values, limit = check_errors(mesh_x, errors, error_limit)
-        data |= {"errors": _encode(values, "<f4"), "errorColors": _encode_colors(error_colors(values, limit))}
-        scale_end = f"{'≥ ' if np.any(values > limit) else ''}{limit:.3g} √area"
-        error_choice = '<label><input type="radio" name="coloring" value="error">Error</label>'
+    error_choices, scale_end = "", ""
+    if errors:
+        checked, limit = check_errors(mesh_x, errors, error_limit)
+        data["errors"] = [
+            {
+                "name": name,
+                "values": _encode(values, "<f4"),
+                "colors": _encode_colors(error_colors(values, limit)),
+            }
+            for name, values in checked.items()
+        ]
+        scale_end = f"{'≥ ' if any(np.any(v > limit) for v in checked.values()) else ''}{limit:.3g} √area"
+        error_choices = "".join(
+            f'<label><input type="radio" name="coloring" value="error-{number}">{html.escape(name)}</label>'
+            for number, name in enumerate(checked)
+        )
 
     assets = files("jaxsmw.report") / "assets"
     script = (assets / "viewer.js").read_text("utf-8")
@@ -80,7 +90,7 @@ def write_page(
         "source": html.escape(" · ".join(describe(mesh_x))),
         "target": html.escape(" · ".join(describe(mesh_y))),
         "last_vertex": str(len(indices) - 1),
-        "error_choice": error_choice,
+        "error_choices": error_choices,
         "scale_colors": ", ".join(
             f"rgb({r} {g} {b})"
             for r, g, b in np.round(255 * error_colors(np.linspace(0, 1, 9), 1.0)).astype(int)

@@ -43,6 +43,9 @@ def write_report(
 ) -> None:
     """Write the pictures of a match, an interactive page and a summary to a directory.
 
+    The error that is to be expected (`Correspondence.expected_error`) is among them, and if given the true
+    one.
+
     **Arguments:**
 
     - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the figures),
@@ -58,7 +61,10 @@ def write_report(
     directory = make_directory(directory)
     errors = errors or {}
     final = list(errors.values())[-1] if errors else None
-    per_vertex = None if final is None else _per_vertex(final, len(correspondence.pointwise_map))
+    expected = correspondence.expected_error()
+    per_vertex = {"Expected error": expected}
+    if final is not None:
+        per_vertex = {"Error": _per_vertex(final, len(correspondence.pointwise_map)), **per_vertex}
 
     figures = {
         "correspondence": draw_correspondence(
@@ -85,7 +91,7 @@ def write_report(
     for name, figure in figures.items():
         save_figure(directory / f"{name}.png", figure)
 
-    facts = summarize(correspondence, errors)
+    facts = summarize(correspondence, errors, expected)
     write_page(
         directory / "report.html",
         correspondence.mesh_x,
@@ -126,7 +132,11 @@ def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
     )
 
 
-def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, str]:
+def summarize(
+    correspondence: Correspondence,
+    errors: Mapping[str, GeodesicError],
+    expected_error: Float[np.ndarray, " m"],
+) -> dict[str, str]:
     """The facts of a match, labelled and ready to print."""
     facts = {
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
@@ -136,6 +146,7 @@ def summarize(correspondence: Correspondence, errors: Mapping[str, GeodesicError
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
+    facts["expected error"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
 
 

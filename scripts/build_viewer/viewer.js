@@ -41,7 +41,11 @@ const decode = (text, Type) => new Type(Uint8Array.from(atob(text), (c) => c.cha
 const LINEAR = Float32Array.from({ length: 256 }, (_, byte) => new Color().setRGB(byte / 255, 0, 0, SRGBColorSpace).r);
 
 const pointwiseMap = decode(data.map, Uint32Array);
-const errors = data.errors && decode(data.errors, Float32Array);
+const errors = (data.errors ?? []).map(({ name, values, colors }) => ({
+  name: name.toLowerCase(),
+  values: decode(values, Float32Array),
+  colors: decode(colors, Uint8Array),
+}));
 
 // White with a black rim, to be seen on every colour; faint where the body is in front.
 const CORE = new SphereGeometry(1, 20, 14);
@@ -215,7 +219,7 @@ const colorings = {
   transfer: { x: colorsX, y: colorsY },
   plain: { x: plain(bodies.x), y: plain(bodies.y) },
 };
-if (errors) colorings.error = { x: decode(data.errorColors, Uint8Array), y: colorings.plain.y };
+errors.forEach(({ colors }, i) => (colorings[`error-${i}`] = { x: colors, y: colorings.plain.y }));
 
 let coloring;
 function color(name) {
@@ -246,7 +250,9 @@ function show(side, vertex) {
     marks.x = [vertex];
     marks.y = [pointwiseMap[vertex]];
     text = `Source vertex ${vertex} → target vertex ${marks.y[0]}`;
-    if (errors) text += ` · error ${Number.isNaN(errors[vertex]) ? "not known" : errors[vertex].toFixed(4)}`;
+    for (const { name, values } of errors) {
+      text += ` · ${name} ${Number.isNaN(values[vertex]) ? "not known" : values[vertex].toFixed(4)}`;
+    }
   } else if (vertex !== null) {
     marks.x = Array.from(sources.subarray(starts[vertex], starts[vertex + 1]));
     marks.y = [vertex];
