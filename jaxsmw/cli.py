@@ -271,9 +271,9 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--preset",
-        choices=("accurate", "paper"),
-        help="how the map is refined: accurate, or as the MWP paper has it, which is faster (default: "
-        "accurate; paper where something is said with the options below)",
+        choices=("accurate", "paper", "fast"),
+        help="how the map is refined: accurate; as the MWP paper has it, which is faster; or fast, the same "
+        "on samples (default: accurate; paper where something is said with the options below)",
     )
     group.add_argument(
         "--precision", choices=("float32", "float64"), default="float32", help="(default: %(default)s)"

@@ -165,9 +165,10 @@ def match(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `preset`: how the map is refined: `"accurate"`; `"paper"`, as the MWP paper has it; or stages of your
-      own, for example `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See
-      `jaxsmw.PRESETS`, of which small meshes get as many eigenvectors and samples as they have vertices for.
+    - `preset`: how the map is refined: `"accurate"`; `"paper"`, as the MWP paper has it; `"fast"`, the same
+      on samples; or stages of your own, for example
+      `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See `jaxsmw.PRESETS`, of which
+      small meshes get as many eigenvectors and samples as they have vertices for.
     - `init`: where to start: `"shot"`, `"wks"`, `"hks"` or `"wavelet"` for nearest neighbours of that
       descriptor (only SHOT tells left from right); `"functional"` for the functional map that preserves
       SHOT and commutes with the Laplacian (section 3.2 of the MWP paper), smoother and much less wrong to

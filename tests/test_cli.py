@@ -240,12 +240,13 @@ def test_report(run, pair, tmp_path):
 def test_presets(run, pair, tmp_path):
     """Accurate by default; options that change the paper's method are for that alone."""
     maps = {}
-    for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100")):
+    for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100"),
+                    ("--preset", "fast"), ("--samples", "500")):  # fmt: skip
         outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", *options)
         assert outcome.code == 0, outcome.errors
         maps[options] = (tmp_path / "m").read_text()
-    default, accurate, paper, changed = maps.values()
-    assert default == accurate != paper == changed
+    default, accurate, paper, changed, fast, sampled = maps.values()
+    assert default == accurate != paper == changed != fast == sampled != default
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     outcome = run(*call, "--preset", "accurate", "--stop-when-unchanged")
     assert_refused(outcome, naming="--stop-when-unchanged: changes the paper's method")

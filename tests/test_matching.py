@@ -316,7 +316,7 @@ def test_presets_fit_small_meshes(monkeypatch):
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(InputError, match="'exact' is no preset: choose from paper, accurate"):
+    with pytest.raises(InputError, match="'exact' is no preset: choose from fast, paper, accurate"):
         chosen_stages("exact", 1000)
 
 
