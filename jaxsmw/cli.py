@@ -184,9 +184,10 @@ def _parser() -> argparse.ArgumentParser:
         "--methods",
         metavar="METHOD",
         nargs="+",
-        help="start, mwp, accurate, mwp-sampled, no-filter, icp, cpd, bcicp, zoomout, zoomout-sampled; "
+        help="start, mwp, accurate, mwp-sampled, no-filter, icp, cpd, bcicp, pfm, zoomout, zoomout-sampled; "
         "pyfm-zoomout, geomfum-zoomout where these are installed; directories with maps X_Y.map made "
-        "elsewhere (default: all that suit the pairs; cpd and bcicp take half a minute per pair)",
+        "elsewhere (default: all that suit the pairs; cpd and bcicp take half a minute per pair; "
+        "pfm is for parts)",
     )
     benchmark.add_argument(
         "--pairs", metavar="N|FILE", help="so many at random, or those of a list (default: all)"

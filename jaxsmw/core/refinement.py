@@ -358,7 +358,7 @@ def refine(
             None,
         )
 
-    result = _diagnose(spectrum_x, spectrum_y, pointwise_map, state.result)
+    result = diagnose(spectrum_x, spectrum_y, pointwise_map, state.result)
     successful = result == RESULTS.successful
     recorded = None
     if history:
@@ -400,10 +400,10 @@ def _checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: R
     return where(went_well & ~finite, RESULTS.nonfinite_functional_map, result)
 
 
-def _diagnose(
+def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, pointwise_map: Int32[Array, " m"], result: RESULTS
 ) -> RESULTS:
-    """The result code, the first cause first."""
+    """How a refinement of a start ended: a fault of the spectra or of the start, or else `result`."""
     vertices_y = spectrum_y.mask.shape[0]
     in_range = (pointwise_map >= 0) & (pointwise_map < vertices_y)
     valid = in_range & spectrum_y.mask[jnp.clip(pointwise_map, 0, vertices_y - 1)]

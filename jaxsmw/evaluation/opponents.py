@@ -27,6 +27,7 @@ from jaxsmw.evaluation.bcicp import bcicp
 from jaxsmw.evaluation.cpd import DriftRecovery
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
+from jaxsmw.evaluation.partial_functional_maps import SurfaceGradient, partial_functional_map
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.presets import PRESETS, Stage, refine_in_stages
 
@@ -79,6 +80,7 @@ class Method(abc.ABC):
     - `reference`: where it is published, with what settings.
     - `both_directions`: whether it needs `PreparedPair.reverse_start`.
     - `whole_only`: whether it makes no sense where one shape is a part of the other.
+    - `partial_only`: whether it makes no sense otherwise.
     """
 
     number_of_eigenvectors: int
@@ -86,6 +88,7 @@ class Method(abc.ABC):
     number_of_descriptors: int = 0
     both_directions: bool = False
     whole_only: bool = False
+    partial_only: bool = False
 
     @abc.abstractmethod
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
@@ -98,6 +101,8 @@ class Method(abc.ABC):
         """
         if self.whole_only and any(pair.partial for pair in pairs):
             raise InputError(f"{self.reference}: is for whole shapes: leave it out of --methods.")
+        if self.partial_only and not all(pair.partial for pair in pairs):
+            raise InputError(f"{self.reference}: is for parts of shapes: leave it out of --methods.")
 
 
 @dataclass(frozen=True)
@@ -270,6 +275,29 @@ class BCICP(Method):
         return jnp.asarray(pointwise_map, jnp.int32), RESULTS.successful  # type: ignore[return-value]
 
 
+@dataclass(frozen=True)
+class PartialFunctionalMaps(Method):
+    """Of a part X and a whole Y; see `jaxsmw.evaluation.partial_functional_maps`."""
+
+    reference: str
+    number_of_eigenvectors: int = 100
+    number_of_descriptors: int = 15
+    turns: int = 5
+    partial_only: bool = True
+
+    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+        assert pair.meshes is not None
+        spectra = pair.seen_in(
+            Stage(
+                number_of_eigenvectors=self.number_of_eigenvectors,
+                number_of_descriptors=self.number_of_descriptors,
+            )
+        )
+        gradient = SurfaceGradient.of(pair.meshes[1], spectra[1])
+        found = compiled(partial_functional_map)(*spectra, gradient, pair.start, turns=self.turns)
+        return found.pointwise_map, found.result
+
+
 MOST_SAMPLES = 1000
 METHODS: dict[str, Method] = {
     "start": Start("nearest neighbours of the descriptors, from which all others start"),
@@ -291,6 +319,10 @@ METHODS: dict[str, Method] = {
         "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (maps "
         "published for tosca_nonisometric are better)"
     ),
+    "pfm": PartialFunctionalMaps(
+        "our reconstruction of Rodolà, Cosmo, Bronstein, Torsello, Cremers 2017, partial functional maps: "
+        "k = 100, 5 turns"
+    ),
     "zoomout": ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120"),
     "zoomout-sampled": ZoomOut(
         "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
@@ -310,8 +342,12 @@ def known_methods() -> dict[str, Method]:
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
     """The known methods that make sense for all of some pairs."""
-    partial = any(pair.partial for pair in pairs)
-    return {name: method for name, method in known_methods().items() if not (partial and method.whole_only)}
+    some, every = any(pair.partial for pair in pairs), all(pair.partial for pair in pairs)
+    return {
+        name: method
+        for name, method in known_methods().items()
+        if not (some and method.whole_only) and not (method.partial_only and not every)
+    }
 
 
 def find_methods(names: Iterable[str]) -> dict[str, Method]:
