@@ -32,6 +32,7 @@ from .core.refinement import History, Refinement, Refiner, WaveletPreservation, 
 from .core.results import RESULTS
 from .core.search import approximate_nearest_neighbor, nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from .core.soft_maps import SoftMap, sinkhorn
 from .core.solutions import (
     DescriptorPair,
     Filtering,
@@ -47,6 +48,7 @@ from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
+from .geometry.assignment import one_to_one_map
 from .geometry.creature import CreaturePair, creature_pair
 from .geometry.eigenbasis import compute_spectrum
 from .geometry.geodesics import SurfacePoints, geodesic_distances
@@ -99,6 +101,7 @@ __all__ = [
     "RegularizedLeastSquares",
     "Simoncelli",
     "SimpleTight",
+    "SoftMap",
     "Solution",
     "SpectralDistribution",
     "Spectrum",
@@ -130,6 +133,7 @@ __all__ = [
     "multiscale_kernel",
     "nearest_neighbor",
     "nearest_point_on_triangles",
+    "one_to_one_map",
     "open_data_set",
     "paired_spectra",
     "read_ground_truth",
@@ -139,6 +143,7 @@ __all__ = [
     "refine_pairs",
     "search_patches",
     "shot_descriptors",
+    "sinkhorn",
     "stack",
     "tighten",
     "wave_kernel_signature",

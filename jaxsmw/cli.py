@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from jaxsmw.core.solutions import Solution
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
-    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.geometry.mesh import Mesh
     from jaxsmw.matching import Correspondence
 
@@ -138,6 +137,18 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="also gets for each source vertex how far from the truth its match may be, in square roots "
         "of the target's area",
+    )
+    match.add_argument(
+        "--one-to-one",
+        metavar="FILE",
+        help="also gets a map like that of --output in which no two source vertices share a target vertex; "
+        "for shapes of the same triangulation, elsewhere it is much less accurate",
+    )
+    match.add_argument(
+        "--texture",
+        metavar="DIR",
+        help="write both meshes there as OBJ files with one picture, projected on the target and carried to "
+        "the source",
     )
     match.add_argument("--report", metavar="DIR", help="write pictures, a 3D page and a summary there")
     _add_up(match)
@@ -467,20 +478,15 @@ def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
     inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
-    if options.surface_points and Path(options.surface_points).suffix != ".baryc_gt":
-        raise InputError(
-            f"{options.surface_points}: points are written as .baryc_gt; choose a name that ends in it."
-        )
-    outputs = [*filter(None, (options.output, options.surface_points, options.expected_error))]
-    for number, path in enumerate(outputs):
-        _keep_inputs(path, *inputs)
-        if os.path.realpath(path) in map(os.path.realpath, outputs[:number]):
-            raise InputError(f"{path}: is named for two outputs: choose another name for one of them.")
-        check_writable(path)
-    if options.report:
+    if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
 
         check_drawable()
+    for path in _match_outputs(options):
+        _keep_inputs(path, *inputs)
+    files = options.output, options.surface_points, options.one_to_one, options.expected_error
+    for path in filter(None, files):
+        check_writable(path)
     from jaxsmw.evaluation.ground_truth import (
         GroundTruth,
         read_ground_truth,
@@ -489,23 +495,39 @@ def _match(options: argparse.Namespace) -> None:
     )
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
+    if options.one_to_one:
+        from jaxsmw.geometry.assignment import check_one_to_one
+
+        check_one_to_one(int(mesh_x.used_vertices.sum()), int(mesh_y.used_vertices.sum()))
     truth = None
     if options.ground_truth:
         truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
     directory = make_directory(options.report) if options.report else None
+    textured = make_directory(options.texture) if options.texture else None
     correspondence = _run_match(options, mesh_x, mesh_y)
     write_pointwise_map(options.output, correspondence.pointwise_map)
-    points = None
-    if options.surface_points:
+    others: dict[str, Any] = {}
+    if options.one_to_one:
+        logging.getLogger("jaxsmw").info("one-to-one map")
+        others["one-to-one"] = correspondence.one_to_one()
+        write_pointwise_map(options.one_to_one, others["one-to-one"])
+    if options.surface_points or textured:
         logging.getLogger("jaxsmw").info("points on the surface")
         points = correspondence.surface_points()
-        write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points), mesh_y)
+        if options.surface_points:
+            others["surface"] = points
+            write_ground_truth(options.surface_points, GroundTruth.of_all_vertices(points), mesh_y)
+        if textured:
+            from jaxsmw.report.texture import write_textured_pair
+
+            write_textured_pair(textured, mesh_x, mesh_y, points)
     if options.expected_error:
         import numpy as np
 
+        logging.getLogger("jaxsmw").info("expected error")
         with atomic_write(options.expected_error) as temporary:
             np.savetxt(temporary, correspondence.expected_error(), "%.6f")
-    _conclude(options, correspondence, truth, directory, points)
+    _conclude(options, correspondence, truth, directory, others)
 
 
 def _run_match(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Correspondence:
@@ -586,15 +608,17 @@ def _conclude(
     correspondence: Correspondence,
     truth: GroundTruth | None,
     directory: Path | None,
-    points: SurfacePoints | None = None,
+    others: Mapping[str, Any] | None = None,
 ) -> None:
     """Evaluate, print, and write the report, as far as each is wanted."""
     errors: dict[str, GeodesicError] = {}
     if truth is not None:
-        maps: dict[str, Any] = {"initial": correspondence.initial_map}
-        if points is not None:
-            maps["surface"] = points
-        maps["refined"] = correspondence.pointwise_map  # the last: the report shows its errors
+        # The last is the one whose errors the report shows.
+        maps = {
+            "initial": correspondence.initial_map,
+            **(others or {}),
+            "refined": correspondence.pointwise_map,
+        }
         errors = _errors(options, correspondence.mesh_y, maps, truth)
     if directory is not None:
         from jaxsmw.report.summary import write_report
@@ -644,6 +668,23 @@ def _keep_inputs(output: str, *inputs: str) -> None:
     """Refuse to write over what is read."""
     if os.path.realpath(output) in (os.path.realpath(path) for path in inputs if path):
         raise InputError(f"{output}: is an input and would be overwritten: choose another name.")
+
+
+def _match_outputs(options: argparse.Namespace) -> list[str]:
+    """The files that `match` writes beside its report, all different."""
+    points = options.surface_points
+    if points and Path(points).suffix != ".baryc_gt":
+        raise InputError(f"{points}: points are written as .baryc_gt; choose a name that ends in it.")
+    files = options.output, points, options.one_to_one, options.expected_error
+    paths = [path for path in files if path]
+    if options.texture:
+        from jaxsmw.report.texture import TEXTURE_FILES
+
+        paths += [os.path.join(options.texture, name) for name in TEXTURE_FILES]
+    for position, path in enumerate(paths):
+        if os.path.realpath(path) in map(os.path.realpath, paths[:position]):
+            raise InputError(f"{path}: is another output as well: choose another name for one of them.")
+    return paths
 
 
 def _check_outputs(options: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
@@ -27,10 +27,12 @@ from jaxsmw.core.refinement import Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.faults import expected_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
@@ -99,12 +101,69 @@ class Correspondence:
         are rows of `mesh_y.faces`. A vertex of X that no face uses gets the point of the nearest one that a
         face does use.
         """
-        faces, traced_weights = self._recovered(_points_on_triangles, self.mesh_y.faces)
+        with self._precision():
+            faces, traced_weights = compiled(nearest_point_on_triangles)(
+                *self._embeddings(), jax.device_put(self.mesh_y.faces)
+            )
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # without rounding errors
-        return SurfacePoints(
-            _extend_to_unused(self.mesh_x, np.asarray(faces).astype(np.int64)),
-            _extend_to_unused(self.mesh_x, weights / weights.sum(axis=1, keepdims=True)),
-        )
+        return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
+
+    def one_to_one(self) -> Int64[np.ndarray, " m"]:
+        """For every vertex of X a vertex of Y (m,), no two on one; see `jaxsmw.one_to_one_map`.
+
+        For shapes whose vertices correspond one by one; where triangulations differ, `pointwise_map` is
+        nearer the truth, often by far. A vertex of X that no face uses shares the match of the nearest one
+        that a face does use; the others share none.
+
+        **Raises:** `InputError` if faces of X use more vertices than those of Y.
+        """
+        queries, database = (np.asarray(points) for points in self._embeddings())
+        used = self.mesh_x.used_vertices
+        found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.used_vertices)
+        return _extend_to_unused(self.mesh_x, found)
+
+    def soft_map(
+        self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.05
+    ) -> SoftMap:
+        """How the area of X is spread over Y, every vertex of which gets its share; see `jaxsmw.sinkhorn`.
+
+        For functions to be carried from Y to X smoothly (`SoftMap.pull_back`), and for a pointwise map that
+        covers more of Y: on four remeshed FAUST pairs 76 to 82 instead of 69 to 75 % of its vertices, at
+        errors from 4 % less to 2 % more. An iteration takes 0.2 seconds for 5000 vertices, and 20 are needed.
+
+        A vertex of X that no face uses is mapped like the nearest one that a face does use. Warns if more of
+        the area than `tolerance` is not yet where it belongs.
+
+        **Arguments:**
+
+        - `temperature`: 0.1 is sharper and takes more iterations, 1 is softer.
+        - `iterations`, `tolerance`: see `jaxsmw.sinkhorn`. What goes on below a few hundredths is area
+          that moves across the body, which gains nothing where bodies differ.
+
+        **Raises:** `InputError` if the temperature is not positive, or there is to be no iteration.
+        """
+        if not temperature > 0 or iterations < 1:
+            raise InputError(
+                f"a soft map of temperature {temperature} after {iterations} iterations is none: give a "
+                "positive temperature, such as 0.3, and at least 1 iteration."
+            )
+        with self._precision():
+            found = compiled(sinkhorn)(
+                *self._embeddings(),
+                query_areas=self.spectrum_x.vertex_areas,
+                database_areas=self.spectrum_y.vertex_areas,
+                temperature=jnp.asarray(float(temperature)),
+                iterations=iterations,
+                tolerance=jnp.asarray(float(tolerance)),
+            )
+        if not found.converged:
+            warnings.warn(
+                f"the soft map is unfinished: after {iterations} iterations {float(found.residual):.3g} of "
+                f"the area is not where it belongs, more than {tolerance:g}; allow more iterations, a higher "
+                "temperature or a larger tolerance",
+                stacklevel=2,
+            )
+        return found
 
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """For every vertex of X how far its match may be from the truth, in square roots of Y's area.
@@ -112,26 +171,35 @@ class Correspondence:
         No truth is needed: `jaxsmw.geometry.faults.expected_error` explains, the way back is what the last
         stage finds. A vertex of X that no face uses gets that of the nearest one that a face does use.
         """
-        way_back = np.asarray(self._recovered(_way_back)).astype(np.int64)
+        with self._precision():
+            way_back = compiled(_way_back)(*self._embeddings(), self.spectrum_x, self.spectrum_y)
         expected = expected_error(
-            self.mesh_x, self.mesh_y, self.pointwise_map, way_back, self.spectrum_x, partial=self.partial
+            self.mesh_x,
+            self.mesh_y,
+            self.pointwise_map,
+            np.asarray(way_back).astype(np.int64),
+            self.spectrum_x,
+            partial=self.partial,
         )
         return _extend_to_unused(self.mesh_x, expected)
 
-    def _recovered(self, recover: Callable[..., Result], *arrays: np.ndarray) -> Result:
-        """What a traced function makes of the outcome of the last stage."""
-        with jax.enable_x64(self.functional_map.dtype == np.float64):  # as when it was computed
-            return compiled(recover)(
-                self.stages[-1].refiner,
-                self.refinement.updated,
-                self.spectrum_x,
-                self.spectrum_y,
-                *jax.device_put(arrays),
+    def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+        """Points in which matches lie close together; unused vertices of X lie where the nearest do."""
+        with self._precision():
+            queries, database = compiled(_embeddings)(
+                self.stages[-1].refiner, self.refinement.updated, self.spectrum_x, self.spectrum_y
             )
+            return jax.device_put(_extend_to_unused(self.mesh_x, np.asarray(queries))), database
+
+    def _precision(self) -> AbstractContextManager[None]:
+        """As when the map was computed."""
+        return jax.enable_x64(self.functional_map.dtype == np.float64)
 
 
-def _way_back(refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Int[Array, " n"]:
-    queries, database = refiner.embeddings(refiner.prepare(spectrum_x, spectrum_y), updated)
+def _way_back(
+    queries: Float[Array, "m d"], database: Float[Array, "n d"], spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> Int[Array, " n"]:
+    """The nearest vertex of X to each of Y, among points whose first coordinates depend on eigenvectors."""
     patches = chosen_patches("auto", spectrum_y, spectrum_x)
     if patches is None:
         return nearest_neighbor(database, queries, database_mask=spectrum_x.mask)
@@ -139,11 +207,10 @@ def _way_back(refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: 
     return nearest_neighbor_in_patches(database[:, :k], queries[:, :k], *patches)
 
 
-def _points_on_triangles(
-    refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: Spectrum, faces_y: Int[Array, "f 3"]
-) -> tuple[Int[Array, " m"], Float[Array, "m 3"]]:
-    queries, database = refiner.embeddings(refiner.prepare(spectrum_x, spectrum_y), updated)
-    return nearest_point_on_triangles(queries, database, faces_y)
+def _embeddings(
+    refiner: Refiner, updated: Any, spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    return refiner.embeddings(refiner.prepare(spectrum_x, spectrum_y), updated)
 
 
 def match(

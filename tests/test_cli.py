@@ -11,6 +11,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw.cli import _BANKS, _NOT_TIGHT, main
@@ -19,6 +20,7 @@ from jaxsmw.core.frames import frame_bounds
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.report.texture import TEXTURE_FILES
 
 SMALL = ["--eigenvectors", "20", "--filters", "4"]
 
@@ -343,7 +345,7 @@ def test_the_expected_error_is_written(run, pair, tmp_path):
     assert run(*call, "--expected-error", tmp_path / "expected.txt").code == 0
     expected = np.loadtxt(tmp_path / "expected.txt")
     assert expected.shape == (642,) and expected.min() >= 0 and expected.mean() < 0.02
-    assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="is named for two outputs")
+    assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="another output as well")
 
 
 @pytest.mark.parametrize(
@@ -352,7 +354,7 @@ def test_the_expected_error_is_written(run, pair, tmp_path):
         ("points.txt", "ends in it"),
         ("missing/points.baryc_gt", "missing"),
         ("truth.baryc_gt", "is an input"),
-        ("map.baryc_gt", "is named for two outputs"),
+        ("map.baryc_gt", "another output as well"),
         ("start.baryc_gt", "is an input"),
     ],
 )
@@ -364,6 +366,52 @@ def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault)
     assert_refused(run(*call, "--surface-points", tmp_path / name), naming=fault)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["start.baryc_gt", "truth.baryc_gt"]
     assert (tmp_path / "start.baryc_gt").read_text() == "0\n" * 642
+
+
+def test_one_to_one_map_and_texture_are_written(run, pair, tmp_path):
+    x, y, points = pair / "x.off", pair / "y.ply", tmp_path / "points.baryc_gt"
+    call = ["match", x, y, "--output", tmp_path / "map.txt", *SMALL, "--ground-truth", pair / "truth.txt"]
+    call += ["--one-to-one", tmp_path / "one.txt", "--texture", tmp_path / "texture"]
+    outcome = run(*call, "--surface-points", points)
+    assert outcome.code == 0, outcome.errors
+    assert "one-to-one map: " in outcome.output
+    one_to_one = np.loadtxt(tmp_path / "one.txt", dtype=int)
+    np.testing.assert_array_equal(np.sort(one_to_one), np.arange(642))
+
+    directory = tmp_path / "texture"
+    assert {path.name for path in directory.iterdir()} == set(TEXTURE_FILES)
+    meshes, coordinates = {}, {}
+    for name, path in (("source", x), ("target", y)):
+        original, meshes[name] = read_mesh(path), read_mesh(directory / f"{name}.obj")
+        np.testing.assert_array_equal(meshes[name].vertices, original.vertices)
+        np.testing.assert_array_equal(meshes[name].faces, original.faces)
+        loaded = trimesh.load(directory / f"{name}.obj", process=False, maintain_order=True)
+        assert loaded.visual.material.image.size == (1024, 1024)
+        coordinates[name] = loaded.visual.uv
+        assert loaded.visual.uv.min() >= 0 and loaded.visual.uv.max() <= 1
+        np.testing.assert_allclose(loaded.vertices, original.vertices, atol=1e-8)
+    # The same point of the body has the same point of the picture.
+    carried = read_ground_truth(points, meshes["source"], meshes["target"]).targets
+    faces, weights = meshes["target"].faces[carried.faces], carried.weights
+    expected = np.einsum("pk,pku->pu", weights, coordinates["target"][faces])
+    np.testing.assert_allclose(coordinates["source"], expected, atol=1e-6)
+
+
+def test_one_to_one_map_that_does_not_exist_is_refused_at_once(run, pair, tmp_path):
+    write_mesh(tmp_path / "small.off", bumpy_mesh(2))
+    call = ["match", pair / "x.off", tmp_path / "small.off", "--output", tmp_path / "map.txt", *SMALL]
+    outcome = run(*call, "--quiet", "--one-to-one", tmp_path / "one.txt")
+    assert_refused(outcome, naming="642 vertices of the source cannot be matched one to one to the 162")
+    assert not (tmp_path / "map.txt").exists()
+
+
+def test_outputs_of_one_name_are_refused(run, pair, tmp_path):
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "source.obj", *SMALL]
+    assert_refused(run(*call, "--one-to-one", tmp_path / "source.obj"), naming="another output as well")
+    assert_refused(run(*call, "--texture", tmp_path), naming="another output as well")
+    (tmp_path / "target.obj").write_text("v 0 0 0\n")
+    call = ["match", pair / "x.off", tmp_path / "target.obj", "--output", tmp_path / "map.txt", *SMALL]
+    assert_refused(run(*call, "--texture", tmp_path), naming="is an input")
 
 
 OFF = "OFF\n{} {} 0\n{}\n{}\n"

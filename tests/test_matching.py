@@ -402,3 +402,34 @@ def test_unused_vertices_get_surface_points_and_expected_errors(pair):
     assert len(points) == len(extra.vertices)
     assert points.faces[-1] == points.faces[0]
     np.testing.assert_array_equal(points.weights[-1], points.weights[0])
+
+
+def test_unused_vertices_share_matches_one_to_one(pair):
+    mesh_x, mesh_y, truth = pair
+    extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
+    result = match(extra, mesh_y, **OPTIONS)
+    found = result.one_to_one()
+    assert found.dtype == np.int64 and found[-1] == found[0]
+    np.testing.assert_array_equal(np.sort(found[:-1]), np.arange(len(truth)))
+    # On the same triangulation no vertex needs to go astray.
+    assert mean_error(mesh_y, found[:-1], truth) <= mean_error(mesh_y, result.pointwise_map[:-1], truth)
+    with pytest.raises(InputError, match=r"2562 vertices of the source .* 642 .* swap"):
+        match(mesh_x, bumpy_mesh(3), **OPTIONS).one_to_one()
+
+
+def test_soft_map_carries_positions(pair):
+    mesh_x, mesh_y, truth = pair
+    extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
+    result = match(extra, mesh_y, **OPTIONS)
+    soft = result.soft_map()
+    assert bool(soft.converged) and float(soft.residual) <= 0.05
+    carried = np.asarray(soft.pull_back(mesh_y.vertices))
+    errors = np.linalg.norm(carried[:-1] - mesh_y.vertices[truth], axis=1) / mesh_y.area**0.5
+    assert np.median(errors) < 0.02
+    np.testing.assert_array_equal(carried[-1], carried[0])
+    assert mean_error(mesh_y, np.asarray(soft.pointwise_map())[:-1], truth) < 0.02
+    with pytest.warns(UserWarning, match="unfinished: after 1 iterations"):
+        result.soft_map(iterations=1, tolerance=1e-9)
+    for settings in ({"temperature": 0.0}, {"temperature": np.nan}, {"iterations": 0}):
+        with pytest.raises(InputError, match="is none"):
+            result.soft_map(**settings)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
 from jaxsmw.core.products import product
 
@@ -63,15 +63,16 @@ def nearest_neighbor(
 
 
 def in_blocks(
-    search: Callable[[Float[Array, "block d"]], Int32[Array, " block"]],
+    search: Callable[[Float[Array, "block d"]], Shaped[Array, "block ..."]],
     queries: Float[Array, "m d"],
     size: int,
-) -> Int32[Array, " m"]:
+) -> Shaped[Array, "m ..."]:
     """What a search finds for all queries, given to it so many at a time; to the last zeros are added."""
     m, d = queries.shape
     blocks = -(-m // size)
     padded = jnp.pad(queries, ((0, blocks * size - m), (0, 0)))
-    return lax.map(search, padded.reshape(blocks, size, d)).reshape(-1)[:m]
+    found = lax.map(search, padded.reshape(blocks, size, d))
+    return found.reshape(blocks * size, *found.shape[2:])[:m]
 
 
 def _two_best(scores: Float[Array, "s block"]) -> Int[Array, "2 block"]:

@@ -1,0 +1,75 @@
+"""Two meshes that wear one picture, for any viewer of OBJ files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from matplotlib.image import imsave
+
+from jaxsmw.files import atomic_write
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mesh import Mesh
+
+TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
+"""What `write_textured_pair` writes."""
+
+_MATERIAL = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.png\n"
+# Pixels of the picture's side, and squares along it.
+_PIXELS, _SQUARES = 1024, 32
+
+
+def write_textured_pair(
+    directory: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints
+) -> None:
+    """Write `source.obj` and `target.obj` with the same checkered picture on both (`TEXTURE_FILES`).
+
+    The target wears it as projected along the shortest of its principal axes: without seams, front and back
+    alike. The source's texture coordinates are those of the points that its vertices are mapped to.
+
+    **Arguments:**
+
+    - `directory`: an existing one; files of these names in it are replaced, each whole or not at all.
+    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
+    - `points`: for every vertex of X a point of Y, for example `Correspondence.surface_points()`.
+
+    **Raises:** `InputError` if a file cannot be written.
+    """
+    on_target = _projection(mesh_y)
+    on_source = np.einsum("pk,pku->pu", points.weights, on_target[mesh_y.faces[points.faces]])
+    picture, material, target, source = (Path(directory) / name for name in TEXTURE_FILES)
+    with atomic_write(picture) as temporary:
+        imsave(temporary, _checkered(), origin="lower")
+    with atomic_write(material) as temporary:
+        temporary.write_text(_MATERIAL, "ascii")
+    for path, mesh, coordinates in ((target, mesh_y, on_target), (source, mesh_x, on_source)):
+        with atomic_write(path) as temporary:
+            temporary.write_text(_obj(mesh, coordinates), "ascii")
+
+
+def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
+    """Coordinates along the two longest principal axes, those of the surface from 0 to at most 1."""
+    used = mesh.vertices[mesh.used_vertices]
+    _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
+    # Whatever signs they came with.
+    longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
+    flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)
+    return (flat - low) / np.ptp(used @ longest.T, axis=0).max()
+
+
+def _checkered() -> Float64[np.ndarray, "h w 3"]:
+    """Squares, light and dark by turns, whose colour tells where in the picture they are."""
+    row, column = np.mgrid[:_PIXELS, :_PIXELS] * _SQUARES // _PIXELS
+    across, up = column / (_SQUARES - 1), row / (_SQUARES - 1)
+    colors = np.stack([0.25 + 0.75 * across, 0.25 + 0.75 * up, 1 - 0.75 * across], axis=2)
+    return np.where((row + column)[..., None] % 2, colors, 0.45 * colors)
+
+
+def _obj(mesh: Mesh, coordinates: Float64[np.ndarray, "n 2"]) -> str:
+    lines = ["mtllib texture.mtl", "usemtl texture"]
+    lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u:.9f} {v:.9f}" for u, v in coordinates.tolist()]
+    lines += [f"f {i}/{i} {j}/{j} {k}/{k}" for i, j, k in (mesh.faces + 1).tolist()]
+    return "\n".join([*lines, ""])
