@@ -216,7 +216,7 @@ def test_stages_are_logged(pair, caplog):
         ({"preset": replace(STAGE, number_of_eigenvectors=0)}, "eigenvectors were asked for"),
         ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
         ({"preset": replace(STAGE, number_of_samples=10**6)}, "samples were asked for"),
-        ({"preset": ()}, "give one of paper, accurate, or stages"),
+        ({"preset": ()}, "give one of fast, paper, accurate, or stages"),
         ({"init": "shoot"}, "choose shot"),
         ({"init": [0, 1]}, "has 2 entries"),
         ({"init": np.zeros(2562)}, "must be integer"),
