@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import copy_context
@@ -241,7 +241,8 @@ def match(
       SHOT and commutes with the Laplacian (section 3.2 of the MWP paper), smoother and much less wrong to
       begin with; an array (m,) of vertices of Y for a map of your own;
       an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
-      and in geodesic distance to the landmarks (a few, on both sides of the body).
+      and in geodesic distance to the landmarks (a few, on both sides of the body). After `"shot"` presets
+      that mend try `other_starts`, too, if it looks as if limbs were still swapped.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
     - `history`: record what happened in the last stage; see `jaxsmw.refine`.
@@ -253,7 +254,8 @@ def match(
     went wrong on the way.
     """
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
-    stages = chosen_stages(preset, min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y)))
+    fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
+    stages = chosen_stages(preset, fewest, partial=partial)
     k = max(stage.number_of_eigenvectors for stage in stages)
     compiling = []
     # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
@@ -296,13 +298,17 @@ def match(
     spectra = [stage.view(spectrum_x, spectrum_y, partial=partial) for stage in stages]
     with _stage("refinement", seconds):
         wait(compiling)
-        refinements = refine_in_stages(
+        others: Iterable[Int64[np.ndarray, " m"]] = ()
+        if isinstance(init, str) and init == "shot":
+            others = other_starts(mesh_x, mesh_y, spectrum_x, spectrum_y, partial=partial)
+        refinements, chosen = refine_in_stages(
             spectra,
             jax.device_put(start),
             stages,
             samples,
             meshes=(mesh_x, mesh_y),
             partial=partial,
+            other_starts=map(jax.device_put, others),
             history=history,
         )
         last = jax.block_until_ready(refinements[-1])
@@ -312,7 +318,7 @@ def match(
         mesh_x=mesh_x,
         mesh_y=mesh_y,
         pointwise_map=_extend_to_unused(mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
-        initial_map=start,
+        initial_map=np.asarray(chosen).astype(np.int64),
         functional_map=np.asarray(last.functional_map),
         stages=stages,
         spectrum_x=spectra[-1][0],
@@ -415,6 +421,7 @@ def initial_map(
     spectrum_y: Spectrum,
     *,
     init: Start | ArrayLike = "shot",
+    radii: Sequence[float] = (SHOT_RADIUS,),
     partial: bool = False,
 ) -> Int64[np.ndarray, " m"]:
     """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
@@ -422,6 +429,12 @@ def initial_map(
     The spectra are those of `paired_spectra`, and `partial` is what was said there. On a mesh of more than
     15 000 vertices descriptors are computed and compared at about 10 000 evenly spread ones, and every other
     vertex of X takes the match of the nearest of them.
+
+    **Arguments:**
+
+    - `radii`: of SHOT's neighbourhoods, in square roots of the area; of several the descriptors are put side
+      by side. Wider ones see more of the body, in less detail: they are computed at 2000 evenly spread
+      vertices.
 
     **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
     """
@@ -435,7 +448,8 @@ def initial_map(
     if not isinstance(init, str):
         features_x, features_y = _landmark_features(given, x, y, partial)
     elif init == "shot":
-        features_x, features_y = _shot(x, y, partial)
+        at_radii = [_shot(x, y, partial, radius) for radius in radii]
+        features_x, features_y = (np.hstack(of_shape) for of_shape in zip(*at_radii, strict=True))
     elif init in _SIGNATURES:
         features_x, features_y = (np.asarray(_SIGNATURES[init](side.spectrum)) for side in (x, y))
     elif init == "functional":
@@ -465,6 +479,20 @@ def initial_map(
     return _extend_to_unused(mesh_x, start)
 
 
+def other_starts(
+    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
+) -> Iterator[Int64[np.ndarray, " m"]]:
+    """Initial maps by SHOT of wider neighbourhoods, one by one, for when `init="shot"` fails.
+
+    None is better than that on average. But a pair on which one swaps limbs another often gets right.
+    """
+    for radii in _OTHER_RADII:
+        yield initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, radii=radii, partial=partial)
+
+
+_OTHER_RADII = (SHOT_RADIUS, 2 * SHOT_RADIUS, 4 * SHOT_RADIUS), (2 * SHOT_RADIUS,), (4 * SHOT_RADIUS,)
+
+
 class _Thinned(NamedTuple):
     """A shape, or where it has too many vertices to compare all, samples of it; `spectrum` is theirs."""
 
@@ -482,6 +510,8 @@ class _Thinned(NamedTuple):
 # Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
 # ten thousand vertices are plenty.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
+# Descriptors of wider neighbourhoods vary more slowly.
+_SPREAD = 2000
 
 
 def _thinned(
@@ -505,13 +535,18 @@ def _side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[
 
 
 def _shot(
-    x: _Thinned, y: _Thinned, partial: bool
+    x: _Thinned, y: _Thinned, partial: bool, radius: float = SHOT_RADIUS
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
     """SHOT of both shapes at one scale."""
 
     def describe(side: tuple[_Thinned, float]) -> Float[np.ndarray, "n d"]:
         (mesh, samples, _), unit = side
-        return shot_descriptors(mesh, radius=SHOT_RADIUS * unit / mesh.area**0.5, samples=samples)
+        own_radius = radius * unit / mesh.area**0.5
+        if radius <= SHOT_RADIUS or len(mesh.vertices) <= _SPREAD:
+            return shot_descriptors(mesh, radius=own_radius, samples=samples)
+        fewer = spread_samples(mesh, _SPREAD)
+        nearest = fewer.nearest if samples is None else fewer.nearest[samples.vertices]
+        return shot_descriptors(mesh, radius=own_radius, samples=fewer)[nearest]
 
     units = units_of_length(x.mesh, y.mesh, partial)
     return _side_by_side(describe, (x, units[0]), (y, units[1]))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
+from itertools import chain
 from typing import Any, Literal
 
 import jax
@@ -17,8 +19,10 @@ from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreserva
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.faults import reversed_orientation, stretch, torn_off
+from jaxsmw.geometry.faults import flaw, reversed_orientation, torn_off
 from jaxsmw.geometry.mesh import Mesh
+
+logger = logging.getLogger("jaxsmw")
 
 
 @dataclass(frozen=True)
@@ -110,26 +114,35 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 """The MWP authors' fast variant, the paper's setting, and what docs/accuracy.md arrives at."""
 
 
-def chosen_stages(preset: str | Stage | Sequence[Stage], vertices: int) -> tuple[Stage, ...]:
+def chosen_stages(
+    preset: str | Stage | Sequence[Stage], vertices: int, *, partial: bool = False
+) -> tuple[Stage, ...]:
     """The stages of a preset for shapes of at least so many vertices, or one's own as they are.
+
+    **Arguments:**
+
+    - `partial`: whether one shape is a part of the other.
 
     **Raises:** `InputError` if there is no such preset, or no stage.
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
             raise InputError(f"{preset!r} is no preset: choose from {', '.join(PRESETS)}, or give stages.")
-        return tuple(_fitting(stage, vertices) for stage in PRESETS[preset])
+        return tuple(_fitting(stage, vertices, partial) for stage in PRESETS[preset])
     stages = (preset,) if isinstance(preset, Stage) else tuple(preset)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(f"preset is {preset!r}; give one of {', '.join(PRESETS)}, or stages.")
     return stages
 
 
-def _fitting(stage: Stage, vertices: int) -> Stage:
+def _fitting(stage: Stage, vertices: int, partial: bool) -> Stage:
     """A stage with what few vertices can give: eigenvectors up to their half, samples if there are more."""
-    samples = stage.number_of_samples
+    samples, refiner = stage.number_of_samples, stage.refiner
+    if isinstance(refiner, FeatureRegression):
+        refiner = replace(refiner, partial=partial)
     return replace(
         stage,
+        refiner=refiner,
         number_of_eigenvectors=max(1, min(stage.number_of_eigenvectors, vertices // 2)),
         number_of_samples=None if samples is None or samples >= vertices else samples,
     )
@@ -143,14 +156,16 @@ def refine_in_stages(
     *,
     meshes: tuple[Mesh, Mesh] | None = None,
     partial: bool = False,
+    other_starts: Iterable[Int[Array, " m"]] = (),
     history: bool = False,
-) -> list[Refinement]:
-    """Refine by one stage after the other, as long as they go well: the outcome of each.
+) -> tuple[list[Refinement], Int[Array, " m"]]:
+    """Refine by one stage after the other, as long as they go well: the outcome of each, and the start.
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. A stage that is to mend this looks for both
     (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
-    faulty part had no say in. The least stretched map it came by is its outcome.
+    faulty part had no say in. The least flawed map it came by is its outcome. Where that does not help, the
+    stages are gone through from other starts, too.
 
     **Arguments:**
 
@@ -158,8 +173,36 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
+    - `other_starts`: taken one by one if a stage is to mend, until an outcome looks right; the least flawed
+      is returned.
     - `history`: see `jaxsmw.refine`.
     """
+    best, least = None, np.inf
+    for start in chain([pointwise_map], other_starts):
+        refinements = _through(spectra, start, stages, samples, meshes, partial, history)
+        failed = refinements[-1].result != RESULTS.successful
+        if meshes is None or not any(stage.mending for stage in stages) or (failed and best is None):
+            return refinements, start
+        flawed = np.inf if failed else _flaw(refinements[-1], spectra[-1][0], meshes, partial)
+        if flawed < least:
+            best, least = (refinements, start), flawed
+        if least < _SUSPICIOUS:
+            break
+        logger.info("swapped limbs are possible (%.2f)", least)
+    assert best is not None
+    return best
+
+
+def _through(
+    spectra: Sequence[tuple[Spectrum, Spectrum]],
+    pointwise_map: Int[Array, " m"],
+    stages: Sequence[Stage],
+    samples: Samples | None,
+    meshes: tuple[Mesh, Mesh] | None,
+    partial: bool,
+    history: bool,
+) -> list[Refinement]:
+    """The outcomes of all stages, or up to the first that fails."""
     refinements: list[Refinement] = []
     for (spectrum_x, spectrum_y), stage in zip(spectra, stages, strict=True):
         run = partial_function(_run, stage, spectrum_y, samples, history)
@@ -199,7 +242,7 @@ def _mended(
     partial: bool,
     rounds: int,
 ) -> Refinement:
-    """The least stretched of a refinement and of others, each begun without what was faulty in the last."""
+    """The least flawed of a refinement and of others, each begun without what was faulty in the last."""
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
@@ -209,12 +252,12 @@ def _mended(
         lambda found: torn_off(*meshes, found, partial=partial),
     )
     for done in range(rounds + 1):
-        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-        stretched = stretch(*meshes, found, partial=partial)
-        if stretched < least:
-            best, least = refinement, stretched
+        flawed = _flaw(refinement, spectrum_x, meshes, partial)
+        if flawed < least:
+            best, least = refinement, flawed
         if done == rounds:
             return best
+        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
         for criterion in criteria[done % 2 :] + criteria[: done % 2]:
             fault = criterion(found)
             if areas[:m][fault].sum() > _NEGLIGIBLE * areas.sum():
@@ -228,5 +271,13 @@ def _mended(
     return best
 
 
+def _flaw(refinement: Refinement, spectrum_x: Spectrum, meshes: tuple[Mesh, Mesh], partial: bool) -> float:
+    m = len(meshes[0].vertices)
+    found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
+    return flaw(*meshes, found, np.asarray(spectrum_x.eigenvectors)[:m], partial=partial)
+
+
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
+# Maps more flawed than this are looked for a better one.
+_SUSPICIOUS = 1.75

@@ -39,12 +39,15 @@ class FeatureRegression(Refiner):
 
     - `levels`: how many eigenvectors count in each iteration (of the shape with more of them; of the other in
       proportion); after these all of them count.
+    - `partial`: for shapes of which one is a part of the other. Many vertices of the whole have no match on
+      the part: the worse one's match fits, beside the part's on average, the less it counts.
     - `search`: how the last matches are found, among all vertices. `"exhaustive"` compares all with all;
       `"patches"` leaves out patches of the target that are too far away, for which it looks at what
       eigenvectors say alone; `"auto"` does that on CPUs from 15 000 vertices.
     """
 
     levels: tuple[int, ...] = eqx.field(static=True, default=())
+    partial: bool = eqx.field(static=True, default=False)
     search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
@@ -74,12 +77,19 @@ class FeatureRegression(Refiner):
         """Regress along the matches, and along those of the way back, which `previous` gives as well."""
         x, y, all_x, all_y, _ = problem.prepared
         iteration = jnp.asarray(0, jnp.int32)
-        moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
-        if previous is not None:
+        if previous is None:
+            moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
+        else:
             iteration = previous.iteration + 1
             way_back = previous.backward.search(y, all_x)
-            back = _Moments.along(all_x.values[way_back], y.values, y.weights)
-            moments = _Moments(*((a + b) / 2 for a, b in zip(moments, back, strict=True)))
+            weights_x, weights_y = x.weights, y.weights
+            if self.partial:
+                residuals_x = previous.forward.residuals(x, all_y, pointwise_map)
+                residuals_y = previous.backward.residuals(y, all_x, way_back)
+                weights_x, weights_y = _doubted(weights_x, residuals_x, weights_y, residuals_y)
+            forth = _Moments.along(x.values, all_y.values[pointwise_map], weights_x)
+            back = _Moments.along(all_x.values[way_back], y.values, weights_y)
+            moments = _Moments(*((a + b) / 2 for a, b in zip(forth, back, strict=True)))
         sizes = problem.spectrum_x.eigenvalues.shape[0], problem.spectrum_y.eigenvalues.shape[0]
         counts_x, counts_y = (self._counts(iteration, size, max(sizes)) for size in sizes)
         functional_map, forward = _regress(moments, counts_x, counts_y)
@@ -163,6 +173,13 @@ class Prediction(NamedTuple):
         """The likeliest matches."""
         return nearest_neighbor(*self.embeddings(asking, answering), database_mask=answering.mask)
 
+    def residuals(
+        self, asking: _Features, answering: _Features, matches: Int[Array, " m"]
+    ) -> Float[Array, " m"]:
+        """Squared distances of matches."""
+        queries, database = self.embeddings(asking, answering)
+        return jnp.sum((queries - database[matches]) ** 2, axis=1)
+
 
 class Regression(NamedTuple):
     """What `FeatureRegression` hands on: a functional map, and predictions of X by Y and of Y by X."""
@@ -190,6 +207,22 @@ class _Moments(NamedTuple):
     @property
     def turned(self) -> _Moments:
         return _Moments(self.yy, self.xy.T, self.xx)
+
+
+def _doubted(
+    weights_x: Float[Array, " m"],
+    residuals_x: Float[Array, " m"],
+    weights_y: Float[Array, " n"],
+    residuals_y: Float[Array, " n"],
+) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
+    """Weights where that of the shape whose matches fit worse, the whole, falls with their residuals."""
+    mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
+
+    def doubt(weights: Array, residuals: Array, mean: Array, other: Array) -> Array:
+        falling = weights / (1 + (residuals / other) ** 2)
+        return jnp.where(mean > other, falling / jnp.sum(falling), weights)
+
+    return doubt(weights_x, residuals_x, mean_x, mean_y), doubt(weights_y, residuals_y, mean_y, mean_x)
 
 
 def _regress(

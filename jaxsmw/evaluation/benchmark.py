@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -49,7 +49,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import Start, describe, initial_map, paired_spectra
+from jaxsmw.matching import Start, describe, initial_map, other_starts, paired_spectra
 from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
@@ -377,6 +377,11 @@ def prepare_pair(
     def padded(pointwise_map: Int64[np.ndarray, " m"], size: int) -> Int[Array, " p"]:
         return jnp.asarray(np.pad(pointwise_map, (0, size - len(pointwise_map))), jnp.int32)
 
+    def others() -> Iterator[Int[Array, " p"]]:
+        if init == "shot":
+            for other in other_starts(*meshes, *spectra, partial=data.partial):
+                yield padded(other, sizes[0])
+
     samples = (
         jnp.asarray(farthest_point_samples(mesh, min(MOST_SAMPLES, int(mesh.used_vertices.sum()))))
         for mesh in meshes
@@ -390,6 +395,7 @@ def prepare_pair(
         meshes,
         data.names,
         data.partial,
+        others,
     )
 
 

@@ -6,7 +6,7 @@ Every method takes a prepared pair, with the same spectra and the same start, an
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.evaluation.partial_functional_maps import SurfaceGradient, partial_functional_map
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.presets import PRESETS, Stage, refine_in_stages
+from jaxsmw.presets import PRESETS, Preset, Stage, chosen_stages, refine_in_stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,7 @@ class PreparedPair:
     - `meshes`: X and Y, for methods that look at edges.
     - `names`: of X and Y, for maps on files.
     - `partial`: whether one shape is a part of the other, so that spectra only have a range in common.
+    - `other_starts`: computes further ones, one by one, for methods that doubt the first.
     """
 
     spectrum_x: Spectrum
@@ -55,6 +56,7 @@ class PreparedPair:
     meshes: tuple[Mesh, Mesh] | None = None
     names: tuple[str, str] = ("X", "Y")
     partial: bool = False
+    other_starts: Callable[[], Iterable[Int[Array, " m"]]] = tuple
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """Both spectra as a stage sees them; of a partial pair with the eigenvectors in common."""
@@ -183,31 +185,39 @@ class Refined(Method):
 
 
 @dataclass(frozen=True)
-class InStages(Method):
-    """One of `jaxsmw.presets`."""
+class Chosen(Method):
+    """One of `jaxsmw.PRESETS`."""
 
     reference: str
-    stages: tuple[Stage, ...]
+    preset: Preset
 
     @property
     def number_of_eigenvectors(self) -> int:  # type: ignore[override]
         """That of the stage with most of them."""
-        return max(stage.number_of_eigenvectors for stage in self.stages)
+        return max(stage.number_of_eigenvectors for stage in PRESETS[self.preset])
 
     @property
     def number_of_descriptors(self) -> int:  # type: ignore[override]
         """That of the stage with most of them."""
-        return max(stage.number_of_descriptors for stage in self.stages)
+        return max(stage.number_of_descriptors for stage in PRESETS[self.preset])
 
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
-        return _refined(pair, *self.stages)
+        fewest = min(int(spectrum.mask.sum()) for spectrum in (pair.spectrum_x, pair.spectrum_y))
+        return _refined(pair, *chosen_stages(self.preset, fewest, partial=pair.partial))
 
 
 def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESULTS]:
     spectra = [pair.seen_in(stage) for stage in stages]
-    refined = refine_in_stages(
-        spectra, pair.start, stages, pair.samples, meshes=pair.meshes, partial=pair.partial
-    )[-1]
+    refinements, _ = refine_in_stages(
+        spectra,
+        pair.start,
+        stages,
+        pair.samples,
+        meshes=pair.meshes,
+        partial=pair.partial,
+        other_starts=pair.other_starts(),
+    )
+    refined = refinements[-1]
     return refined.pointwise_map, refined.result
 
 
@@ -302,7 +312,7 @@ MOST_SAMPLES = 1000
 METHODS: dict[str, Method] = {
     "start": Start("nearest neighbours of the descriptors, from which all others start"),
     "mwp": Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations"),
-    "accurate": InStages("this library's preset, from the outcome of mwp", PRESETS["accurate"]),
+    "accurate": Chosen("this library's preset, from the outcome of mwp", "accurate"),
     "mwp-sampled": Refined("Hu, Li, Liu, Liu 2021: the same on 500 samples", number_of_samples=500),
     "no-filter": Refined("MWP without filters: k = 100, 3 iterations", _UNFILTERED),
     "icp": Refined(

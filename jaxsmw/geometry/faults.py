@@ -13,6 +13,7 @@ from jaxsmw.geometry.mesh import Mesh, connected_pieces, units_of_length
 _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
+_WEIGHT_OF_REVERSED = 4
 # What `expected_error` thinks of a vertex on a limb that is swapped, in square roots of the area.
 _MISPLACED = 0.3
 # The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
@@ -29,6 +30,24 @@ def stretch(
     """
     before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map, partial)
     return float(np.sum(after**2) / np.sum(before**2))
+
+
+def flaw(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_map: Int64[np.ndarray, " m"],
+    eigenvectors_x: Float[np.ndarray, "m k"],
+    *,
+    partial: bool = False,
+) -> float:
+    """How bad a map looks: its `stretch`, the more so the more of X has `reversed_orientation`.
+
+    Stretch alone would have a body mapped to its mirror image rather than one leg to the other. Good maps
+    between bodies of one kind have 1.3 to 2, those that swap limbs more.
+    """
+    reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors_x, partial=partial)
+    share = mesh_x.vertex_areas[reversed_].sum() / mesh_x.area
+    return stretch(mesh_x, mesh_y, pointwise_map, partial=partial) * (1 + _WEIGHT_OF_REVERSED * share)
 
 
 def torn_off(
