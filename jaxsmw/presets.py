@@ -260,7 +260,7 @@ def _mended(
         found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
         for criterion in criteria[done % 2 :] + criteria[: done % 2]:
             fault = criterion(found)
-            if areas[:m][fault].sum() > _NEGLIGIBLE * areas.sum():
+            if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH:
                 break
         else:
             return best
@@ -279,5 +279,7 @@ def _flaw(refinement: Refinement, spectrum_x: Spectrum, meshes: tuple[Mesh, Mesh
 
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
+# What is left of a body turned round as a whole is no help.
+_TOO_MUCH = 0.5
 # Maps more flawed than this are looked for a better one.
 _SUSPICIOUS = 1.75

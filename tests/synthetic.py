@@ -68,3 +68,11 @@ def bumpy_mesh(subdivisions: int = 4) -> Mesh:
     vertices, faces = sphere_mesh(subdivisions)
     waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
     return make_mesh(vertices * (1 + waves)[:, None], faces)
+
+
+def body_with_arms() -> Mesh:
+    """That sphere with an arm to the left and one to the right."""
+    sphere = bumpy_mesh(4)
+    directions = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
+    length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))
+    return make_mesh(directions * length[:, None], sphere.faces)

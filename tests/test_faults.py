@@ -3,20 +3,17 @@
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from synthetic import bumpy_mesh
+from synthetic import body_with_arms, bumpy_mesh
 
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.faults import expected_error, reversed_orientation, stretch, torn_off
+from jaxsmw.geometry.faults import expected_error, flaw, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
 
 
 @pytest.fixture(scope="module")
 def body():
     """A sphere with an arm to the left and one to the right, and its eigenvectors."""
-    sphere = bumpy_mesh(4)
-    directions = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
-    length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))
-    mesh = make_mesh(directions * length[:, None], sphere.faces)
+    mesh = body_with_arms()
     return mesh, np.asarray(compute_spectrum(mesh, 60).eigenvectors)
 
 
@@ -59,9 +56,10 @@ def test_swapped_limbs_are_torn_off_and_reversed(body):
     assert off[arms].all() and not off[~arms].any()
     reversed_ = reversed_orientation(mesh, mesh, swapped, eigenvectors)
     assert reversed_[arms].mean() > 0.8 and reversed_[~arms].mean() < 0.05
-    assert stretch(mesh, mesh, swapped) > 1.2
+    assert flaw(mesh, mesh, swapped, eigenvectors) > stretch(mesh, mesh, swapped) > 1.2
     mirror_image = reversed_orientation(mesh, mesh, mirrored, eigenvectors)
     assert mirror_image.mean() > 0.95
+    assert flaw(mesh, mesh, mirrored, eigenvectors) > 3 * stretch(mesh, mesh, mirrored)
 
 
 def test_coarse_meshes_are_not_torn_by_their_own_edges():

@@ -1,5 +1,7 @@
 """Refinement by regression of features."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -53,14 +55,24 @@ def predicted(moments_xx, moments_xy, moments_yy):
     return matrix, np.linalg.inv(residual + 0.03 * np.eye(len(residual)))
 
 
-def test_is_what_its_definition_says(pair):
+@pytest.mark.parametrize("partial", [False, True], ids=["whole", "part"])
+def test_is_what_its_definition_says(pair, partial):
     """Two turns, written out without whitening, masks or blocks."""
     x, y, start, _ = pair
     a, b = features(x), features(y)
     w_x, w_y = (np.asarray(s.vertex_areas / s.vertex_areas.sum()) for s in (x, y))
     t = np.asarray(start)
-    there, back = slice(None), None
+    back = None
     for _ in range(2):
+        if partial and back is not None:
+            forth_squared = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t] ** 2
+            back_squared = (
+                cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back)[np.arange(M), back] ** 2
+            )
+            # Here the way back fits worse.
+            assert w_x @ forth_squared < w_y @ back_squared
+            w_y = w_y / (1 + (back_squared / (w_x @ forth_squared)) ** 2)
+            w_y /= w_y.sum()
         xx, xy, yy = (p.T @ (w_x[:, None] * q) for p, q in ((a, a), (a, b[t]), (b[t], b[t])))
         if back is not None:
             pairs = (a[back], a[back]), (a[back], b), (b, b)
@@ -68,10 +80,10 @@ def test_is_what_its_definition_says(pair):
                 (m + p.T @ (w_y[:, None] * q)) / 2 for m, (p, q) in zip((xx, xy, yy), pairs, strict=True)
             )
         matrix, precision = predicted(xx, xy, yy)
-        t = cdist(a[there], b @ matrix.T, "mahalanobis", VI=precision).argmin(axis=1)
+        t = cdist(a, b @ matrix.T, "mahalanobis", VI=precision).argmin(axis=1)
         matrix_back, precision_back = predicted(yy, xy.T, xx)
         back = cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back).argmin(axis=1)
-    found = refine(x, y, start, refiner=FeatureRegression(), iterations=2, history=True)
+    found = refine(x, y, start, refiner=FeatureRegression(partial=partial), iterations=2, history=True)
     np.testing.assert_array_equal(found.pointwise_map, t)
     np.testing.assert_allclose(found.functional_map, matrix[:K, :K], atol=1e-10)
     distances = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t]
@@ -89,6 +101,34 @@ def test_mends_a_copy_whose_features_are_mixed(pair):
     assert np.mean(np.asarray(blind.pointwise_map) == truth) < np.mean(
         np.asarray(found.pointwise_map) == truth
     )
+
+
+@pytest.mark.parametrize("swapped", [False, True], ids=["part to whole", "whole to part"])
+def test_what_a_part_lacks_has_no_say(pair, swapped):
+    """Of Y all is there, of X a third: its map comes out better where the others count less."""
+    x, y, start, truth = pair
+    third = M // 3
+    generator = np.random.default_rng(3)
+    scattered = jnp.asarray(generator.integers(0, M, M), jnp.int32)
+    start = jnp.where(generator.random(M) < 0.5, scattered, start)
+    noise = 0.4 * generator.normal(size=(M, K))
+    y = replace(y, eigenvectors=y.eigenvectors + noise, descriptors=y.descriptors + noise[:, :D])
+    part = Spectrum(
+        x.eigenvalues, x.eigenvectors[:third], x.vertex_areas[:third], x.mask[:third], x.descriptors[:third]
+    )
+    shapes, begin = (part, y), start[:third]
+    if swapped:
+        back = np.random.default_rng(1).integers(0, third, M)
+        known = truth[:third]
+        back[known] = np.where(np.random.default_rng(2).random(third) < 0.4, back[known], np.arange(third))
+        shapes, begin = (y, part), jnp.asarray(back, jnp.int32)
+
+    def right(partial):
+        found = refine(*shapes, begin, refiner=FeatureRegression(partial=partial), iterations=5)
+        found = np.asarray(found.pointwise_map)
+        return np.mean(found[truth[:third]] == np.arange(third) if swapped else found == truth[:third])
+
+    assert right(True) > 0.7 and right(True) > right(False) + 0.05
 
 
 def test_levels_are_truncated_spectra(pair):

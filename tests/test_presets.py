@@ -1,0 +1,77 @@
+"""Stages one after the other, from one start or several."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from synthetic import body_with_arms
+
+from jaxsmw.core.feature_regression import FeatureRegression
+from jaxsmw.core.results import RESULTS
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.faults import flaw
+from jaxsmw.presets import Stage, refine_in_stages
+
+STAGE = Stage(FeatureRegression((20, 20, 40, 40)), 40, iterations=4)
+MENDING = replace(STAGE, mending=3)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """The mesh, what stages see of it and itself, and a map of it to itself that swaps its arms."""
+    mesh = body_with_arms()
+    spectrum = compute_spectrum(mesh, 40)
+    _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    arms = np.abs(mesh.vertices[:, 0]) > 1
+    swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
+    return mesh, (spectrum, spectrum), jnp.asarray(swapped, jnp.int32)
+
+
+def outcome(body, stages, start, **options):
+    mesh, spectra, _ = body
+    found, chosen = refine_in_stages([spectra] * len(stages), start, stages, meshes=(mesh, mesh), **options)
+    assert found[-1].result == RESULTS.successful
+    wrong = np.asarray(found[-1].pointwise_map) != np.arange(len(mesh.vertices))
+    return mesh.vertex_areas[wrong].sum() / mesh.area, chosen
+
+
+def test_swapped_limbs_are_mended(body):
+    assert outcome(body, [STAGE], body[2])[0] > 0.1
+    assert outcome(body, [MENDING], body[2])[0] < 0.02
+
+
+def test_padding_changes_nothing(body):
+    mesh, (spectrum, _), swapped = body
+    found, _ = refine_in_stages([(spectrum, spectrum)], swapped, [MENDING], meshes=(mesh, mesh))
+    n = len(mesh.vertices)
+    padded = spectrum.pad(n + 20)
+    more, _ = refine_in_stages([(padded, padded)], jnp.pad(swapped, (0, 20)), [MENDING], meshes=(mesh, mesh))
+    np.testing.assert_array_equal(more[0].pointwise_map[:n], found[0].pointwise_map)
+
+
+def test_another_start_helps_where_mending_does_not(body):
+    """With no round to mend in; and the start that did it is told."""
+    mesh, (spectrum, _), swapped = body
+    stage = replace(STAGE, mending=1)
+    # Nothing is left to tell the arms apart by: all that mending could keep is turned round.
+    _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    start, identity = jnp.asarray(turned, jnp.int32), jnp.arange(len(mesh.vertices), dtype=jnp.int32)
+    assert flaw(mesh, mesh, turned, np.asarray(spectrum.eigenvectors)) > 3
+    wrong, chosen = outcome(body, [stage], start, other_starts=[swapped, identity])
+    assert wrong < 0.02 and chosen is not start
+    alone, _ = outcome(body, [stage], start)
+    assert alone > 0.5
+
+
+def test_no_other_start_is_asked_for_without_need(body):
+    def none():
+        raise AssertionError("a start was asked for")
+        yield
+
+    identity = jnp.arange(len(body[0].vertices), dtype=jnp.int32)
+    wrong, chosen = outcome(body, [MENDING], identity, other_starts=none())
+    assert wrong < 0.02 and chosen is identity
+    # Nor by stages that do not mend.
+    outcome(body, [STAGE], body[2], other_starts=none())
