@@ -165,7 +165,7 @@ def refine_in_stages(
     left and right, and for where it joins the body. A stage that is to mend this looks for both
     (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
     faulty part had no say in. The least flawed map it came by is its outcome. Where that does not help, the
-    stages are gone through from other starts, too.
+    stages are gone through from other starts, too. Maps that look right are let be.
 
     **Arguments:**
 
@@ -255,7 +255,7 @@ def _mended(
         flawed = _flaw(refinement, spectrum_x, meshes, partial)
         if flawed < least:
             best, least = refinement, flawed
-        if done == rounds:
+        if done == rounds or flawed < _SUSPICIOUS:
             return best
         found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
         for criterion in criteria[done % 2 :] + criteria[: done % 2]:
@@ -281,5 +281,5 @@ def _flaw(refinement: Refinement, spectrum_x: Spectrum, meshes: tuple[Mesh, Mesh
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# Maps more flawed than this are looked for a better one.
+# What is less flawed than this looks right.
 _SUSPICIOUS = 1.75
