@@ -557,7 +557,8 @@ def _preset(options: argparse.Namespace) -> Any:
     if options.preset != "paper":
         option = changes[0].replace("_", "-")
         raise InputError(
-            f"--{option}: changes the paper's method: leave it out, or --preset {options.preset}."
+            f"--{option}: changes the paper's method, which --preset {options.preset} is not: leave one of "
+            "them out."
         )
     from jaxsmw.core.refinement import WaveletPreservation
     from jaxsmw.presets import Stage
@@ -680,7 +681,14 @@ def _match_outputs(options: argparse.Namespace) -> list[str]:
     if options.texture:
         from jaxsmw.report.texture import TEXTURE_FILES
 
-        paths += [os.path.join(options.texture, name) for name in TEXTURE_FILES]
+        paths += [os.path.join(options.texture, name) for name in ("", *TEXTURE_FILES)]
+    if options.report:
+        from jaxsmw.report.summary import REPORT_FILES
+
+        inside = [os.path.join(options.report, name) for name in REPORT_FILES]
+        # One directory may be for both.
+        same = options.texture and os.path.realpath(options.report) == os.path.realpath(options.texture)
+        paths += inside if same else [options.report, *inside]
     for position, path in enumerate(paths):
         if os.path.realpath(path) in map(os.path.realpath, paths[:position]):
             raise InputError(f"{path}: is another output as well: choose another name for one of them.")

@@ -122,9 +122,7 @@ class Correspondence:
         found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.used_vertices)
         return _extend_to_unused(self.mesh_x, found)
 
-    def soft_map(
-        self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.05
-    ) -> SoftMap:
+    def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """How the area of X is spread over Y, every vertex of which gets its share; see `jaxsmw.sinkhorn`.
 
         For functions to be carried from Y to X smoothly (`SoftMap.pull_back`), and for a pointwise map that
@@ -242,7 +240,7 @@ def match(
       begin with; an array (m,) of vertices of Y for a map of your own;
       an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
       and in geodesic distance to the landmarks (a few, on both sides of the body). After `"shot"` presets
-      that mend try `other_starts`, too, if it looks as if limbs were still swapped.
+      that mend try `jaxsmw.matching.other_starts`, too, if it looks as if limbs were still swapped.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
     - `history`: record what happened in the last stage; see `jaxsmw.refine`.
@@ -364,7 +362,8 @@ def paired_spectra(
     the other the larger is, and the other by the same factor; then both are cut where the first of them
     ends (`jaxsmw.presets.common_range`), so that k_X and k_Y differ.
 
-    **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`).
+    **Raises:** `InputError` if one cannot be computed (see `jaxsmw.compute_spectrum`), or a part would be too
+    small to be one.
     """
     if eigensolver == "auto":  # the same for both, whose spectra are compared
         eigensolver = choose_eigensolver(mesh_x, mesh_y)
@@ -378,6 +377,11 @@ def paired_spectra(
     if not partial:
         return spectrum_x, spectrum_y
     larger = max(mesh_x.area, mesh_y.area)
+    if min(mesh_x.area, mesh_y.area) < _SMALLEST_PART * larger:
+        raise InputError(
+            f"{mesh_x.name} has area {mesh_x.area:.3g} and {mesh_y.name} {mesh_y.area:.3g}, so neither is a "
+            "part of the other in the same unit of length: scale one of them."
+        )
     return common_range(spectrum_x.scale(mesh_x.area / larger), spectrum_y.scale(mesh_y.area / larger))
 
 
@@ -510,6 +514,8 @@ class _Thinned(NamedTuple):
 # Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
 # ten thousand vertices are plenty.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
+# A thousandth of a body's area shows nothing of its kind.
+_SMALLEST_PART = 1e-3
 # Descriptors of wider neighbourhoods vary more slowly.
 _SPREAD = 2000
 

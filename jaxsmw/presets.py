@@ -21,6 +21,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.faults import flaw, reversed_orientation, torn_off
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.shot import SHOT_DIMENSION
 
 logger = logging.getLogger("jaxsmw")
 
@@ -58,6 +59,12 @@ class Stage:
             )
         if self.iterations < 1:
             raise InputError(f"{self.iterations} iterations were asked for; at least 1 is needed.")
+        if not 0 <= self.number_of_descriptors <= SHOT_DIMENSION:
+            raise InputError(
+                f"{self.number_of_descriptors} descriptors were asked for; SHOT has {SHOT_DIMENSION}."
+            )
+        if self.mending < 0:
+            raise InputError(f"{self.mending} rounds of mending were asked for; 0 is none.")
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
                 f"{self.number_of_samples} samples cannot tell {self.number_of_eigenvectors} eigenvectors "
@@ -188,7 +195,7 @@ def refine_in_stages(
             best, least = (refinements, start), flawed
         if least < _SUSPICIOUS:
             break
-        logger.info("swapped limbs are possible (%.2f)", least)
+        logger.info("limbs may be swapped (flaw %.2f, below %.2f is good): other starts", flawed, _SUSPICIOUS)
     assert best is not None
     return best
 

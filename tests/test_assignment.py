@@ -4,6 +4,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import assignment
@@ -70,6 +71,10 @@ def test_what_cannot_work_is_refused(generator, monkeypatch):
     one_to_one_map(x, x[:4], mask_x=mask)
     with pytest.raises(InputError, match="NaN or infinity"):
         one_to_one_map(x, np.where(x == x[0, 0], np.inf, x))
+    with pytest.raises((InputError, TypeCheckError), match="mask"):
+        one_to_one_map(x, x, mask_x=mask[:4])
+    with pytest.raises((InputError, TypeCheckError), match=r"dimensions|embedding_y"):
+        one_to_one_map(x, x[:, :2])
     monkeypatch.setattr(assignment, "_LARGEST", 24)
     with pytest.raises(InputError, match="would take"):
         one_to_one_map(x, x)

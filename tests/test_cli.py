@@ -348,6 +348,16 @@ def test_the_expected_error_is_written(run, pair, tmp_path):
     assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="another output as well")
 
 
+def test_the_report_is_no_place_for_the_map(run, pair, tmp_path):
+    call = ["match", pair / "x.off", pair / "y.ply", "--quiet", *SMALL]
+    (tmp_path / "r").mkdir()
+    for output in (tmp_path / "r" / "report.html", tmp_path / "new"):
+        directory = tmp_path / "r" if output.name == "report.html" else output
+        outcome = run(*call, "--output", output, "--report", directory)
+        assert_refused(outcome, naming="is another output as well")
+    assert not (tmp_path / "new").exists() and not list((tmp_path / "r").iterdir())
+
+
 @pytest.mark.parametrize(
     ("name", "fault"),
     [
@@ -523,7 +533,7 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --init map:", "map:"),
         ("match {x} {y} --output {t}/m --init map:{t}/missing.txt", "missing.txt"),
         ("match {x} {y} --output {t}/m --init landmarks:{x}", "x.off"),
-        ("match {x} {y} --output {t}/m --report {x}", "cannot be made a directory"),
+        ("match {x} {y} --output {t}/m --report {x}", "is an input"),
         ("match {x} {y} --output {t}/m --ground-truth {t}/missing.vts {p}/y.vts", "missing.vts"),
         ("match {x} {y} --output {t}/m --ground-truth {p}/x.vts", "half of a pair"),
         ("match {x} {y} --output {t}/m --precision float16", "float16"),

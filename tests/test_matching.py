@@ -279,6 +279,8 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
         ({"refiner": Meyer()}, "refiner"),
         ({"iterations": 0}, "at least 1"),
         ({"number_of_samples": 10}, "cannot tell 100 eigenvectors apart"),
+        ({"number_of_descriptors": 353}, "SHOT has 352"),
+        ({"mending": -1}, "0 is none"),
     ],
     ids=str,
 )
@@ -357,6 +359,15 @@ def test_spectra_of_a_part_keep_the_unit_of_the_whole(part):
     np.testing.assert_array_equal(reverse[1].eigenvalues, x.eigenvalues)
     whole = paired_spectra(mesh_x, mesh_y, 40)
     np.testing.assert_array_equal(whole[0].eigenvalues, own.eigenvalues)
+
+
+def test_a_part_in_another_unit_is_refused(part):
+    mesh_x, mesh_y, _ = part
+    shrunken = make_mesh(mesh_x.vertices / 100, mesh_x.faces, name="x.off")
+    with pytest.raises(
+        InputError, match=r"x.off has area .*, so neither is a part of the other .*: scale one"
+    ):
+        match(shrunken, mesh_y, partial=True)
 
 
 def test_a_part_is_found_in_the_whole(part):

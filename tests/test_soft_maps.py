@@ -194,7 +194,9 @@ def test_rows_that_nothing_would_reach_get_their_share():
 
 def test_numbers_that_went_wrong_do_not_pass_for_convergence():
     (queries, database), areas = points(20, 20)
-    assert not compiled(queries.at[0, 0].set(jnp.nan), database, **areas, iterations=5).converged
+    broken = queries.at[0, 0].set(jnp.nan)
+    assert not compiled(broken, database, **areas, iterations=5).converged
+    assert not sinkhorn(np.asarray(broken), np.asarray(database), **areas, iterations=5).converged
     with pytest.raises(ValueError, match="at least 1 iteration"):
         sinkhorn(queries, database, **areas, iterations=0)
 

@@ -73,11 +73,11 @@ class SoftMap(eqx.Module):
 
 
 def sinkhorn(
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
+    queries: Float[Array | np.ndarray, "m d"],
+    database: Float[Array | np.ndarray, "n d"],
     *,
-    query_areas: Float[Array, " m"],
-    database_areas: Float[Array, " n"],
+    query_areas: Float[Array | np.ndarray, " m"],
+    database_areas: Float[Array | np.ndarray, " n"],
     temperature: float | Float[Array, ""] = 0.3,
     iterations: int = 200,
     tolerance: float | Float[Array, ""] = 0.01,
@@ -109,6 +109,9 @@ def sinkhorn(
     """
     if iterations < 1:
         raise ValueError(f"sinkhorn needs at least 1 iteration, not {iterations}")
+    queries, database, query_areas, database_areas = map(
+        jnp.asarray, (queries, database, query_areas, database_areas)
+    )
     dtype, (m, d) = queries.dtype, queries.shape
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     scale = jnp.asarray(temperature, dtype) * _mean_squared_nearest(queries, database, a, b)

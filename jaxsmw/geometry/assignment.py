@@ -36,8 +36,20 @@ def one_to_one_map(
 
     **Returns:** A vertex of Y for each vertex of X; -1 where masked.
 
-    **Raises:** `InputError` if Y has fewer vertices than X, both have too many, or a point is not finite.
+    **Raises:** `InputError` if Y has fewer vertices than X, both have too many, a point is not finite, or
+    array shapes do not fit.
     """
+    for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):
+        if points.ndim != 2 or (mask is not None and mask.shape != points.shape[:1]):
+            raise InputError(
+                f"embedding_{side} has shape {points.shape}, which does not go with mask_{side}: give a "
+                "point per row, and a mask as long."
+            )
+    if embedding_x.shape[1] != embedding_y.shape[1]:
+        raise InputError(
+            f"the points of X have {embedding_x.shape[1]} dimensions and those of Y {embedding_y.shape[1]}: "
+            "give both in the same space."
+        )
     rows, columns = (
         np.arange(len(points)) if mask is None else np.flatnonzero(mask)
         for points, mask in ((embedding_x, mask_x), (embedding_y, mask_y))

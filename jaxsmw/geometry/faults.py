@@ -14,8 +14,8 @@ _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
 _WEIGHT_OF_REVERSED = 4
-# What `expected_error` thinks of a vertex on a limb that is swapped, in square roots of the area.
-_MISPLACED = 0.3
+# What `expected_error` thinks of a piece that is misplaced as a whole, in square roots of the piece's area.
+_MISPLACED = 0.5
 # The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
 _HEAT_TIME = 1e-3
 
@@ -107,8 +107,8 @@ def expected_error(
 
     Two signs, evened out over the surroundings: how far from where it began one comes back to, there and
     `way_back`; and how much distances between neighbours change. Where limbs are swapped (`torn_off`,
-    `reversed_orientation`) more is expected. docs/accuracy.md tells how well this ranks vertices. A map that
-    is wrong and consistent throughout, as of a body to its mirror image, passes for right.
+    `reversed_orientation`) more is expected, in proportion to their size. docs/accuracy.md tells how well
+    this ranks vertices. A map that is wrong and consistent throughout passes for right.
 
     **Arguments:**
 
@@ -128,7 +128,11 @@ def expected_error(
     heat = np.exp(-_HEAT_TIME * eigenvalues) * (eigenvectors.T @ (areas * (detour + distortion)))
     misplaced = torn_off(mesh_x, mesh_y, pointwise_map, partial=partial)
     misplaced |= reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
-    return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced
+    # The larger a limb is, the farther from its place it can be.
+    inside = misplaced[mesh_x.edges].all(axis=1)
+    number, piece = connected_pieces(mesh_x.edges[inside], m)
+    sizes = np.sqrt(np.bincount(piece, areas, number))[piece]
+    return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced * sizes
 
 
 def _edge_lengths(

@@ -15,7 +15,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples
 
 _AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` counts on the twos
-_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
+SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
@@ -76,7 +76,7 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        descriptors = np.zeros((number, _DIMENSION))
+        descriptors = np.zeros((number, SHOT_DIMENSION))
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
@@ -98,7 +98,7 @@ def shot_descriptors(
 def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
-        f"the SHOT radius of {radius} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
+        f"the SHOT radius of {radius:.3g} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
         "from another map (init='wks', on the command line --init wks)."
     )
 
@@ -140,7 +140,7 @@ def _describe(
             weights = sector_weight * level_weight
             histogram += sp.csc_array((weights, rows, each), (len(histogram), len(center))) @ shares
     shape = len(block), _AZIMUTH, _COSINE, _ELEVATION * _RADIAL
-    descriptors = histogram.reshape(shape).swapaxes(2, 3).reshape(len(block), _DIMENSION)
+    descriptors = histogram.reshape(shape).swapaxes(2, 3).reshape(len(block), SHOT_DIMENSION)
     descriptors[np.bincount(center, minlength=len(block)) < _FEWEST_NEIGHBORS] = 0
     norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
     return descriptors / np.where(norms > 0, norms, 1)

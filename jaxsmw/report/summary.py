@@ -33,6 +33,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+REPORT_FILES = (
+    "report.html",
+    "correspondence.png",
+    "functional_map.png",
+    "filters.png",
+    "quality.png",
+    "summary.json",
+)
+"""What `write_report` may write."""
+
+
 def write_report(
     directory: str | os.PathLike[str],
     correspondence: Correspondence,
@@ -146,7 +157,7 @@ def summarize(
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
-    facts["expected error"] = f"{expected_error.mean():.4f} √area"
+    facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
 
 
