@@ -289,4 +289,4 @@ _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
 # What is less flawed than this looks right.
-_SUSPICIOUS = 1.75
+_SUSPICIOUS = 2.0
