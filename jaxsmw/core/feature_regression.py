@@ -33,7 +33,7 @@ class FeatureRegression(Refiner):
     same is done from Y to X. At first few eigenvectors count, then more, as in ZoomOut (Melzi et al. 2019).
 
     It does not presuppose isometry, so that it ends nearer the truth than `WaveletPreservation`, if it
-    starts from a map as good as the outcome of that. [docs/accuracy.md] measures both.
+    starts from a map as good as the outcome of that: docs/accuracy.md measures both.
 
     **Arguments:**
 

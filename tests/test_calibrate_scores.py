@@ -1,0 +1,44 @@
+"""The study of scores: what its tables say of pairs whose figures are known."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from synthetic import bumpy_mesh
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+import calibrate_scores
+from calibrate_scores import Measured, everywhere, tables
+
+from jaxsmw.evaluation.ground_truth import GroundTruth
+
+
+def cells(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if "|" in line]
+
+
+def test_tables_say_what_was_measured():
+    true = np.linspace(0, 0.2, 100)  # half of them gross
+    knowing = Measured(true, true, {"flaw": (1.0, 2.0)})
+    wrong = Measured(true, true[::-1].copy(), {"flaw": (3.0, 2.0)})
+    shares, tenths, scores = map(cells, tables({"a": [knowing], "b": [wrong, wrong]}))
+    assert shares[2] == ["a", "1", "100.0", "100.0", "1.00", "50.00%", "20%"]
+    assert shares[3] == ["b", "2", "100.0", "100.0", "-1.00", "50.00%", "0%"]
+    assert len(tenths) == 12 and tenths[-1][0] == "180.0 to 200.0"
+    # The last tenth: ten of the largest errors by the one, twenty of the smallest by the others.
+    assert float(tenths[-1][1]) == round(1e3 * (true[-10:].mean() + 2 * true[:10].mean()) / 3, 1)
+    assert scores[2:] == [["a", "1 of 1"], ["b", "0 of 2"]]
+
+
+def test_vertices_without_a_truth_take_the_nearest_ones():
+    mesh = bumpy_mesh(2)
+    known = np.arange(0, 162, 2)
+    found = everywhere(GroundTruth(known, known + 1), mesh)
+    np.testing.assert_array_equal(found[known], known + 1)
+    other = np.linalg.norm(mesh.vertices[1] - mesh.vertices[known], axis=1).argmin()
+    assert found[1] == known[other] + 1
+
+
+def test_stages_after_the_first_do_not_mend():
+    assert all(stage.mending == 0 for stage in calibrate_scores.AS_IT_STARTS)
