@@ -191,12 +191,12 @@ def refine_in_stages(
         if meshes is None or not any(stage.mending for stage in stages) or (failed and best is None):
             return refinements, start
         flawed = np.inf if failed else _flaw(refinements[-1], spectra[-1][0], meshes, partial)
-        if flawed < least:
+        if best is None or flawed < least:
             best, least = (refinements, start), flawed
         if least < _SUSPICIOUS:
             break
         logger.info("limbs may be swapped (flaw %.2f, below %.2f is good): other starts", flawed, _SUSPICIOUS)
-    assert best is not None
+    assert best is not None  # the first start at the latest
     return best
 
 

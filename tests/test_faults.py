@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 from synthetic import body_with_arms, bumpy_mesh
 
+from jaxsmw.geometry import faults
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.faults import expected_error, flaw, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
@@ -65,6 +66,27 @@ def test_swapped_limbs_are_torn_off_and_reversed(body):
 def test_coarse_meshes_are_not_torn_by_their_own_edges():
     mesh = bumpy_mesh(1)
     assert not torn_off(mesh, mesh, np.arange(len(mesh.vertices))).any()
+
+
+def test_dense_meshes_are_no_rougher_than_others(body, monkeypatch):
+    """Matches that are wrong by an edge are nothing to be seen from farther away; swapped arms are."""
+    mesh, _ = body
+    edge = np.sqrt(mesh.area / len(mesh.vertices))
+    moved = mesh.vertices + edge * np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    _, rough = KDTree(mesh.vertices).query(moved)
+    arms = np.abs(mesh.vertices[:, 0]) > 1
+    _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
+    near = stretch(mesh, mesh, rough)
+    faults._neighbors.cache_clear()
+    monkeypatch.setattr(faults, "_DENSE", 1000)
+    monkeypatch.setattr(faults, "_SPREAD", 500)
+    far = stretch(mesh, mesh, rough)
+    assert near > 2 and far - 1 < (near - 1) / 2
+    assert stretch(mesh, mesh, swapped) > 2
+    off = torn_off(mesh, mesh, swapped)
+    assert off[arms].mean() > 0.8 and off[~arms].mean() < 0.1
+    faults._neighbors.cache_clear()
 
 
 def test_of_a_perfect_map_no_error_is_expected(body, spectrum):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, connected_pieces, units_of_length
+from jaxsmw.geometry.sampling import spread_samples
 
 # Neighbours whose matches are farther apart than this, in square roots of the area, and than so many times
 # their own distance, are torn apart. Matches of neighbours are 0.03 apart on bodies of 5000 vertices.
@@ -14,6 +17,9 @@ _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
 _WEIGHT_OF_REVERSED = 4
+# Meshes of more vertices are looked at on so many evenly spread ones: between neighbours that are much nearer
+# to each other than maps are accurate, every map is rough.
+_DENSE, _SPREAD = 15_000, 5000
 # What `expected_error` thinks of a piece that is misplaced as a whole, in square roots of the piece's area.
 _MISPLACED = 0.5
 # The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
@@ -28,7 +34,8 @@ def stretch(
     In Euclidean distance, on surfaces scaled to area 1, or if `partial` by one factor. About 1 for the true
     map between poses of one body; maps that tear or scatter have more.
     """
-    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map, partial)
+    edges, _ = _neighbors(mesh_x)
+    before, after = _lengths(edges, mesh_x, mesh_y, pointwise_map, partial)
     return float(np.sum(after**2) / np.sum(before**2))
 
 
@@ -57,9 +64,11 @@ def torn_off(
 
     Limbs that are swapped as a whole come off so.
     """
-    before, after = _edge_lengths(mesh_x, mesh_y, pointwise_map, partial)
-    kept = mesh_x.edges[after < np.maximum(_TORN, _STRETCHED * before)]
+    edges, nearest = _neighbors(mesh_x)
+    before, after = _lengths(edges, mesh_x, mesh_y, pointwise_map, partial)
+    kept = edges[after < np.maximum(_TORN, _STRETCHED * before)]
     _, piece = connected_pieces(kept, len(mesh_x.vertices))
+    piece = piece[nearest]
     return piece != np.argmax(np.bincount(piece, mesh_x.vertex_areas))
 
 
@@ -118,7 +127,7 @@ def expected_error(
     """
     units = units_of_length(mesh_x, mesh_y, partial)
     detour = np.linalg.norm(mesh_x.vertices - mesh_x.vertices[way_back[pointwise_map]], axis=1) / units[0]
-    change = np.abs(np.subtract(*_edge_lengths(mesh_x, mesh_y, pointwise_map, partial)))
+    change = np.abs(np.subtract(*_lengths(mesh_x.edges, mesh_x, mesh_y, pointwise_map, partial)))
     ends, m = mesh_x.edges.ravel(), len(mesh_x.vertices)
     distortion = np.bincount(ends, np.repeat(change, 2), m) / np.maximum(np.bincount(ends, minlength=m), 1)
     eigenvalues, eigenvectors, areas = (
@@ -135,11 +144,26 @@ def expected_error(
     return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced * sizes
 
 
-def _edge_lengths(
-    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"], partial: bool
+@lru_cache(maxsize=1)
+def _neighbors(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
+    """Pairs of neighbours not too near to each other; and which vertex of these each is nearest to."""
+    n = len(mesh.vertices)
+    if n <= _DENSE:
+        return mesh.edges, np.arange(n)
+    samples = spread_samples(mesh, _SPREAD)
+    pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
+    return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
+
+
+def _lengths(
+    edges: Int64[np.ndarray, "e 2"],
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_map: Int64[np.ndarray, " m"],
+    partial: bool,
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Lengths of the edges of X, and distances of their ends' matches, in `units_of_length`."""
+    """Lengths of edges of X, and distances of their ends' matches, in `units_of_length`."""
     unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
     placed = (mesh_x.vertices / unit_x, mesh_y.vertices[pointwise_map] / unit_y)
-    before, after = (np.linalg.norm(np.diff(v[mesh_x.edges], axis=1)[:, 0], axis=1) for v in placed)
+    before, after = (np.linalg.norm(np.diff(v[edges], axis=1)[:, 0], axis=1) for v in placed)
     return before, after
