@@ -181,7 +181,7 @@ def refine_in_stages(
     - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
     - `other_starts`: taken one by one if a stage is to mend, until an outcome looks right; the least flawed
-      is returned.
+      is returned, the first if none is clearly better.
     - `history`: see `jaxsmw.refine`.
     """
     best, least = None, np.inf
@@ -191,7 +191,7 @@ def refine_in_stages(
         if meshes is None or not any(stage.mending for stage in stages) or (failed and best is None):
             return refinements, start
         flawed = np.inf if failed else _flaw(refinements[-1], spectra[-1][0], meshes, partial)
-        if best is None or flawed < least:
+        if best is None or flawed < _CLEARLY * least:
             best, least = (refinements, start), flawed
         if least < _SUSPICIOUS:
             break
@@ -290,3 +290,5 @@ _NEGLIGIBLE = 0.002
 _TOO_MUCH = 0.5
 # What is less flawed than this looks right.
 _SUSPICIOUS = 2.0
+# By so much less flawed another start's outcome has to be: the first is the right one more often.
+_CLEARLY = 0.75
