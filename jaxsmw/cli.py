@@ -672,7 +672,7 @@ def _keep_inputs(output: str, *inputs: str) -> None:
 
 
 def _match_outputs(options: argparse.Namespace) -> list[str]:
-    """The files that `match` writes beside its report, all different."""
+    """The files and directories that `match` writes, all different."""
     points = options.surface_points
     if points and Path(points).suffix != ".baryc_gt":
         raise InputError(f"{points}: points are written as .baryc_gt; choose a name that ends in it.")

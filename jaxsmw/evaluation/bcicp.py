@@ -48,6 +48,18 @@ _SPECTRAL_STEPS = 2
 _SOURCES_AT_ONCE = 256
 
 
+def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
+    """Whether a spectrum, perhaps padded, can be that of a mesh.
+
+    **Raises:** `InputError` if it has fewer vertices.
+    """
+    rows, n = spectrum.mask.shape[0], len(mesh.vertices)
+    if rows < n:
+        raise InputError(
+            f"{mesh.name}: has {n} vertices, but its spectrum {rows}: give the spectrum of this mesh."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Surface:
     """What the steps know of a shape.
@@ -77,11 +89,8 @@ class _Surface:
 
         **Raises:** `InputError` if the spectrum is of fewer vertices than the mesh has.
         """
-        rows, n = spectrum.mask.shape[0], len(mesh.vertices)
-        if rows < n:
-            raise InputError(
-                f"{mesh.name}: has {n} vertices, but its spectrum {rows}: give the spectrum of this mesh."
-            )
+        check_spectrum(mesh, spectrum)
+        n = len(mesh.vertices)
         on_surface = mesh.used_vertices & np.asarray(spectrum.mask)[:n]
         vertices, number = np.flatnonzero(on_surface), np.cumsum(on_surface) - 1
         positions = mesh.vertices[vertices] / np.sqrt(mesh.area)

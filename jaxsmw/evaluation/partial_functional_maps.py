@@ -67,7 +67,7 @@ from jaxsmw.core.products import product
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.evaluation.bcicp import check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 
 FIDELITY = 60.0
@@ -107,11 +107,7 @@ class SurfaceGradient(eqx.Module):
 
         **Raises:** `InputError` if the spectrum has fewer vertices than the mesh.
         """
-        rows, n = spectrum.mask.shape[0], len(mesh.vertices)
-        if rows < n:
-            raise InputError(
-                f"{mesh.name}: has {n} vertices, but its spectrum {rows}: give the spectrum of this mesh."
-            )
+        check_spectrum(mesh, spectrum)
         scale = math.sqrt(float(jnp.sum(spectrum.vertex_areas)) / mesh.area)
         corners = scale * mesh.vertices[mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
