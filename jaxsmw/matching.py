@@ -22,8 +22,9 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.compilation import compile_ahead, compiled
-from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
-from jaxsmw.core.refinement import Refinement, Refiner, refine
+from jaxsmw.core.functional_map import encode, multiscale_kernel
+from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
+from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -396,13 +397,17 @@ def describe(
 ) -> tuple[Spectrum, Spectrum]:
     """The spectra with descriptors: principal components of SHOT on both shapes together, of mean square 1.
 
+    SHOT with the usual radius, and on meshes that are fine enough with one of two thirds, too, side by side.
+
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`, `partial`: see `paired_spectra`.
     - `number_of_descriptors`: d, at most 352; the components in which the shapes' vertices differ most.
     """
     sides = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
-    shot = _shot(*sides, partial)
+    radii = _FINE_RADII if min(len(side.mesh.vertices) for side in sides) >= _FINE else (SHOT_RADIUS,)
+    of_radii = [_shot(*sides, partial, radius) for radius in radii]
+    shot = [np.hstack(of_shape) for of_shape in zip(*of_radii, strict=True)]
     weights = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
     both, weight = np.concatenate(shot), np.concatenate([w / w.sum() / 2 for w in weights])
     centered = both - weight @ both
@@ -425,7 +430,6 @@ def initial_map(
     spectrum_y: Spectrum,
     *,
     init: Start | ArrayLike = "shot",
-    radii: Sequence[float] = (SHOT_RADIUS,),
     partial: bool = False,
 ) -> Int64[np.ndarray, " m"]:
     """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
@@ -433,12 +437,6 @@ def initial_map(
     The spectra are those of `paired_spectra`, and `partial` is what was said there. On a mesh of more than
     15 000 vertices descriptors are computed and compared at about 10 000 evenly spread ones, and every other
     vertex of X takes the match of the nearest of them.
-
-    **Arguments:**
-
-    - `radii`: of SHOT's neighbourhoods, in square roots of the area; of several the descriptors are put side
-      by side. Wider ones see more of the body, in less detail: they are computed at 2000 evenly spread
-      vertices.
 
     **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
     """
@@ -452,8 +450,7 @@ def initial_map(
     if not isinstance(init, str):
         features_x, features_y = _landmark_features(given, x, y, partial)
     elif init == "shot":
-        at_radii = [_shot(x, y, partial, radius) for radius in radii]
-        features_x, features_y = (np.hstack(of_shape) for of_shape in zip(*at_radii, strict=True))
+        features_x, features_y = _shot(x, y, partial)
     elif init in _SIGNATURES:
         features_x, features_y = (np.asarray(_SIGNATURES[init](side.spectrum)) for side in (x, y))
     elif init == "functional":
@@ -468,16 +465,7 @@ def initial_map(
             f"{mesh_x.name} to {mesh_y.name}: {init!r} descriptors are not defined on these meshes with "
             f"{len(spectrum_x.eigenvalues)} eigenvectors; ask for more, or start from another map."
         )
-    dtype = spectrum_x.eigenvectors.dtype
-    nearest = compiled(nearest_neighbor)(
-        *(jax.device_put(features.astype(dtype)) for features in (features_x, features_y)),
-        database_mask=y.spectrum.mask,
-    )
-    start = np.asarray(nearest).astype(np.int64)
-    if y.samples is not None:
-        start = y.samples.vertices[start]
-    if x.samples is not None:
-        start = start[x.samples.nearest]
+    start = _nearest(features_x, features_y, x, y)
     if not isinstance(init, str):
         start[given[:, 0]] = given[:, 1]
     return _extend_to_unused(mesh_x, start)
@@ -486,15 +474,66 @@ def initial_map(
 def other_starts(
     mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
 ) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Initial maps by SHOT of wider neighbourhoods, one by one, for when `init="shot"` fails.
+    """Initial maps by way of functional maps, one by one, for when `init="shot"` fails.
 
-    None is better than that on average. But a pair on which one swaps limbs another often gets right.
+    Nearest neighbours of SHOT from Y to X, too, as a functional map, filtered like the paper's, and read
+    back: first the mean of both directions, by neighbourhoods of several sizes side by side; then from Y to X
+    alone, by the usual ones; then the mean of both by these. Where one start swaps limbs, another often does
+    not.
     """
-    for radii in _OTHER_RADII:
-        yield initial_map(mesh_x, mesh_y, spectrum_x, spectrum_y, radii=radii, partial=partial)
+    x, y = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
+    spectra = [spectrum.truncate(_PAPER_EIGENVECTORS) for spectrum in (spectrum_x, spectrum_y)]
+    shot: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+    for radii, share_of_back in _OTHER_STARTS:
+        for radius in radii:
+            if radius not in shot:
+                shot[radius] = _shot(x, y, partial, radius)
+        features_x, features_y = (
+            np.hstack(of_shape) for of_shape in zip(*(shot[radius] for radius in radii), strict=True)
+        )
+        there, back = _nearest(features_x, features_y, x, y), _nearest(features_y, features_x, y, x)
+        share = spectra[0].eigenvalues.dtype.type(share_of_back)
+        start = compiled(_both_ways)(*jax.device_put((there, back, share)), *spectra)
+        yield _extend_to_unused(mesh_x, np.asarray(start).astype(np.int64))
 
 
-_OTHER_RADII = (SHOT_RADIUS, 2 * SHOT_RADIUS, 4 * SHOT_RADIUS), (2 * SHOT_RADIUS,), (4 * SHOT_RADIUS,)
+# Radii, and how much the way back counts. Wide neighbourhoods see more of the body, in less detail.
+_OTHER_STARTS = (
+    ((SHOT_RADIUS, 2 * SHOT_RADIUS, 4 * SHOT_RADIUS), 0.5),
+    ((SHOT_RADIUS,), 1.0),
+    ((SHOT_RADIUS,), 0.5),
+)
+_PAPER_EIGENVECTORS = 100
+
+
+def _both_ways(
+    there: Int[Array, " m"],
+    back: Int[Array, " n"],
+    share: Float[Array, ""],
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+) -> Int[Array, " m"]:
+    """The map X -> Y of a mean of two functional maps, of a map there and of one back, which has a share."""
+    responses = WaveletPreservation().problem(spectrum_x, spectrum_y).responses
+    of_there, of_back = encode(there, spectrum_x, spectrum_y), encode(back, spectrum_y, spectrum_x).T
+    mean = (1 - share) * of_there + share * of_back
+    patches = chosen_patches("auto", spectrum_x, spectrum_y)
+    return decode(mean * multiscale_kernel(*responses), spectrum_x, spectrum_y, patches=patches)
+
+
+def _nearest(
+    features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"], x: _Thinned, y: _Thinned
+) -> Int64[np.ndarray, " m"]:
+    """The nearest neighbours of all of X's vertices, from features of those that are compared."""
+    dtype = x.spectrum.eigenvectors.dtype
+    nearest = compiled(nearest_neighbor)(
+        *(jax.device_put(features.astype(dtype)) for features in (features_x, features_y)),
+        database_mask=y.spectrum.mask,
+    )
+    found = np.asarray(nearest).astype(np.int64)
+    if y.samples is not None:
+        found = y.samples.vertices[found]
+    return found if x.samples is None else found[x.samples.nearest]
 
 
 class _Thinned(NamedTuple):
@@ -516,6 +555,8 @@ class _Thinned(NamedTuple):
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # A thousandth of a body's area shows nothing of its kind.
 _SMALLEST_PART = 1e-3
+# The smaller neighbourhoods hold ten vertices from this many on.
+_FINE, _FINE_RADII = 2000, (2 / 3 * SHOT_RADIUS, SHOT_RADIUS)
 # Descriptors of wider neighbourhoods vary more slowly.
 _SPREAD = 2000
 

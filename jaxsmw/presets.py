@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxsmw.core.compilation import compiled
-from jaxsmw.core.feature_regression import FeatureRegression
+from jaxsmw.core.feature_regression import FeatureRegression, Regression
 from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
@@ -104,7 +104,7 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
 
 def _regression(levels: tuple[int, ...], number_of_samples: int, mending: int = 0) -> Stage:
     """Feature regression, once per level."""
-    return Stage(FeatureRegression(levels), max(levels), 30, len(levels), number_of_samples, mending=mending)
+    return Stage(FeatureRegression(levels), max(levels), 60, len(levels), number_of_samples, mending=mending)
 
 
 Preset = Literal["fast", "paper", "accurate"]
@@ -172,7 +172,7 @@ def refine_in_stages(
     left and right, and for where it joins the body. A stage that is to mend this looks for both
     (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
     faulty part had no say in. The least flawed map it came by is its outcome. Where that does not help, the
-    stages are gone through from other starts, too. Maps that look right are let be.
+    stages so far are gone through from other starts, too. Maps that look right are let be.
 
     **Arguments:**
 
@@ -181,46 +181,60 @@ def refine_in_stages(
     - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
     - `other_starts`: taken one by one if a stage is to mend, until an outcome looks right; the least flawed
-      is returned, the first if none is clearly better.
+      is returned, where features that predict each other (`FeatureRegression`) count as well.
     - `history`: see `jaxsmw.refine`.
     """
-    best, least = None, np.inf
-    for start in chain([pointwise_map], other_starts):
-        refinements = _through(spectra, start, stages, samples, meshes, partial, history)
-        failed = refinements[-1].result != RESULTS.successful
-        if meshes is None or not any(stage.mending for stage in stages) or (failed and best is None):
-            return refinements, start
-        flawed = np.inf if failed else _flaw(refinements[-1], spectra[-1][0], meshes, partial)
-        if best is None or flawed < _CLEARLY * least:
-            best, least = (refinements, start), flawed
-        if least < _SUSPICIOUS:
+    through = partial_function(_through, samples=samples, meshes=meshes, partial=partial, history=history)
+    steps = list(zip(spectra, stages, strict=True))
+    # What comes after the last stage that mends is done for the best start alone.
+    mending = [index + 1 for index, stage in enumerate(stages) if stage.mending and meshes is not None]
+    doubtful, certain = (steps[: mending[-1]], steps[mending[-1] :]) if mending else ([], steps)
+    best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
+    least = np.inf
+    for start in chain([pointwise_map], other_starts) if doubtful else ():
+        refinements, flawed, suspicious = through(doubtful, start)
+        last = refinements[-1]
+        if last.result != RESULTS.successful:
+            if start is pointwise_map:
+                return refinements, start
+            continue
+        doubt = np.log(flawed)
+        if isinstance(last.updated, Regression):
+            doubt += _UNCERTAINTY * float(last.updated.uncertainty)
+        if doubt < least:
+            best, least = (refinements, start), doubt
+        if not suspicious:
             break
-        logger.info("limbs may be swapped (flaw %.2f, below %.2f is good): other starts", flawed, _SUSPICIOUS)
-    assert best is not None  # the first start at the latest
-    return best
+        logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
+    refinements, start = best
+    so_far = refinements[-1].pointwise_map if refinements else start
+    return refinements + through(certain, so_far)[0], start
 
 
 def _through(
-    spectra: Sequence[tuple[Spectrum, Spectrum]],
+    steps: Sequence[tuple[tuple[Spectrum, Spectrum], Stage]],
     pointwise_map: Int[Array, " m"],
-    stages: Sequence[Stage],
+    *,
     samples: Samples | None,
     meshes: tuple[Mesh, Mesh] | None,
     partial: bool,
     history: bool,
-) -> list[Refinement]:
-    """The outcomes of all stages, or up to the first that fails."""
+) -> tuple[list[Refinement], float, bool]:
+    """The outcomes of stages, up to the first that fails; and what `_mended` says of the last that mends."""
     refinements: list[Refinement] = []
-    for (spectrum_x, spectrum_y), stage in zip(spectra, stages, strict=True):
+    flawed, suspicious = np.inf, True
+    for (spectrum_x, spectrum_y), stage in steps:
         run = partial_function(_run, stage, spectrum_y, samples, history)
         refinement = run(spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            refinement = _mended(refinement, spectrum_x, run, meshes, partial, stage.mending)
+            refinement, flawed, suspicious = _mended(
+                refinement, spectrum_x, run, meshes, partial, stage.mending
+            )
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
         pointwise_map = refinement.pointwise_map
-    return refinements
+    return refinements, flawed, suspicious
 
 
 def _run(
@@ -248,47 +262,49 @@ def _mended(
     meshes: tuple[Mesh, Mesh],
     partial: bool,
     rounds: int,
-) -> Refinement:
-    """The least flawed of a refinement and of others, each begun without what was faulty in the last."""
+) -> tuple[Refinement, float, bool]:
+    """The least flawed of a refinement and of others, each begun without what was faulty in the last.
+
+    And its flaw, and whether limbs may be swapped still. Where a small flaw stays what it is, whatever is left
+    out, bodies differ.
+    """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
-    best, least = refinement, np.inf
+    best, least, first = refinement, np.inf, np.inf
     criteria = (
         lambda found: reversed_orientation(*meshes, found, eigenvectors, partial=partial),
         lambda found: torn_off(*meshes, found, partial=partial),
     )
     for done in range(rounds + 1):
-        flawed = _flaw(refinement, spectrum_x, meshes, partial)
+        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
+        flawed = flaw(*meshes, found, eigenvectors, partial=partial)
+        if done == 0:
+            first = flawed
         if flawed < least:
             best, least = refinement, flawed
-        if done == rounds or flawed < _SUSPICIOUS:
-            return best
-        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-        for criterion in criteria[done % 2 :] + criteria[: done % 2]:
-            fault = criterion(found)
-            if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH:
-                break
-        else:
-            return best
-        sound = jax.device_put(np.where(np.pad(fault, (0, len(areas) - m)), 0, areas))
+        stays = done == len(criteria) and least > _HARDLY * first and first < _SMALL
+        if least < _SUSPICIOUS or stays:
+            return best, least, False
+        faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
+        shares = [areas[:m][fault].sum() / areas.sum() for fault in faults]
+        some = [fault for fault, share in zip(faults, shares, strict=True) if _NEGLIGIBLE < share < _TOO_MUCH]
+        if done == rounds or not some:
+            return best, least, bool(max(shares) > _NEGLIGIBLE)
+        sound = jax.device_put(np.where(np.pad(some[0], (0, len(areas) - m)), 0, areas))
         refinement = run(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
         if refinement.result != RESULTS.successful:
-            return best
-    return best
-
-
-def _flaw(refinement: Refinement, spectrum_x: Spectrum, meshes: tuple[Mesh, Mesh], partial: bool) -> float:
-    m = len(meshes[0].vertices)
-    found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-    return flaw(*meshes, found, np.asarray(spectrum_x.eigenvectors)[:m], partial=partial)
+            break
+    return best, least, True
 
 
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# What is less flawed than this looks right.
-_SUSPICIOUS = 2.0
-# By so much less flawed another start's outcome has to be: the first is the right one more often.
-_CLEARLY = 0.75
+# What is less flawed than this looks right (right maps with 50 eigenvectors have up to 3); with less than the
+# other it does if it stays so, but for a tenth.
+_SUSPICIOUS, _SMALL, _HARDLY = 2.5, 5.0, 0.9
+# Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
+# the mirror image the larger flaw. From half to twice of this, nearly the same outcomes are chosen.
+_UNCERTAINTY = 12.0

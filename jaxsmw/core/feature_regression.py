@@ -112,8 +112,8 @@ class FeatureRegression(Refiner):
         return nearest_neighbor_in_patches(queries[:, :k], database[:, :k], *problem.prepared.patches)
 
     def energy(self, problem: Problem, updated: Any, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """How uncertain predictions are: half the logarithm of their residual covariances' determinants."""
-        return updated.forward.uncertainty + updated.backward.uncertainty
+        """How uncertain predictions are; see `Regression.uncertainty`."""
+        return updated.uncertainty
 
     def embeddings(
         self, problem: Problem, updated: Any
@@ -188,6 +188,15 @@ class Regression(NamedTuple):
     forward: Prediction
     backward: Prediction
     iteration: Int32[Array, ""]
+
+    @property
+    def uncertainty(self) -> Float[Array, ""]:
+        """The mean logarithm of what standard deviation predictions leave, over features of both shapes.
+
+        (Of their principal components: half the logarithm of the residual covariances' determinants.)
+        """
+        features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
+        return (self.forward.uncertainty + self.backward.uncertainty) / features
 
 
 class _Moments(NamedTuple):
