@@ -42,10 +42,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.products import product
+from jaxsmw.core.soft_maps import PointwiseMap, pull_back
 from jaxsmw.core.spectrum import Spectrum
 
 Convention = Literal["pullback", "pushforward"]
@@ -70,7 +71,7 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
 
 
 def encode(
-    pointwise_map: Int[Array, " m"],
+    pointwise_map: PointwiseMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
@@ -81,7 +82,7 @@ def encode(
 
     **Arguments:**
 
-    - `pointwise_map`: T, one vertex of Y per vertex of X.
+    - `pointwise_map`: T, one vertex of Y per vertex of X, or a soft map from X to Y.
     - `convention`: `"pullback"` gives `Phi_X^+ P Phi_Y` (k_X, k_Y), `"pushforward"` gives
       `Phi_Y^+ P^T Phi_X` (k_Y, k_X).
     - `pseudo_inverse`: see `dual_eigenvectors`.
@@ -94,7 +95,7 @@ def encode(
 
 
 def project_matches(
-    pointwise_map: Int[Array, " m"],
+    pointwise_map: PointwiseMap,
     dual_out: Float[Array, "n_out k_out"],
     eigenvectors_in: Float[Array, "n_in k_in"],
     *,
@@ -103,8 +104,8 @@ def project_matches(
     """`encode` with the dual eigenvectors of the shape that C leads to already at hand."""
     # A padded vertex of X has a zero row on its side of the product, whatever its entry of T says.
     if convention == "pullback":
-        return product(dual_out.T, eigenvectors_in[pointwise_map])
-    return product(dual_out[pointwise_map].T, eigenvectors_in)
+        return product(dual_out.T, pull_back(pointwise_map, eigenvectors_in))
+    return product(pull_back(pointwise_map, dual_out).T, eigenvectors_in)
 
 
 def multiscale_kernel(
@@ -177,7 +178,7 @@ class QuadraticEnergy(eqx.Module):
 
 
 def wavelet_energy(
-    pointwise_map: Int[Array, " m"],
+    pointwise_map: PointwiseMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     responses_x: Float[Array, "filters k_x"],
@@ -195,20 +196,19 @@ def wavelet_energy(
 
     **Arguments:**
 
-    - `pointwise_map`: T, one vertex of Y per vertex of X.
+    - `pointwise_map`: T, one vertex of Y per vertex of X, or a soft map from X to Y.
     - `responses_x`, `responses_y`: the bank on the eigenvalues of X and of Y.
     - `convention`: which way C goes, see above.
     - `norm`: `"area"` for the norm of the surface, `"frobenius"` for eq. (5) as printed.
     """
     areas_x = jnp.where(spectrum_x.mask, spectrum_x.vertex_areas, 0)[:, None]
-    areas_y = spectrum_y.vertex_areas[pointwise_map][:, None]
-    matched = spectrum_y.eigenvectors[pointwise_map]
     if convention == "pullback":
-        fed, returned = matched, spectrum_x.eigenvectors
+        fed, returned = pull_back(pointwise_map, spectrum_y.eigenvectors), spectrum_x.eigenvectors
         responses_in, responses_out = responses_y, responses_x
         weights = areas_x if norm == "area" else spectrum_x.mask.astype(areas_x.dtype)[:, None]
     else:
-        fed, returned = spectrum_x.eigenvectors, matched * areas_y
+        fed = spectrum_x.eigenvectors
+        returned = pull_back(pointwise_map, dual_eigenvectors(spectrum_y, "area"))
         responses_in, responses_out = responses_x, responses_y
         if norm == "area":
             weights = areas_x

@@ -17,6 +17,7 @@ from jaxsmw.core.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
 
@@ -197,7 +198,7 @@ class WaveletPreservation(Refiner):
     def update(
         self,
         problem: Problem,
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """See `Solution.solve`."""
@@ -301,8 +302,8 @@ def refine(
         objective = refiner.objective(problem, updated, after) if history else undefined
         return after, changed.astype(dtype), objective
 
-    def checked(updated: Any, result: RESULTS) -> RESULTS:
-        return _checked(updated, refiner.functional_map(updated), result)
+    def how(updated: Any, result: RESULTS) -> RESULTS:
+        return checked(updated, refiner.functional_map(updated), result)
 
     def energy(problem: Problem, updated: Any, pointwise_map: Array) -> Array:
         return refiner.energy(problem, updated, pointwise_map) if history else undefined
@@ -313,7 +314,7 @@ def refine(
 
         def follow() -> tuple[Any, RESULTS, Array, Array]:
             updated, result = refiner.update(working, after, state.updated)
-            result = where(state.result == RESULTS.successful, checked(updated, result), state.result)
+            result = where(state.result == RESULTS.successful, how(updated, result), state.result)
             return updated, result, energy(working, updated, after), state.iterations + 1
 
         def keep() -> tuple[Any, RESULTS, Array, Array]:
@@ -335,7 +336,7 @@ def refine(
     state = _State(
         working_map,
         updated,
-        checked(updated, result),
+        how(updated, result),
         energy(whole, updated, pointwise_map),
         iterations=jnp.asarray(1, jnp.int32),
         unchanged=jnp.asarray(False),
@@ -392,7 +393,7 @@ _Record = tuple[Array, Array, Array, Array | None]
 """What one turn adds to the four series of `History`."""
 
 
-def _checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
+def checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
     """How an update came out: a failure that its computation reported says more than a NaN."""
     went_well = result == RESULTS.successful
     finite, zero = all_finite(updated), jnp.all(functional_map == 0)

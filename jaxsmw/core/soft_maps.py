@@ -1,14 +1,21 @@
-"""Soft maps: the area of one point set spread over another, every point giving and taking its share."""
+"""Soft maps: what a point corresponds to, spread over several, so that it can be differentiated.
+
+A `Recovery` makes one of two point sets: `Softmax` by distances alone, `NearestFew` among the nearest only,
+`Sinkhorn` so that every point gives and takes its share.
+"""
 
 from __future__ import annotations
+
+import abc
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Bool, Float, Int, Int32
 
+from jaxsmw.core.checks import as_parameter, check_between
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
@@ -30,8 +37,9 @@ class SoftMap(eqx.Module):
       of zero area gets what any other in its place would get.
     - `potentials`: g (n,), without unit: the higher, the more a row is sought after; 0 for rows of zero area.
     - `temperature`: in the points' squared unit.
-    - `residual`: the share of the area, from 0 to 1, that arrives where there is too much already.
-    - `converged`: whether that is at most the tolerance; False if a number went wrong.
+    - `residual`: the share of the area, from 0 to 1, that arrives where there is too much already; NaN where
+      nobody looked (`Softmax`).
+    - `converged`: whether that is at most the tolerance; False if a number went wrong, or nobody looked.
     - `iterations`: how many were done.
     """
 
@@ -70,6 +78,167 @@ class SoftMap(eqx.Module):
             return jnp.argmax(densities, axis=0).astype(jnp.int32)
 
         return in_blocks(likeliest, self.queries, _BLOCK)
+
+
+class SparseSoftMap(eqx.Module):
+    """A soft map of which few database rows are known for each query.
+
+    **Attributes:**
+
+    - `rows`: (m, t), the nearest first.
+    - `shares`: (m, t), of sum 1.
+    """
+
+    rows: Int32[Array, "m t"]
+    shares: Float[Array, "m t"]
+
+    def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
+        """The mean of functions over each query's rows."""
+        functions = jnp.asarray(functions_on_y, self.shares.dtype)
+        # One after the other, as all of them take t times the memory.
+        taken = zip(self.rows.T, self.shares.T, strict=True)
+        return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
+
+    def pointwise_map(self) -> Int32[Array, " m"]:
+        """The nearest database row of each query."""
+        return self.rows[:, 0]
+
+
+PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
+"""T: X -> Y, one vertex of Y for each of X, or a soft map from X to Y."""
+
+
+def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
+    """Functions on Y as functions on X: `P f`, P of size m x n never being stored."""
+    if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):
+        return pointwise_map.pull_back(functions_on_y)
+    return functions_on_y[pointwise_map]
+
+
+class Recovery(eqx.Module):
+    """How a soft map follows from the distances between two point sets."""
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        queries: Float[Array, "m d"],
+        database: Float[Array, "n d"],
+        query_areas: Float[Array, " m"],
+        database_areas: Float[Array, " n"],
+    ) -> SoftMap | SparseSoftMap:
+        """The soft map from the queries to the database; rows of zero area get nothing."""
+
+
+class Softmax(Recovery):
+    """Each row gets of a query what its area times `exp(-distance² / temperature)` is among all rows'.
+
+    **Arguments:**
+
+    - `temperature`: positive, in the units of `sinkhorn`.
+    """
+
+    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+
+    def __check_init__(self) -> None:
+        check_between(self, "temperature", self.temperature)
+
+    def __call__(
+        self,
+        queries: Float[Array, "m d"],
+        database: Float[Array, "n d"],
+        query_areas: Float[Array, " m"],
+        database_areas: Float[Array, " n"],
+    ) -> SoftMap:
+        """See `Recovery`."""
+        a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+        return SoftMap(
+            queries,
+            database,
+            a,
+            b,
+            jnp.zeros_like(b),
+            _in_unit(self.temperature, queries, database, a, b),
+            jnp.asarray(jnp.nan, b.dtype),
+            jnp.asarray(False),
+            jnp.asarray(0, jnp.int32),
+        )
+
+
+class NearestFew(Recovery):
+    """`Softmax` among the nearest rows alone; which ones these are is not differentiated.
+
+    Fast in float32; in float64 sorting takes most of the time on CPUs.
+
+    **Arguments:**
+
+    - `number`: how many; if there are fewer of positive area, a query's other shares are zero.
+    - `temperature`: positive, in the units of `sinkhorn`.
+    """
+
+    number: int = eqx.field(static=True, default=10)
+    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+
+    def __check_init__(self) -> None:
+        check_between(self, "temperature", self.temperature)
+        if self.number < 1:
+            raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
+
+    def __call__(
+        self,
+        queries: Float[Array, "m d"],
+        database: Float[Array, "n d"],
+        query_areas: Float[Array, " m"],
+        database_areas: Float[Array, " n"],
+    ) -> SparseSoftMap:
+        """See `Recovery`."""
+        a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+        settled_queries, settled = lax.stop_gradient((queries, database))
+        unit = jnp.asarray(1, queries.dtype)
+
+        def nearest(block: Float[Array, "block d"]) -> Int32[Array, "block t"]:
+            closeness = jnp.where((b > 0)[:, None], _log_kernel(settled, block, unit), -jnp.inf)
+            return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
+
+        rows = in_blocks(nearest, settled_queries, _BLOCK)
+        # One after the other, as all differences take t times the memory.
+        squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
+        exponents = -jnp.stack(squares, axis=1) / _in_unit(self.temperature, queries, database, a, b)
+        return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
+
+
+class Sinkhorn(Recovery):
+    """Soft maps by `sinkhorn`: every row gets its share.
+
+    **Arguments:**
+
+    - `temperature`: positive, in the units of `sinkhorn`.
+    - `iterations`, `tolerance`: see there.
+    """
+
+    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+    iterations: int = eqx.field(static=True, default=10)
+    tolerance: float = eqx.field(static=True, default=0.01)
+
+    def __check_init__(self) -> None:
+        check_between(self, "temperature", self.temperature)
+
+    def __call__(
+        self,
+        queries: Float[Array, "m d"],
+        database: Float[Array, "n d"],
+        query_areas: Float[Array, " m"],
+        database_areas: Float[Array, " n"],
+    ) -> SoftMap:
+        """See `Recovery`."""
+        return sinkhorn(
+            queries,
+            database,
+            query_areas=query_areas,
+            database_areas=database_areas,
+            temperature=self.temperature,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+        )
 
 
 def sinkhorn(
@@ -114,7 +283,7 @@ def sinkhorn(
     )
     dtype, (m, d) = queries.dtype, queries.shape
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
-    scale = jnp.asarray(temperature, dtype) * _mean_squared_nearest(queries, database, a, b)
+    scale = _in_unit(jnp.asarray(temperature), queries, database, a, b)
     log_b, rest = _log(b), -m % _BLOCK
     blocks = (
         jnp.pad(queries, ((0, rest), (0, 0))).reshape(-1, _BLOCK, d),
@@ -167,12 +336,17 @@ def _log_kernel(
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
 
-def _mean_squared_nearest(
-    queries: Float[Array, "m d"], database: Float[Array, "n d"], a: Float[Array, " m"], b: Float[Array, " n"]
+def _in_unit(
+    temperature: Float[Array, ""],
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    a: Float[Array, " m"],
+    b: Float[Array, " n"],
 ) -> Float[Array, ""]:
-    """The unit of temperature."""
+    """A temperature in the points' squared unit, from one in units of the mean squared nearest distance."""
     found = nearest_neighbor(*lax.stop_gradient((queries, database)), database_mask=b > 0)
     spread = jnp.sum(a * jnp.sum((queries - product(a[None, :], queries)) ** 2, axis=1))
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     unit = jnp.maximum(unit, jnp.finfo(queries.dtype).eps ** 0.5 * spread)
-    return jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
+    unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
+    return temperature.astype(queries.dtype) * unit

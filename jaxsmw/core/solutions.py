@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsmw.core.checks import as_parameter, check_between, check_choice
 from jaxsmw.core.frames import frame_function
@@ -27,6 +27,7 @@ from jaxsmw.core.functional_map import (
     wavelet_energy,
 )
 from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -60,7 +61,7 @@ class WaveletProblem(eqx.Module):
         pair = self.responses_x, self.responses_y
         return pair if self.convention == "pullback" else pair[::-1]
 
-    def energy(self, pointwise_map: Int[Array, " m"], *, norm: Norm = "area") -> QuadraticEnergy:
+    def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
         """The energy (5) of functional maps under a pointwise map; see `wavelet_energy`."""
         return wavelet_energy(
             pointwise_map,
@@ -85,7 +86,7 @@ class Solution(eqx.Module):
         self,
         problem: WaveletProblem,
         prepared: Any,
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """The functional map that follows from a pointwise map, and how its computation ended.
@@ -121,7 +122,7 @@ class Filtering(Solution):
         self,
         problem: WaveletProblem,
         prepared: tuple[Array, Array],
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Eq. (8)."""
@@ -149,7 +150,7 @@ class NearestOrthogonal(Solution):
         self,
         problem: WaveletProblem,
         prepared: Any,
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """The polar factor, by a singular value decomposition."""
@@ -177,7 +178,7 @@ class LeastSquares(Solution):
         self,
         problem: WaveletProblem,
         prepared: None,
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """The closed form."""
@@ -345,7 +346,7 @@ class RegularizedLeastSquares(Solution):
         self,
         problem: WaveletProblem,
         prepared: None,
-        pointwise_map: Int[Array, " m"],
+        pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Minimise, starting from the previous functional map."""
@@ -442,7 +443,7 @@ class RegularizedLeastSquares(Solution):
                 optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
                 jax.lax.stop_gradient(start / unit),
                 max_steps=self.max_steps,
-                adjoint=optx.ImplicitAdjoint(inner),
+                adjoint=optx.ImplicitAdjoint(lx.GMRES(precision, precision, restart=50)),
                 throw=False,
             )
         result = where(

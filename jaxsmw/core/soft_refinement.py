@@ -1,0 +1,165 @@
+"""Refinement that can be differentiated: soft maps between the updates of the functional map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int32
+
+from jaxsmw.core.checks import check_choice
+from jaxsmw.core.refinement import Problem, WaveletPreservation, checked
+from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
+from jaxsmw.core.spectrum import Spectrum
+
+Differentiation = Literal["unrolled", "checkpointed", "implicit"]
+
+
+class SoftRefinement(eqx.Module):
+    """The outcome of `refine_softly`, a pytree.
+
+    **Attributes:**
+
+    - `functional_map`: C.
+    - `soft_map`: the soft map X -> Y that follows from it.
+    - `result`: a member of `RESULTS`; compare with `RESULTS.successful`.
+    - `iterations`: how many functional maps were made after the first.
+    - `change`: how much the last one changed C, relative to its Frobenius norm: 0 at a fixed point.
+    """
+
+    functional_map: Float[Array, "k_out k_in"]
+    soft_map: SoftMap | SparseSoftMap
+    result: RESULTS
+    iterations: Int32[Array, ""]
+    change: Float[Array, ""]
+
+
+@eqx.filter_jit
+def refine_softly(
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    pointwise_map: PointwiseMap,
+    *,
+    refiner: WaveletPreservation = WaveletPreservation(),  # noqa: B008 (immutable)
+    recovery: Recovery = Softmax(),  # noqa: B008 (immutable)
+    iterations: int = 5,
+    differentiation: Differentiation = "checkpointed",
+    tolerance: float = 1e-4,
+) -> SoftRefinement:
+    """Algorithm 1 with soft maps in place of nearest neighbours, differentiable in all that it is given.
+
+    Spectra, start if it is soft, parameters of the bank, weights and descriptors of the solution, and the
+    temperature. Nothing of size m x n is stored, nor for derivatives.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+    - `pointwise_map`: the start, a pointwise map or a soft one from X to Y.
+    - `refiner`: how functional maps follow from maps; its `search` is not used.
+    - `recovery`: how soft maps follow from functional ones. Low temperatures are nearer to `jaxsmw.refine`,
+      with larger and less telling derivatives.
+    - `iterations`: how many functional maps are made after the first; with `"implicit"` at most so many.
+    - `differentiation`: how derivatives are had.
+        - `"unrolled"`: back through all iterations, as automatic differentiation does.
+        - `"checkpointed"`: the same derivatives; what they need within an iteration is computed anew.
+        - `"implicit"`: iterate up to a fixed point C = F(C, θ), where `dC = (I - dF/dC)^-1 dF/dθ dθ`
+          (implicit function theorem), by `optimistix.fixed_point`; the linear system is solved by GMRES, its
+          products being derivatives of one iteration. Takes no more memory for more iterations, and the
+          start has no derivative.
+    - `tolerance`: with `"implicit"`, on changes of C beside its largest entry, and of the linear solver.
+
+    **Returns:** A `SoftRefinement`. Nothing is raised for bad numbers: check its `result`. With `"implicit"`
+    it is `RESULTS.fixed_point_not_reached` if `iterations` were too few.
+
+    **Raises:** `ValueError` for fewer than one iteration, another `differentiation`, or spectra of two float
+    types.
+    """
+    check_choice("differentiation", differentiation, get_args(Differentiation))
+    if iterations < 1:
+        raise ValueError(f"refine_softly needs at least 1 iteration, not {iterations}")
+    if spectrum_x.eigenvectors.dtype != spectrum_y.eigenvectors.dtype:
+        raise ValueError(
+            f"the spectrum of X is {spectrum_x.eigenvectors.dtype} and that of Y "
+            f"{spectrum_y.eigenvectors.dtype}: compute both with the same jax_enable_x64"
+        )
+    problem = refiner.prepare(spectrum_x, spectrum_y)
+    start, result = refiner.update(problem, pointwise_map, None)
+    start_went = checked(start, start, result)
+
+    def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        soft = soft_recovery(refiner, recovery, problem, functional_map)
+        following, how = refiner.update(problem, soft, functional_map)
+        return following, checked(following, following, how)
+
+    if differentiation == "implicit":
+        last, done, converged = _fixed_point(lambda c: step(c)[0], start, iterations, tolerance)
+        # Once more, for what the solver does not tell: how the update went, and how far it still moves.
+        following, how = step(lax.stop_gradient(last))
+        went = where(how == RESULTS.successful, RESULTS.fixed_point_not_reached, how)
+        went = where(converged & (how == RESULTS.successful), RESULTS.successful, went)
+        before = last
+    else:
+        turn = jax.checkpoint(step) if differentiation == "checkpointed" else step
+
+        def follow(state: _State, _: None) -> tuple[_State, None]:
+            _, functional_map, so_far = state
+            next_one, how = turn(functional_map)
+            return (functional_map, next_one, where(so_far == RESULTS.successful, how, so_far)), None
+
+        (before, last, went), _ = lax.scan(follow, (start, start, start_went), None, length=iterations)
+        following, done = last, jnp.asarray(iterations, jnp.int32)
+    norm = jnp.sqrt(jnp.sum(lax.stop_gradient(last) ** 2))
+    change = jnp.sqrt(jnp.sum(lax.stop_gradient(following - before) ** 2)) / norm
+    went = where(start_went == RESULTS.successful, went, start_went)
+    return SoftRefinement(last, soft_recovery(refiner, recovery, problem, last), went, done, change)
+
+
+def soft_recovery(
+    refiner: WaveletPreservation,
+    recovery: Recovery,
+    problem: Problem,
+    functional_map: Float[Array, "k_out k_in"],
+) -> SoftMap | SparseSoftMap:
+    """The soft map of a functional map."""
+    x, y = problem.spectrum_x, problem.spectrum_y
+    areas_x, areas_y = (jnp.where(s.mask, s.vertex_areas, 0) for s in (x, y))
+    return recovery(*refiner.embeddings(problem, functional_map), areas_x, areas_y)
+
+
+def _fixed_point(
+    step: Callable[[Float[Array, "k_out k_in"]], Float[Array, "k_out k_in"]],
+    start: Float[Array, "k_out k_in"],
+    iterations: int,
+    tolerance: float,
+) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
+    """Where iterations come to rest, how many that took, and whether they did."""
+    import lineax as lx  # here, as importing them takes as long as an eigenbasis
+    import optimistix as optx
+
+    # In units of the largest entry, as what is wanted is precision relative to C as a whole; and in the
+    # default float type, since optimistix takes no float32 while jax_enable_x64 is set.
+    unit = lax.stop_gradient(jnp.max(jnp.abs(start)))
+
+    def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
+        return (step(scaled.astype(start.dtype) * unit) / unit).astype(float)
+
+    solution: optx.Solution = optx.fixed_point(
+        scaled_step,
+        optx.FixedPointIteration(rtol=0.0, atol=tolerance),
+        (lax.stop_gradient(start) / unit).astype(float),
+        max_steps=iterations,
+        adjoint=optx.ImplicitAdjoint(lx.GMRES(tolerance, tolerance)),
+        throw=False,
+    )
+    converged = solution.result == optx.RESULTS.successful
+    functional_map = solution.value.astype(start.dtype) * unit
+    return functional_map, solution.stats["num_steps"].astype(jnp.int32), converged
+
+
+_State = tuple[Float[Array, "k_out k_in"], Float[Array, "k_out k_in"], RESULTS]
+"""The functional map before, the last one, and how it went so far."""

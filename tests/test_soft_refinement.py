@@ -1,0 +1,306 @@
+"""Soft recoveries and the loop that can be differentiated: limits, derivatives, memory, what is reported."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from scipy.spatial.distance import cdist
+from synthetic import random_spectrum
+
+from jaxsmw.core.filters import Logarithm, Meyer, Warped
+from jaxsmw.core.functional_map import encode, wavelet_energy
+from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
+from jaxsmw.core.soft_refinement import refine_softly
+from jaxsmw.core.solutions import DescriptorPair, Filtering, LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.spectrum import Spectrum
+
+M, K = 120, 8
+# High, as vertices of random spectra are far from each other.
+RECOVERIES = {"softmax": Softmax(10.0), "few": NearestFew(5, 10.0), "sinkhorn": Sinkhorn(10.0, 6)}
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A shape, a shuffled and disturbed copy, and a start with a third of it wrong."""
+    generator = np.random.default_rng(0)
+    x = random_spectrum(M, K)
+    order = generator.permutation(M)
+    disturbed = x.eigenvectors[order] + 0.05 * generator.normal(size=(M, K))
+    y = Spectrum(x.eigenvalues, disturbed, x.vertex_areas[order], x.mask[order])
+    truth = np.argsort(order)
+    start = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
+    return x, y, jnp.asarray(start, jnp.int32)
+
+
+def points(m=150, n=140, d=4):
+    generator = np.random.default_rng(1)
+    sets = (jnp.asarray(generator.normal(size=(size, d))) for size in (m, n))
+    areas = (jnp.asarray(generator.uniform(0.5, 1.5, size)) for size in (m, n))
+    return *sets, *areas
+
+
+def dense(recovery: Recovery, queries, database, a, b):
+    """Rows of shares."""
+    return np.asarray(recovery(queries, database, a, b).pull_back(jnp.eye(database.shape[0])))
+
+
+def test_softmax_is_what_it_says():
+    queries, database, a, b = points()
+    distances = cdist(queries, database, "sqeuclidean")
+    a_, b_ = np.asarray(a / a.sum()), np.asarray(b / b.sum())
+    temperature = 0.7 * a_ @ distances.min(axis=1)
+    expected = b_ * np.exp(-distances / temperature)
+    expected /= expected.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(dense(Softmax(0.7), queries, database, a, b), expected, atol=1e-12)
+    # Among few: the same, where the others are left out.
+    few = np.where(distances <= np.sort(distances, axis=1)[:, 4:5], expected, 0)
+    few /= few.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(dense(NearestFew(5, 0.7), queries, database, a, b), few, atol=1e-12)
+    found = NearestFew(5, 0.7)(queries, database, a, b)
+    np.testing.assert_array_equal(found.pointwise_map(), distances.argmin(axis=1))
+    np.testing.assert_allclose(
+        dense(NearestFew(1000, 0.7), queries, database, a, b), expected, atol=1e-12
+    )  # as many as there are
+
+
+@pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
+def test_rows_of_no_area_get_nothing_and_change_nothing(recovery):
+    queries, database, a, b = points()
+    padded = jnp.concatenate([database, queries[:7]]), jnp.concatenate([b, jnp.zeros(7)])
+    shares = dense(recovery, queries, padded[0], a, padded[1])
+    np.testing.assert_array_equal(shares[:, -7:], 0)
+    np.testing.assert_allclose(shares[:, :-7], dense(recovery, queries, database, a, b), atol=1e-12)
+
+
+def test_fewer_of_positive_area_than_asked_for():
+    queries, database, a, b = points(n=9)
+    b = b.at[3:].set(0)
+    shares = dense(NearestFew(5), queries, database, a, b)
+    np.testing.assert_array_equal(shares[:, 3:], 0)
+    np.testing.assert_allclose(shares.sum(axis=1), 1)
+
+
+@pytest.mark.parametrize("recovery", [Softmax(0.01), NearestFew(5, 0.01)], ids=["softmax", "few"])
+def test_the_coldest_soft_maps_are_nearest_neighbors(pair, recovery):
+    x, y, start = pair
+    soft = refine_softly(x, y, start, recovery=recovery, iterations=2)
+    hard = refine(x, y, start, iterations=3)
+    assert soft.result == RESULTS.successful
+    np.testing.assert_array_equal(soft.soft_map.pointwise_map(), hard.pointwise_map)
+    np.testing.assert_allclose(soft.functional_map, hard.functional_map, atol=1e-9)
+
+
+@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
+    x, y, start = pair
+    one = NearestFew(1)(y.eigenvectors[start], y.eigenvectors, x.vertex_areas, y.vertex_areas)
+    np.testing.assert_array_equal(pull_back(one, y.eigenvectors), pull_back(start, y.eigenvectors))
+    hard, soft = (encode(t, x, y, convention=convention) for t in (start, one))
+    np.testing.assert_allclose(soft, hard, atol=1e-14)
+    g = Meyer(4)(x.eigenvalues, x.eigenvalues)
+    for norm in ("area", "frobenius"):
+        energies = (wavelet_energy(t, x, y, g, g, convention=convention, norm=norm) for t in (start, one))
+        expected, found = (energy(hard) for energy in energies)
+        np.testing.assert_allclose(found, expected)
+
+
+def leaves_and_directions(pair):
+    """What derivatives are taken in, and one direction in each."""
+    x, y, _ = pair
+    leaves = {
+        "eigenvalues of X": x.eigenvalues,
+        "eigenvalues of Y": y.eigenvalues,
+        "eigenvectors of X": x.eigenvectors,
+        "eigenvectors of Y": y.eigenvectors,
+        "vertex areas of Y": y.vertex_areas,
+        "bank": jnp.asarray(10.0),
+        "temperature": jnp.asarray(10.0),
+        "weight": jnp.asarray(1.0),
+        "descriptors": jnp.asarray(np.random.default_rng(2).normal(size=(M, 3))),
+    }
+    generator = np.random.default_rng(3)
+    directions = {
+        name: jnp.asarray(generator.normal(size=leaf.shape)) * jnp.mean(jnp.abs(leaf))
+        for name, leaf in leaves.items()
+    }
+    return leaves, directions
+
+
+def refined(pair, leaves, recovery, solution, **options):
+    x, y, start = pair
+    x = Spectrum(leaves["eigenvalues of X"], leaves["eigenvectors of X"], x.vertex_areas, x.mask)
+    y = Spectrum(leaves["eigenvalues of Y"], leaves["eigenvectors of Y"], leaves["vertex areas of Y"], y.mask)
+    if solution == "descriptors":
+        described = leaves["descriptors"]
+        solution = RegularizedLeastSquares(
+            orthogonality=None,
+            descriptor_preservation=leaves["weight"],
+            descriptors=DescriptorPair.project(described, described[::-1], x, y),
+            tolerance=1e-8,
+        )
+    refiner = WaveletPreservation(Warped(Meyer(4), Logarithm(leaves["bank"])), solution)
+    recovery = eqx.tree_at(lambda r: r.temperature, recovery, leaves["temperature"])
+    return refine_softly(x, y, start, refiner=refiner, recovery=recovery, **options)
+
+
+CASES = {
+    **{name: (recovery, Filtering(), "checkpointed") for name, recovery in RECOVERIES.items()},
+    "unrolled": (Softmax(10.0), Filtering(), "unrolled"),
+    "implicit": (Softmax(10.0), Filtering(), "implicit"),
+    "implicit, few": (NearestFew(5, 10.0), Filtering(), "implicit"),
+    "exact": (Softmax(10.0), LeastSquares(), "checkpointed"),
+    "descriptors": (Softmax(10.0), "descriptors", "checkpointed"),
+}
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_derivatives_are_those_of_finite_differences(pair, case):
+    recovery, solution, differentiation = case
+    leaves, directions = leaves_and_directions(pair)
+    implicit = differentiation == "implicit"
+    options = {"iterations": 100, "tolerance": 1e-12} if implicit else {"iterations": 2}
+    generator = np.random.default_rng(4)
+    of_map, of_positions = (jnp.asarray(generator.normal(size=(size, K))) for size in (K, M))
+
+    def loss(leaves):
+        outcome = refined(pair, leaves, recovery, solution, differentiation=differentiation, **options)
+        carried = outcome.soft_map.pull_back(leaves["eigenvectors of Y"])
+        return jnp.sum(of_map * outcome.functional_map) + jnp.sum(of_positions * carried), outcome.result
+
+    compiled = jax.jit(loss)
+    (_, result), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(leaves)
+    assert result == RESULTS.successful
+    for name, leaf in leaves.items():
+        if solution != "descriptors" and name in ("weight", "descriptors"):
+            continue
+        step = 1e-5 if solution == "descriptors" else 1e-6
+        ahead, behind = (
+            compiled(leaves | {name: leaf + sign * step * directions[name]})[0] for sign in (1, -1)
+        )
+        numerical = float(ahead - behind) / (2 * step)
+        assert numerical != 0, name
+        analytical = float(jnp.sum(gradient[name] * directions[name]))
+        np.testing.assert_allclose(analytical, numerical, rtol=2e-3, atol=1e-6, err_msg=name)
+
+
+def test_all_ways_agree_at_a_fixed_point(pair):
+    leaves, _ = leaves_and_directions(pair)
+
+    def gradient(differentiation):
+        def loss(leaves):
+            outcome = refined(
+                pair,
+                leaves,
+                Softmax(10.0),
+                Filtering(),
+                differentiation=differentiation,
+                iterations=60,
+                tolerance=1e-12,
+            )
+            return jnp.sum(outcome.functional_map[:4] ** 2), outcome
+
+        return jax.grad(loss, has_aux=True)(leaves)
+
+    gradients = {way: gradient(way) for way in ("unrolled", "checkpointed", "implicit")}
+    for way, (found, outcome) in gradients.items():
+        assert outcome.result == RESULTS.successful and outcome.change < 1e-9
+        for name, leaf in found.items():
+            expected = gradients["unrolled"][0][name]
+            np.testing.assert_allclose(leaf, expected, atol=1e-7 * float(jnp.abs(expected).max()) + 1e-10), way
+    assert gradients["implicit"][1].iterations < 60 == gradients["unrolled"][1].iterations
+
+
+def test_not_coming_to_rest_is_named(pair):
+    x, y, start = pair
+    few = refine_softly(
+        x, y, start, recovery=Softmax(10.0), iterations=2, differentiation="implicit", tolerance=1e-9
+    )
+    assert few.result == RESULTS.fixed_point_not_reached
+
+
+def test_the_start_has_a_derivative(pair):
+    x, y, _ = pair
+
+    def loss(features):
+        start = Softmax(100.0)(features, y.eigenvectors, x.vertex_areas, y.vertex_areas)
+        return jnp.sum(refine_softly(x, y, start, recovery=Softmax(10.0), iterations=1).functional_map[0])
+
+    assert float(jnp.abs(jax.grad(loss)(x.eigenvectors)).max()) > 1e-6
+
+
+@pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
+def test_padding_changes_nothing(pair, recovery):
+    x, y, start = pair
+
+    def padded(spectrum: Spectrum, rows: int) -> Spectrum:
+        add = lambda leaf: jnp.pad(leaf, [(0, rows)] + [(0, 0)] * (leaf.ndim - 1))  # noqa: E731
+        return Spectrum(
+            spectrum.eigenvalues, add(spectrum.eigenvectors), add(spectrum.vertex_areas), add(spectrum.mask)
+        )
+
+    options = {"recovery": recovery, "iterations": 2}
+    expected = refine_softly(x, y, start, **options)
+    found = refine_softly(padded(x, 9), padded(y, 4), jnp.pad(start, (0, 9)), **options)
+    np.testing.assert_allclose(found.functional_map, expected.functional_map, atol=1e-10)
+
+
+def test_signs_of_eigenvectors_do_not_matter(pair):
+    x, y, start = pair
+    signs = jnp.asarray([[1.0, -1.0] * (K // 2)])
+    turned = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * signs)
+    options = {"recovery": Softmax(10.0), "iterations": 2}
+    expected, found = (refine_softly(x, shape, start, **options) for shape in (y, turned))
+    np.testing.assert_allclose(found.functional_map * signs, expected.functional_map, atol=1e-12)
+
+
+def test_float32_in_float32_out(pair):
+    spectra = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, pair[:2])
+    for recovery in RECOVERIES.values():
+        for differentiation in ("checkpointed", "implicit"):
+            found = refine_softly(*spectra, pair[2], recovery=recovery, differentiation=differentiation)
+            assert found.functional_map.dtype == jnp.float32
+            assert found.change.dtype == jnp.float32
+
+
+@pytest.mark.parametrize("recovery", [Softmax(), NearestFew()], ids=["softmax", "few"])
+@pytest.mark.parametrize("differentiation", ["checkpointed", "implicit"])
+def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differentiation):
+    n, k = 5000, 20
+    spectrum = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(a.shape, np.dtype(np.float32) if a.dtype == np.float64 else a.dtype),
+        jax.eval_shape(lambda: Spectrum(jnp.ones(k), jnp.ones((n, k)), jnp.ones(n), jnp.ones(n, bool))),
+    )
+
+    def loss(x, y, start):
+        soft = refine_softly(x, y, start, recovery=recovery, iterations=8, differentiation=differentiation)
+        return jnp.sum(soft.soft_map.pull_back(y.eigenvectors) ** 2)
+
+    program = jax.jit(jax.grad(loss, allow_int=True)).lower(
+        spectrum, spectrum, jax.ShapeDtypeStruct((n,), jnp.int32)
+    )
+    assert program.compile().memory_analysis().temp_size_in_bytes < n * n * 4 / 3
+
+
+def test_what_went_wrong_is_named(pair):
+    x, y, start = pair
+    damaged = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors.at[3, 2].set(jnp.nan))
+    assert refine_softly(x, damaged, start).result == RESULTS.nonfinite_functional_map
+
+
+def test_settings_that_do_not_exist(pair):
+    x, y, start = pair
+    with pytest.raises(ValueError, match="at least 1 iteration"):
+        refine_softly(x, y, start, iterations=0)
+    with pytest.raises((ValueError, TypeCheckError), match="differentiation"):
+        refine_softly(x, y, start, differentiation="forward")
+    with pytest.raises(ValueError, match="same jax_enable_x64"):
+        refine_softly(x, jax.tree.map(lambda a: a.astype(jnp.float32), y), start)
+    with pytest.raises(ValueError, match="at least 1 row"):
+        NearestFew(0)
+    for recovery in (Softmax, NearestFew, Sinkhorn):
+        with pytest.raises(ValueError, match=f"temperature of {recovery.__name__}"):
+            recovery(temperature=0.0)
