@@ -265,8 +265,8 @@ def _mended(
 ) -> tuple[Refinement, float, bool]:
     """The least flawed of a refinement and of others, each begun without what was faulty in the last.
 
-    And its flaw, and whether limbs may be swapped still. Where a small flaw stays what it is, whatever is left
-    out, bodies differ.
+    And its flaw, and whether limbs may be swapped still. A small flaw that stays, whatever is left out, is
+    how bodies differ.
     """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
@@ -283,7 +283,7 @@ def _mended(
             first = flawed
         if flawed < least:
             best, least = refinement, flawed
-        stays = done == len(criteria) and least > _HARDLY * first and first < _SMALL
+        stays = done == rounds and least > _HARDLY * first and first < _SMALL
         if least < _SUSPICIOUS or stays:
             return best, least, False
         faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
@@ -304,7 +304,7 @@ _NEGLIGIBLE = 0.002
 _TOO_MUCH = 0.5
 # What is less flawed than this looks right (right maps with 50 eigenvectors have up to 3); with less than the
 # other it does if it stays so, but for a tenth.
-_SUSPICIOUS, _SMALL, _HARDLY = 2.5, 5.0, 0.9
+_SUSPICIOUS, _SMALL, _HARDLY = 2.5, 3.5, 0.9
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From half to twice of this, nearly the same outcomes are chosen.
 _UNCERTAINTY = 12.0

@@ -28,6 +28,7 @@ from jaxsmw.core.filters import (
     Regular,
     Simoncelli,
     SimpleTight,
+    SoftmaxFrame,
     SpectralDistribution,
     Warped,
 )
@@ -59,6 +60,8 @@ PARSEVAL = {name: make(6) for name, make in PARSEVAL_OF_ANY_SIZE.items()} | {
     "papadakis": Papadakis(),
     "regular": Regular(),
     "identity": Identity(),
+    "softmax": SoftmaxFrame(np.random.default_rng(5).uniform(0.5, 3, size=(4, 7))),
+    "softmax, power": Warped(SoftmaxFrame(np.random.default_rng(6).uniform(0.5, 3, size=(3, 5))), Power()),
 }
 BANKS = PARSEVAL | {
     "cubic spline": CubicSpline(),
@@ -208,6 +211,24 @@ def test_every_continuous_parameter_changes_the_result(bank):
         assert np.abs(change).max() > 1e-3
 
 
+def test_a_softmax_frame_is_like_another_bank_at_its_knots():
+    knots = jnp.linspace(0, 20, 33)
+    for bank in (Meyer(5), Itersine(4)):
+        alike = SoftmaxFrame.like(bank, 33, floor=1e-6)
+        np.testing.assert_allclose(sample(alike, knots, knots), sample(bank, knots, knots), atol=1e-5)
+    # Not tight: what is alike is the shape of each filter beside the others.
+    squares = sample(Heat([1.0, 10.0]), knots, knots) ** 2
+    alike = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
+    np.testing.assert_allclose(alike[0], squares[0] / squares.sum(axis=0), atol=1e-3)
+
+
+def test_nothing_but_differences_of_logits_counts():
+    logits = jnp.asarray(np.random.default_rng(0).normal(size=(4, 7)))
+    grid = jnp.linspace(0, 3, 50)
+    shifted = SoftmaxFrame(logits + jnp.arange(7.0)[None, :])
+    np.testing.assert_allclose(shifted(grid, grid), SoftmaxFrame(logits)(grid, grid), atol=1e-12)
+
+
 def test_the_sizes_are_not_traced():
     banks = [Meyer(), SimpleTight(), Itersine(), HalfCosine(), Regular(), Identity()]
     assert not jax.tree.leaves(banks)
@@ -332,6 +353,10 @@ def test_repeated_eigenvalues_are_filtered_alike():
         (lambda: Simoncelli(1.5), "edge of Simoncelli must be between 0 and 1"),
         (lambda: Papadakis(-0.1), "edge of Papadakis must be between 0 and 1"),
         (lambda: Regular(-1), "degree of Regular cannot be negative"),
+        (lambda: SoftmaxFrame([1.0, 2.0]), r"logits of SoftmaxFrame have shape \(2,\)"),
+        (lambda: SoftmaxFrame(np.ones((2, 1))), "at least 2 knots"),
+        (lambda: SoftmaxFrame.like(Meyer(), knots=1), "at least 2 knots"),
+        (lambda: SoftmaxFrame.like(Meyer(), floor=0.0), "positive floor"),
         (lambda: CubicSpline(1), "CubicSpline needs at least 2"),
         (lambda: CubicSpline(ratio=1.0), "ratio of CubicSpline must be finite and above 1"),
         (lambda: MexicanHat(1), "MexicanHat needs at least 2"),

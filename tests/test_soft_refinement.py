@@ -14,7 +14,7 @@ from jaxsmw.core.functional_map import encode, wavelet_energy
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
-from jaxsmw.core.soft_refinement import refine_softly
+from jaxsmw.core.soft_refinement import WaveletPreservationLayer, refine_softly
 from jaxsmw.core.solutions import DescriptorPair, Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
@@ -184,7 +184,9 @@ def test_derivatives_are_those_of_finite_differences(pair, case):
         numerical = float(ahead - behind) / (2 * step)
         assert numerical != 0, name
         analytical = float(jnp.sum(gradient[name] * directions[name]))
-        np.testing.assert_allclose(analytical, numerical, rtol=2e-3, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            analytical, numerical, rtol=2e-3, atol=1e-4 if solution == "descriptors" else 1e-6, err_msg=name
+        )
 
 
 def test_all_ways_agree_at_a_fixed_point(pair):
@@ -210,7 +212,12 @@ def test_all_ways_agree_at_a_fixed_point(pair):
         assert outcome.result == RESULTS.successful and outcome.change < 1e-9
         for name, leaf in found.items():
             expected = gradients["unrolled"][0][name]
-            np.testing.assert_allclose(leaf, expected, atol=1e-7 * float(jnp.abs(expected).max()) + 1e-10), way
+            (
+                np.testing.assert_allclose(
+                    leaf, expected, atol=1e-7 * float(jnp.abs(expected).max()) + 1e-10
+                ),
+                way,
+            )
     assert gradients["implicit"][1].iterations < 60 == gradients["unrolled"][1].iterations
 
 
@@ -230,6 +237,29 @@ def test_the_start_has_a_derivative(pair):
         return jnp.sum(refine_softly(x, y, start, recovery=Softmax(10.0), iterations=1).functional_map[0])
 
     assert float(jnp.abs(jax.grad(loss)(x.eigenvectors)).max()) > 1e-6
+
+
+def test_the_layer_learns_features_that_match(pair):
+    """From features of chance to such as tell the shapes' vertices apart, by gradients through the layer."""
+    x, y, _ = pair
+    truth = jnp.argmin(jnp.sum((x.eigenvectors[:, None] - y.eigenvectors[None]) ** 2, axis=2), axis=1)
+    layer = WaveletPreservationLayer(recovery_of_features=Softmax(1.0), recovery=Softmax(1.0), iterations=1)
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(K, 2)))
+
+    def loss(weights):
+        outcome = layer(x.eigenvectors @ weights, y.eigenvectors @ weights, x, y)
+        error = outcome.soft_map.pull_back(y.eigenvectors) - y.eigenvectors[truth]
+        return jnp.mean(jnp.sum(error**2, axis=1)), outcome
+
+    descend = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    (first, outcome), _ = descend(weights)
+    assert outcome.functional_map.shape == (K, K)
+    for _ in range(30):
+        (now, outcome), gradient = descend(weights)
+        weights -= 0.3 * gradient / jnp.linalg.norm(gradient)
+    assert outcome.result == RESULTS.successful and now < 0.3 * first
+    # Its leaves are what can be trained.
+    assert len(jax.tree.leaves(layer)) == 2
 
 
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)

@@ -4,8 +4,9 @@ Every bank here depends on ratios of eigenvalues only, so that the scale of a sh
 is the one that passes the lowest eigenvalues.
 
 Parseval (the squares sum to one): `Meyer`, `SimpleTight`, `Itersine`, `HalfCosine`, `Held`, `Simoncelli`,
-`Papadakis`, `Regular`, and each of them `Warped`; also `Identity`. Not tight: `CubicSpline`, `MexicanHat`,
-`Heat`, `Gabor`, `ExponentialWindow`, `LowPass`; `jaxsmw.core.frames.tighten` makes a tight frame of any.
+`Papadakis`, `Regular`, `SoftmaxFrame` (to be learned), and each of them `Warped`; also `Identity`. Not tight:
+`CubicSpline`, `MexicanHat`, `Heat`, `Gabor`, `ExponentialWindow`, `LowPass`; `jaxsmw.core.frames.tighten`
+makes a tight frame of any.
 """
 
 from __future__ import annotations
@@ -506,6 +507,60 @@ class Identity(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         return jnp.ones_like(points)[None, :]
+
+
+# A bank to be learned
+
+
+class SoftmaxFrame(FilterBank):
+    """Filters whose squares are a softmax, so that they sum to one whatever the parameters are.
+
+    `g_l(lambda)² = exp(z_l) / sum_j exp(z_j)`, each z_l linear in lambda between evenly spaced knots. Every
+    Parseval frame of positive filters is one up to the resolution of the knots; to learn one, start
+    `like` a known bank and follow the gradient. On eigenvalues whose low end matters, wrap it in
+    `Warped(…, Power())`, which spaces the knots evenly in frequency.
+
+    **Arguments:**
+
+    - `logits`: (filters, knots), z at the knots, from 0 to lambda_max; at least 2 knots. Adding a constant to
+      a column changes nothing.
+    """
+
+    logits: Float[Array, "filters knots"] = eqx.field(converter=as_parameter)
+
+    def __check_init__(self) -> None:
+        if self.logits.ndim != 2 or self.logits.shape[0] < 1 or self.logits.shape[1] < 2:
+            raise ValueError(
+                f"the logits of SoftmaxFrame have shape {self.logits.shape}, where (filters, knots) with at "
+                "least 2 knots is needed"
+            )
+
+    @classmethod
+    def like(cls, bank: FilterBank, knots: int = 32, *, floor: float = 0.01) -> SoftmaxFrame:
+        """A frame that agrees with a bank at its knots, up to the bank's frame function.
+
+        **Arguments:**
+
+        - `bank`: any bank, of any sign: squares are what counts.
+        - `knots`: how many; at least 2.
+        - `floor`: raises filters where they are less, since one that is zero cannot be learned.
+
+        **Raises:** `ValueError` for fewer than 2 knots, or a floor that is not positive.
+        """
+        if knots < 2 or not floor > 0:
+            raise ValueError(
+                f"SoftmaxFrame.like needs at least 2 knots and a positive floor, not {knots}, {floor}"
+            )
+        points = jnp.linspace(0, 1, knots)
+        return cls(2 * jnp.log(jnp.maximum(jnp.abs(sample_bank(bank, points, points)), floor)))
+
+    def __call__(
+        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
+    ) -> Float[Array, "filters p"]:
+        knots = jnp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
+        relative, logits = points / eigenvalues[-1], self.logits.astype(points.dtype)
+        heights = jax.vmap(lambda z: jnp.interp(relative, knots, z))(logits)
+        return jnp.exp(jax.nn.log_softmax(heights, axis=0) / 2)
 
 
 # Banks adapted to the spectrum

@@ -38,8 +38,8 @@ class RESULTS(eqx.Enumeration):
         "samples, fewer eigenvectors, float64, or solution=Filtering(), which solves nothing."
     )
     fixed_point_not_reached = (
-        "The soft refinement did not come to rest, so that its implicit derivatives mean little; give it more "
-        "iterations, a larger tolerance or a higher temperature, or differentiate through its iterations."
+        "The soft refinement did not come to rest, so that its implicit derivatives mean little; give it "
+        "more iterations, a larger tolerance or a higher temperature, or differentiate through iterations."
     )
     solver_not_converged = (
         "The iterative solver for the functional map did not reach its tolerance; give it more max_steps, a "

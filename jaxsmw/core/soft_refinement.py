@@ -99,24 +99,67 @@ def refine_softly(
     if differentiation == "implicit":
         last, done, converged = _fixed_point(lambda c: step(c)[0], start, iterations, tolerance)
         # Once more, for what the solver does not tell: how the update went, and how far it still moves.
-        following, how = step(lax.stop_gradient(last))
-        went = where(how == RESULTS.successful, RESULTS.fixed_point_not_reached, how)
-        went = where(converged & (how == RESULTS.successful), RESULTS.successful, went)
-        before = last
+        before, (after, went) = last, step(lax.stop_gradient(last))
+        unsettled = (went == RESULTS.successful) & ~converged
+        went = where(unsettled, RESULTS.fixed_point_not_reached, went)
     else:
         turn = jax.checkpoint(step) if differentiation == "checkpointed" else step
 
         def follow(state: _State, _: None) -> tuple[_State, None]:
-            _, functional_map, so_far = state
-            next_one, how = turn(functional_map)
-            return (functional_map, next_one, where(so_far == RESULTS.successful, how, so_far)), None
+            functional_map, so_far = state[1:]
+            following, how = turn(functional_map)
+            return (functional_map, following, where(so_far == RESULTS.successful, how, so_far)), None
 
         (before, last, went), _ = lax.scan(follow, (start, start, start_went), None, length=iterations)
-        following, done = last, jnp.asarray(iterations, jnp.int32)
-    norm = jnp.sqrt(jnp.sum(lax.stop_gradient(last) ** 2))
-    change = jnp.sqrt(jnp.sum(lax.stop_gradient(following - before) ** 2)) / norm
+        after, done = last, jnp.asarray(iterations, jnp.int32)
+    moved, norm = (jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (after - before, last))
     went = where(start_went == RESULTS.successful, went, start_went)
-    return SoftRefinement(last, soft_recovery(refiner, recovery, problem, last), went, done, change)
+    return SoftRefinement(last, soft_recovery(refiner, recovery, problem, last), went, done, moved / norm)
+
+
+class WaveletPreservationLayer(eqx.Module):
+    """A layer for models of one's own: features of both shapes in, functional map and soft map out.
+
+    The soft map between the features is refined by `refine_softly`. It has no parameters but those of its
+    modules, which are leaves, as those of any equinox module: train them all, or freeze what is not to be
+    learned (`equinox.partition`). As a pure function of arrays it also is part of a flax or haiku model.
+
+    **Arguments:**
+
+    - `refiner`: how functional maps follow from maps.
+    - `recovery_of_features`: how the first soft map follows from the features.
+    - `recovery`, `iterations`, `differentiation`, `tolerance`: see `refine_softly`.
+    """
+
+    refiner: WaveletPreservation = WaveletPreservation()
+    recovery_of_features: Recovery = Softmax()
+    recovery: Recovery = Softmax()
+    iterations: int = eqx.field(static=True, default=2)
+    differentiation: Differentiation = eqx.field(static=True, default="checkpointed")
+    tolerance: float = eqx.field(static=True, default=1e-4)
+
+    def __call__(
+        self,
+        features_x: Float[Array, "m d"],
+        features_y: Float[Array, "n d"],
+        spectrum_x: Spectrum,
+        spectrum_y: Spectrum,
+    ) -> SoftRefinement:
+        """Match two shapes by features of their vertices: near in feature space is likely the same point.
+
+        **Raises:** see `refine_softly`.
+        """
+        areas = (jnp.where(s.mask, s.vertex_areas, 0) for s in (spectrum_x, spectrum_y))
+        return refine_softly(
+            spectrum_x,
+            spectrum_y,
+            self.recovery_of_features(features_x, features_y, *areas),
+            refiner=self.refiner,
+            recovery=self.recovery,
+            iterations=self.iterations,
+            differentiation=self.differentiation,
+            tolerance=self.tolerance,
+        )
 
 
 def soft_recovery(
@@ -156,7 +199,7 @@ def _fixed_point(
         adjoint=optx.ImplicitAdjoint(lx.GMRES(tolerance, tolerance)),
         throw=False,
     )
-    converged = solution.result == optx.RESULTS.successful
+    converged = jnp.asarray(solution.result == optx.RESULTS.successful)
     functional_map = solution.value.astype(start.dtype) * unit
     return functional_map, solution.stats["num_steps"].astype(jnp.int32), converged
 
