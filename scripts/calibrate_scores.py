@@ -22,18 +22,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
-from scipy.spatial import KDTree
+from jaxtyping import Float64
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from jaxsmw import InputError, geodesic_error, match, read_mesh
 from jaxsmw.evaluation.benchmark import choose_pairs
 from jaxsmw.evaluation.datasets import DataPair, DataSet, open_data_set
-from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.faults import flaw, stretch
-from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS
 from jaxsmw.provenance import commit, machine, versions
@@ -65,18 +62,11 @@ def measure(pair: DataPair, seed: int, number_of_samples: int | None = 1000) -> 
     except InputError:
         mirrored = None
     if mirrored is not None and isinstance(mirrored.targets, np.ndarray) and not pair.partial:
-        turned = match(mesh_x, mesh_y, init=everywhere(mirrored, mesh_x), preset=AS_IT_STARTS)
+        turned = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=AS_IT_STARTS)
         direct, other = (looks(result) for result in (found, turned))
         scores = {name: (direct[name], other[name]) for name in direct}
     expected = found.expected_error()[error.source_vertices]
     return Measured(error.errors[known], expected[known], scores)
-
-
-def everywhere(truth: GroundTruth, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-    """The truth of the nearest vertex for which there is one."""
-    _, nearest = KDTree(mesh_x.vertices[truth.source_vertices]).query(mesh_x.vertices)
-    assert isinstance(truth.targets, np.ndarray)
-    return truth.targets[nearest]
 
 
 def looks(found: Correspondence) -> dict[str, float]:
@@ -85,7 +75,7 @@ def looks(found: Correspondence) -> dict[str, float]:
     updated = found.refinement.updated
     return {
         "stretch": stretch(*meshes, pointwise_map),
-        "uncertainty of the regression": float(updated.forward.uncertainty + updated.backward.uncertainty),
+        "uncertainty of the regression": float(updated.uncertainty),
         "flaw": flaw(*meshes, pointwise_map, np.asarray(found.spectrum_x.eigenvectors)),
     }
 

@@ -4,14 +4,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from synthetic import bumpy_mesh
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import calibrate_scores
-from calibrate_scores import Measured, everywhere, tables
-
-from jaxsmw.evaluation.ground_truth import GroundTruth
+from calibrate_scores import Measured, tables
 
 
 def cells(table: str) -> list[list[str]]:
@@ -29,15 +26,6 @@ def test_tables_say_what_was_measured():
     # The last tenth: ten of the largest errors by the one, twenty of the smallest by the others.
     assert float(tenths[-1][1]) == round(1e3 * (true[-10:].mean() + 2 * true[:10].mean()) / 3, 1)
     assert scores[2:] == [["a", "1 of 1"], ["b", "0 of 2"]]
-
-
-def test_vertices_without_a_truth_take_the_nearest_ones():
-    mesh = bumpy_mesh(2)
-    known = np.arange(0, 162, 2)
-    found = everywhere(GroundTruth(known, known + 1), mesh)
-    np.testing.assert_array_equal(found[known], known + 1)
-    other = np.linalg.norm(mesh.vertices[1] - mesh.vertices[known], axis=1).argmin()
-    assert found[1] == known[other] + 1
 
 
 def test_stages_after_the_first_do_not_mend():

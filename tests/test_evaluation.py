@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import grid_mesh
+from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw import InputError, make_mesh, read_mesh
 from jaxsmw.evaluation.ground_truth import (
@@ -461,3 +461,12 @@ def test_errors_that_others_measured_for_the_same_maps(shared):
                 errors = 1000 * geodesic_error(y, pointwise_map, truth, number_of_samples=1500).errors
                 standard_error = errors.std() * np.sqrt(1 / 1000 + 1 / 1500)
                 assert abs(errors.mean() - mean) < 3.5 * standard_error, (a, b, name)
+
+
+def test_vertices_without_a_truth_take_the_nearest_ones():
+    mesh = bumpy_mesh(2)
+    known = np.arange(0, 162, 2)
+    found = GroundTruth(known, known + 1).everywhere(mesh)
+    np.testing.assert_array_equal(found[known], known + 1)
+    other = np.linalg.norm(mesh.vertices[1] - mesh.vertices[known], axis=1).argmin()
+    assert found[1] == known[other] + 1

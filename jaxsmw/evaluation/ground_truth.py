@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
@@ -54,6 +55,16 @@ class GroundTruth:
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
         """The targets of vertices 0, 1, … of X, in this order."""
         return cls(np.arange(len(targets)), targets)
+
+    def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
+        """A pointwise map X -> Y: every vertex gets the target of the nearest one that has one.
+
+        **Raises:** `InputError` if the targets are not vertices.
+        """
+        if not isinstance(self.targets, np.ndarray):
+            raise InputError("ground truth: its targets are points on triangles, where vertices are needed.")
+        _, nearest = KDTree(mesh_x.vertices[self.source_vertices]).query(mesh_x.vertices)
+        return self.targets[nearest]
 
 
 def read_ground_truth(
