@@ -179,7 +179,7 @@ def train(
 
     frame = like_meyer()
     state = State(frame, optimizer.init(frame), jnp.asarray(0, jnp.int32), jnp.zeros(steps))
-    saved = directory / f"training_{name}_{steps}_{seed}.eqx"
+    saved = make_directory(directory) / f"training_{name}_{steps}_{seed}.eqx"
     if saved.exists():
         state = eqx.tree_deserialise_leaves(saved, state)
     order = np.random.default_rng(seed).integers(0, len(pairs), steps)
