@@ -3,6 +3,7 @@
 import logging
 from concurrent.futures import Future
 from dataclasses import replace
+from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import initial_map, match, paired_spectra
+from jaxsmw.matching import describe, initial_map, match, other_starts, paired_spectra
 from jaxsmw.presets import Stage, chosen_stages
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
@@ -260,6 +261,39 @@ def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
     spectra = [compute_spectrum(mesh, 10) for mesh in (mesh_x, mesh_y)]
     distances = cdist(shot_descriptors(mesh_x), shot_descriptors(mesh_y))
     np.testing.assert_array_equal(initial_map(mesh_x, mesh_y, *spectra), distances.argmin(axis=1))
+
+
+@pytest.mark.parametrize("thinned", [False, True])
+def test_other_starts_differ_and_are_better_here(pair, thinned, monkeypatch):
+    mesh_x, mesh_y, truth = pair
+    spectra = paired_spectra(mesh_x, mesh_y, 30)
+    if thinned:
+        monkeypatch.setattr(matching, "_COMPARED", 1200)
+        monkeypatch.setattr(matching, "_COMPARED_FROM", 1000)
+    starts = list(other_starts(mesh_x, mesh_y, *spectra))
+    assert len(starts) == 3
+    usual = initial_map(mesh_x, mesh_y, *spectra)
+    for start in starts:
+        assert start.dtype == np.int64 and start.shape == truth.shape
+        # Read back from a filtered functional map, they are smoother than nearest neighbours.
+        assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, usual, truth)
+    assert all(np.any(a != b) for a, b in combinations(starts, 2))
+
+
+def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
+    mesh_x, mesh_y, truth = pair
+    spectra = paired_spectra(mesh_x, mesh_y, 30)
+    described = describe(mesh_x, mesh_y, *spectra, 60)
+    monkeypatch.setattr(matching, "_FINE", 10**6)
+    coarse = describe(mesh_x, mesh_y, *spectra, 60)
+    assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
+    for x, y in (described, coarse):  # of mean square 1, and the same on both shapes
+        squares = [
+            np.asarray(s.vertex_areas) @ np.asarray(s.descriptors) ** 2 / np.sum(s.vertex_areas)
+            for s in (x, y)
+        ]
+        np.testing.assert_allclose((squares[0] + squares[1]) / 2, 1, rtol=1e-3)
+    assert np.abs(np.asarray(described[0].descriptors - coarse[0].descriptors)).max() > 0.1
 
 
 def test_functional_start_preserves_descriptors_smoothly(pair):
