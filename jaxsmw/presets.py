@@ -180,8 +180,8 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken one by one if a stage is to mend, until an outcome looks right; the least flawed
-      is returned, where features that predict each other (`FeatureRegression`) count as well.
+    - `other_starts`: taken if a stage that is to mend could not; the least flawed outcome is returned, where
+      features that predict each other (`FeatureRegression`) count as well.
     - `history`: see `jaxsmw.refine`.
     """
     through = partial_function(_through, samples=samples, meshes=meshes, partial=partial, history=history)
@@ -203,9 +203,11 @@ def refine_in_stages(
             doubt += _UNCERTAINTY * float(last.updated.uncertainty)
         if doubt < least:
             best, least = (refinements, start), doubt
-        if not suspicious:
-            break
-        logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
+        # Of several that look right one may be better: once in doubt, all are tried.
+        if start is pointwise_map:
+            if not suspicious:
+                break
+            logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
     refinements, start = best
     so_far = refinements[-1].pointwise_map if refinements else start
     return refinements + through(certain, so_far)[0], start

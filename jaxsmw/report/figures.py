@@ -573,7 +573,7 @@ def _draw_error_scale(figure: Figure, limit: float, exceeded: bool) -> None:
     scale = figure.colorbar(
         ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max" if exceeded else "neither"
     )
-    scale.set_label("geodesic error / √area", fontsize=7.5, color=_FAINT)
+    scale.set_label("error / √area", fontsize=7.5, color=_FAINT)
     scale.outline.set_visible(False)
     _style(axes)
 
