@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
@@ -405,8 +405,11 @@ def describe(
     - `number_of_descriptors`: d, at most 352; the components in which the shapes' vertices differ most.
     """
     sides = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
-    radii = _FINE_RADII if min(len(side.mesh.vertices) for side in sides) >= _FINE else (SHOT_RADIUS,)
-    of_radii = [_shot(*sides, partial, radius) for radius in radii]
+    of_radii = [_shot(*sides, partial)]
+    if min(len(side.mesh.vertices) for side in sides) >= _FINE:
+        with suppress(InputError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where a mesh is too coarse for it, the usual one is enough
+            of_radii.append(_shot(*sides, partial, _FINE_RADIUS))
     shot = [np.hstack(of_shape) for of_shape in zip(*of_radii, strict=True)]
     weights = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
     both, weight = np.concatenate(shot), np.concatenate([w / w.sum() / 2 for w in weights])
@@ -556,7 +559,7 @@ _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # A thousandth of a body's area shows nothing of its kind.
 _SMALLEST_PART = 1e-3
 # The smaller neighbourhoods hold ten vertices from this many on.
-_FINE, _FINE_RADII = 2000, (2 / 3 * SHOT_RADIUS, SHOT_RADIUS)
+_FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
 # Descriptors of wider neighbourhoods vary more slowly.
 _SPREAD = 2000
 

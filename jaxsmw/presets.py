@@ -201,7 +201,7 @@ def refine_in_stages(
         doubt = np.log(flawed)
         if isinstance(last.updated, Regression):
             doubt += _UNCERTAINTY * float(last.updated.uncertainty)
-        if doubt < least:
+        if not best[0] or doubt < least:
             best, least = (refinements, start), doubt
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
