@@ -287,6 +287,22 @@ def test_signs_of_eigenvectors_do_not_matter(pair):
     np.testing.assert_allclose(found.functional_map * signs, expected.functional_map, atol=1e-12)
 
 
+@pytest.mark.parametrize("differentiation", ["checkpointed", "implicit"])
+def test_vmap_over_pairs_equals_a_loop(pair, differentiation):
+    x, y, start = pair
+    options = {"recovery": Softmax(10.0), "iterations": 30, "differentiation": differentiation}
+
+    def loss(x, y, start):
+        return jnp.sum(refine_softly(x, y, start, **options).functional_map[0])
+
+    two = [(x, y, start), (y, x, start[::-1])]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *two)
+    gradient = jax.grad(lambda v, x, y, s: loss(eqx.tree_at(lambda z: z.eigenvectors, x, v), y, s))
+    found = jax.vmap(gradient)(stacked[0].eigenvectors, *stacked)
+    for each, (a, b, s) in zip(found, two, strict=True):
+        np.testing.assert_allclose(each, gradient(a.eigenvectors, a, b, s), atol=1e-5)
+
+
 def test_float32_in_float32_out(pair):
     spectra = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, pair[:2])
     for recovery in RECOVERIES.values():

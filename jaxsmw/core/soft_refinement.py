@@ -77,7 +77,8 @@ def refine_softly(
     it is `RESULTS.fixed_point_not_reached` if `iterations` were too few.
 
     **Raises:** `ValueError` for fewer than one iteration, another `differentiation`, or spectra of two float
-    types.
+    types. With `"implicit"`, derivatives raise equinox's runtime error where GMRES does not come to its
+    tolerance, as at a point that is not fixed.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     if iterations < 1:
