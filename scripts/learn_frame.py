@@ -60,7 +60,7 @@ from jaxsmw.provenance import commit, machine, versions
 from jaxsmw.report.tables import markdown
 
 EIGENVECTORS, ITERATIONS, SAMPLES, KNOTS, FILTERS = 100, 3, 1000, 32, 6
-TEMPERATURE, LEARNING_RATE = 0.1, 0.03
+TEMPERATURE, LEARNING_RATE, FLOOR = 0.1, 0.3, 0.05
 TRAINING_PEOPLE, POSES = 5, 10
 # Steps between saves.
 _SAVED_EVERY = 10
@@ -85,7 +85,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 def like_meyer() -> SoftmaxFrame:
     """Where learning starts."""
-    return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS)
+    return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 
 def sampled(pair: DataPair) -> Sampled:
@@ -167,14 +167,17 @@ class State(eqx.Module):
 def train(
     name: str, pairs: list[DataPair], steps: int, seed: int, directory: Path, prepared: dict
 ) -> tuple[SoftmaxFrame, np.ndarray]:
-    """The frame after so many steps, each by another pair, and the losses on the way."""
+    """The frame after so many steps, each by another pair, and the losses on the way.
+
+    Pairs differ more than frames do: losses are in units of that of the frame before learning, on the same pair.
+    """
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps))
 
     @eqx.filter_jit
     def improve(state: State, pair: Sampled) -> State:
         loss, gradient = jax.value_and_grad(LOSSES[name])(state.frame, pair)
         change, following = optimizer.update(gradient, state.optimizer)
-        losses = state.losses.at[state.step].set(loss)
+        losses = state.losses.at[state.step].set(loss / LOSSES[name](like_meyer(), pair))
         return State(optax.apply_updates(state.frame, change), following, state.step + 1, losses)
 
     frame = like_meyer()
@@ -259,8 +262,8 @@ def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path
     for name, values in losses.items():
         window = max(1, len(values) // 10)
         smooth = np.convolve(values, np.ones(window) / window, "valid")
-        axes[-1].plot(np.arange(len(smooth)) + window / 2, smooth / smooth[0], label=name)
-    axes[-1].set(title="loss, relative to the first", xlabel="step")
+        axes[-1].plot(np.arange(len(smooth)) + window / 2, smooth, label=name)
+    axes[-1].set(title="loss, of that before learning", xlabel="step")
     axes[-1].legend()
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)

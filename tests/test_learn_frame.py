@@ -37,7 +37,6 @@ def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
 def pairs(monkeypatch):
     # Vertices of random spectra are far from each other.
     monkeypatch.setattr(learn_frame, "TEMPERATURE", 1.0)
-    monkeypatch.setattr(learn_frame, "LEARNING_RATE", 0.3)
     made = [fake_pair(seed) for seed in range(3)]
     with jax.numpy_dtype_promotion("standard"):  # which optax needs
         yield [pair for pair, _ in made], {pair.names: sampled for pair, sampled in made}
@@ -47,7 +46,7 @@ def pairs(monkeypatch):
 def test_learning_lowers_the_loss(pairs, tmp_path, name):
     listed, prepared = pairs
     frame, losses = train(name, listed[:1], 20, 0, tmp_path, prepared)
-    assert losses.shape == (20,) and losses[-1] < 0.97 * losses[0]
+    assert losses.shape == (20,) and losses[0] == pytest.approx(1) and losses[-1] < 0.97
     assert float(abs(frame.logits - like_meyer().logits).max()) > 0.1
 
 
@@ -82,7 +81,7 @@ def test_frames_are_kept(tmp_path):
     bank = load(tmp_path / "frame.npz")
     np.testing.assert_array_equal(bank(points, points), bank_of(frame)(points, points))
     # Learning starts near Meyer's frame.
-    np.testing.assert_allclose(bank(points, points), Meyer(6)(points, points), atol=0.15)
+    np.testing.assert_allclose(bank(points, points), Meyer(6)(points, points), atol=0.2)
 
 
 def test_the_summary_says_whether_it_helped():
