@@ -169,7 +169,7 @@ def train(
 ) -> tuple[SoftmaxFrame, np.ndarray]:
     """The frame after so many steps, each by another pair, and the losses on the way.
 
-    Pairs differ more than frames do: losses are in units of that of the frame before learning, on the same pair.
+    Pairs differ more than frames do: losses are in units of that of the frame before learning, pair by pair.
     """
     optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps))
 
