@@ -243,21 +243,22 @@ def test_the_layer_learns_features_that_match(pair):
     """From features of chance to such as tell the shapes' vertices apart, by gradients through the layer."""
     x, y, _ = pair
     truth = jnp.argmin(jnp.sum((x.eigenvectors[:, None] - y.eigenvectors[None]) ** 2, axis=2), axis=1)
-    layer = WaveletPreservationLayer(recovery_of_features=Softmax(1.0), recovery=Softmax(1.0), iterations=1)
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=(K, 2)))
+    layer = WaveletPreservationLayer(recovery_of_features=Softmax(1.0), recovery=Softmax(10.0), iterations=1)
+    features_x = x.eigenvectors @ jnp.asarray(np.random.default_rng(0).normal(size=(K, 3)))
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(K, 3)))
 
     def loss(weights):
-        outcome = layer(x.eigenvectors @ weights, y.eigenvectors @ weights, x, y)
+        outcome = layer(features_x, y.eigenvectors @ weights, x, y)
         error = outcome.soft_map.pull_back(y.eigenvectors) - y.eigenvectors[truth]
         return jnp.mean(jnp.sum(error**2, axis=1)), outcome
 
     descend = jax.jit(jax.value_and_grad(loss, has_aux=True))
     (first, outcome), _ = descend(weights)
     assert outcome.functional_map.shape == (K, K)
-    for _ in range(30):
+    for _ in range(60):
         (now, outcome), gradient = descend(weights)
-        weights -= 0.3 * gradient / jnp.linalg.norm(gradient)
-    assert outcome.result == RESULTS.successful and now < 0.3 * first
+        weights -= 0.2 * gradient / jnp.linalg.norm(gradient)
+    assert outcome.result == RESULTS.successful and now < 0.1 * first
     # Its leaves are what can be trained.
     assert len(jax.tree.leaves(layer)) == 2
 
@@ -334,13 +335,54 @@ def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differen
 def test_what_went_wrong_is_named(pair):
     x, y, start = pair
     damaged = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors.at[3, 2].set(jnp.nan))
-    assert refine_softly(x, damaged, start).result == RESULTS.nonfinite_functional_map
+    assert refine_softly(x, damaged, start).result == RESULTS.nonfinite_spectrum
+    for nowhere in (start.at[0].set(M), -jnp.ones_like(start)):  # the latter is what a failure gives
+        assert refine_softly(x, y, nowhere).result == RESULTS.invalid_initial_map
+    few = NearestFew(3)(x.eigenvectors, y.eigenvectors, x.vertex_areas, y.vertex_areas)
+    assert refine_softly(x, y, few).result == RESULTS.successful
+    elsewhere = eqx.tree_at(lambda t: t.rows, few, few.rows.at[4, 2].set(M))
+    assert refine_softly(x, y, elsewhere).result == RESULTS.invalid_initial_map
+    # As a step of training may make it.
+    below_zero = eqx.tree_at(lambda r: r.temperature, Softmax(), jnp.asarray(-0.1))
+    assert refine_softly(x, y, start, recovery=below_zero).result == RESULTS.nonfinite_functional_map
+
+
+@pytest.mark.parametrize(
+    "recovery", [Softmax(), NearestFew(5), Sinkhorn()], ids=["softmax", "few", "sinkhorn"]
+)
+def test_a_common_shift_changes_nothing_in_single_precision(recovery):
+    queries, database, a, b = (value.astype(jnp.float32) for value in points())
+    far = jnp.asarray([[1000.0, -300.0, 500.0, 0.0]], jnp.float32)
+    queries, database = (jnp.round(p * 64) / 64 for p in (queries, database))  # so that shifts are exact
+    expected = recovery(queries, database, a, b).pull_back(database)
+    found = recovery(queries + far, database + far, a, b).pull_back(database)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_functions_of_another_shape_are_refused(pair):
+    x, y, _ = pair
+    for recovery in (Softmax(), NearestFew(3)):
+        found = recovery(x.eigenvectors, y.eigenvectors, x.vertex_areas, y.vertex_areas)
+        with pytest.raises((ValueError, TypeCheckError)):
+            found.pull_back(y.eigenvectors[:, 0])
 
 
 def test_settings_that_do_not_exist(pair):
     x, y, start = pair
-    with pytest.raises(ValueError, match="at least 1 iteration"):
-        refine_softly(x, y, start, iterations=0)
+    for options in ({"iterations": 0}, {"tolerance": 0.0}):
+        with pytest.raises(ValueError, match="at least 1 iteration and a positive tolerance"):
+            refine_softly(x, y, start, **options)
+    with pytest.raises((TypeError, TypeCheckError)):
+        refine_softly(x, y, start, recovery=0.1)
+    with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
+        refine_softly(x, y, start[:-3])
+    short = Softmax()(x.eigenvectors[3:], y.eigenvectors, x.vertex_areas[3:], y.vertex_areas)
+    with pytest.raises(ValueError, match="maps 117 points to 120"):
+        refine_softly(x, y, short)
+    with pytest.raises(ValueError, match="Sinkhorn needs at least 1 iteration"):
+        Sinkhorn(iterations=0)
+    with pytest.raises((ValueError, TypeCheckError), match="features"):
+        WaveletPreservationLayer()(x.eigenvectors, y.eigenvectors[:, 1:], x, y)
     with pytest.raises((ValueError, TypeCheckError), match="differentiation"):
         refine_softly(x, y, start, differentiation="forward")
     with pytest.raises(ValueError, match="same jax_enable_x64"):

@@ -513,7 +513,7 @@ class Identity(FilterBank):
 
 
 class SoftmaxFrame(FilterBank):
-    """Filters whose squares are a softmax, so that they sum to one whatever the parameters are.
+    """Filters whose squares are a softmax, so that they sum to one whatever (finite) the parameters are.
 
     `g_l(lambda)² = exp(z_l) / sum_j exp(z_j)`, each z_l linear in lambda between evenly spaced knots. Every
     Parseval frame of positive filters is one up to the resolution of the knots; to learn one, start
@@ -539,17 +539,19 @@ class SoftmaxFrame(FilterBank):
     def like(cls, bank: FilterBank, knots: int = 32, *, floor: float = 0.01) -> SoftmaxFrame:
         """A frame that agrees with a bank at its knots, up to the bank's frame function.
 
+        Of a bank that is adapted to a spectrum, with that for evenly spaced eigenvalues.
+
         **Arguments:**
 
         - `bank`: any bank, of any sign: squares are what counts.
         - `knots`: how many; at least 2.
         - `floor`: raises filters where they are less, since one that is zero cannot be learned.
 
-        **Raises:** `ValueError` for fewer than 2 knots, or a floor that is not positive.
+        **Raises:** `ValueError` for fewer than 2 knots, or a floor outside 1e-12 to 1.
         """
-        if knots < 2 or not floor > 0:
+        if knots < 2 or not 1e-12 <= floor < 1:
             raise ValueError(
-                f"SoftmaxFrame.like needs at least 2 knots and a positive floor, not {knots}, {floor}"
+                f"SoftmaxFrame.like needs at least 2 knots and a floor from 1e-12 to 1, not {knots}, {floor}"
             )
         points = jnp.linspace(0, 1, knots)
         return cls(2 * jnp.log(jnp.maximum(jnp.abs(sample_bank(bank, points, points)), floor)))

@@ -402,11 +402,16 @@ def checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RE
 
 
 def diagnose(
-    spectrum_x: Spectrum, spectrum_y: Spectrum, pointwise_map: Int32[Array, " m"], result: RESULTS
+    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m *t"] | None, result: RESULTS
 ) -> RESULTS:
-    """How a refinement of a start ended: a fault of the spectra or of the start, or else `result`."""
-    vertices_y = spectrum_y.mask.shape[0]
-    in_range = (pointwise_map >= 0) & (pointwise_map < vertices_y)
-    valid = in_range & spectrum_y.mask[jnp.clip(pointwise_map, 0, vertices_y - 1)]
-    result = where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
+    """How a refinement of a start ended: a fault of the spectra or of the start, or else `result`.
+
+    `matches` are the vertices of Y that the start names, some for each vertex of X; None if it names none.
+    """
+    if matches is not None:
+        vertices_y = spectrum_y.mask.shape[0]
+        in_range = (matches >= 0) & (matches < vertices_y)
+        valid = in_range & spectrum_y.mask[jnp.clip(matches, 0, vertices_y - 1)]
+        valid = jnp.all(valid.reshape(valid.shape[0], -1), axis=1)
+        result = where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
     return where(all_finite((spectrum_x, spectrum_y)), result, RESULTS.nonfinite_spectrum)

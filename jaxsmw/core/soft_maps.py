@@ -32,7 +32,7 @@ class SoftMap(eqx.Module):
 
     **Attributes:**
 
-    - `queries`, `database`: the points q (m, d) and y (n, d).
+    - `queries`, `database`: the points q (m, d) and y (n, d), up to a common shift.
     - `query_areas`, `database_areas`: a (m,) and b (n,), of sum 1; zero for points that do not count. A query
       of zero area gets what any other in its place would get.
     - `potentials`: g (n,), without unit: the higher, the more a row is sought after; 0 for rows of zero area.
@@ -57,6 +57,10 @@ class SoftMap(eqx.Module):
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
         """The mean of functions over where each query's area goes; of positions, for example, or colours."""
         functions = jnp.asarray(functions_on_y, self.database.dtype)
+        if functions.ndim != 2 or functions.shape[0] != self.database.shape[0]:
+            raise ValueError(
+                f"functions on Y have shape {functions.shape}, where ({self.database.shape[0]}, p) is needed"
+            )
         weights = _log(self.database_areas) + self.potentials
 
         def mean(block: Float[Array, "block d"]) -> Float[Array, "block p"]:
@@ -95,6 +99,8 @@ class SparseSoftMap(eqx.Module):
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
         """The mean of functions over each query's rows."""
         functions = jnp.asarray(functions_on_y, self.shares.dtype)
+        if functions.ndim != 2:
+            raise ValueError(f"functions on Y have shape {functions.shape}, where (n, p) is needed")
         # One after the other, as all of them take t times the memory.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
@@ -150,7 +156,7 @@ class Softmax(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
         """See `Recovery`."""
-        a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+        queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
         return SoftMap(
             queries,
             database,
@@ -191,7 +197,7 @@ class NearestFew(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
         """See `Recovery`."""
-        a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+        queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
 
@@ -221,6 +227,11 @@ class Sinkhorn(Recovery):
 
     def __check_init__(self) -> None:
         check_between(self, "temperature", self.temperature)
+        if self.iterations < 1 or not self.tolerance > 0:
+            raise ValueError(
+                f"Sinkhorn needs at least 1 iteration and a positive tolerance, not {self.iterations} and "
+                f"{self.tolerance}"
+            )
 
     def __call__(
         self,
@@ -281,8 +292,8 @@ def sinkhorn(
     queries, database, query_areas, database_areas = map(
         jnp.asarray, (queries, database, query_areas, database_areas)
     )
+    queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
     dtype, (m, d) = queries.dtype, queries.shape
-    a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     scale = _in_unit(jnp.asarray(temperature), queries, database, a, b)
     log_b, rest = _log(b), -m % _BLOCK
     blocks = (
@@ -336,6 +347,18 @@ def _log_kernel(
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
 
+def _prepared(
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    query_areas: Float[Array, " m"],
+    database_areas: Float[Array, " n"],
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"], Float[Array, " m"], Float[Array, " n"]]:
+    """Points about their centre, so that squares of coordinates do not drown distances; areas of sum 1."""
+    a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+    center = lax.stop_gradient(product(b[None, :], database))
+    return queries - center, database - center, a, b
+
+
 def _in_unit(
     temperature: Float[Array, ""],
     queries: Float[Array, "m d"],
@@ -343,10 +366,13 @@ def _in_unit(
     a: Float[Array, " m"],
     b: Float[Array, " n"],
 ) -> Float[Array, ""]:
-    """A temperature in the points' squared unit, from one in units of the mean squared nearest distance."""
+    """A temperature in the points' squared unit, from one in units of the mean squared nearest distance.
+
+    NaN if it is not positive, as steps of training may make it: then so is what follows.
+    """
     found = nearest_neighbor(*lax.stop_gradient((queries, database)), database_mask=b > 0)
     spread = jnp.sum(a * jnp.sum((queries - product(a[None, :], queries)) ** 2, axis=1))
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     unit = jnp.maximum(unit, jnp.finfo(queries.dtype).eps ** 0.5 * spread)
     unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
-    return temperature.astype(queries.dtype) * unit
+    return jnp.where(temperature > 0, temperature, jnp.nan).astype(queries.dtype) * unit

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.refinement import Problem, WaveletPreservation, checked
+from jaxsmw.core.refinement import Problem, WaveletPreservation, checked, diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
@@ -76,13 +76,33 @@ def refine_softly(
     **Returns:** A `SoftRefinement`. Nothing is raised for bad numbers: check its `result`. With `"implicit"`
     it is `RESULTS.fixed_point_not_reached` if `iterations` were too few.
 
-    **Raises:** `ValueError` for fewer than one iteration, another `differentiation`, or spectra of two float
-    types. With `"implicit"`, derivatives raise equinox's runtime error where GMRES does not come to its
-    tolerance, as at a point that is not fixed.
+    **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, another
+    `differentiation`, a start of another size, or spectra of two float types; `TypeError` for what is no
+    refiner or recovery. With `"implicit"`, derivatives (not the outcome) raise equinox's runtime error where
+    the outcome is a failure, or GMRES does not come to its tolerance.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
-    if iterations < 1:
-        raise ValueError(f"refine_softly needs at least 1 iteration, not {iterations}")
+    for name, value, kind in (("refiner", refiner, WaveletPreservation), ("recovery", recovery, Recovery)):
+        if not isinstance(value, kind):
+            raise TypeError(f"the {name} is {value!r}, but a {kind.__name__} is needed")
+    if not isinstance(iterations, int) or iterations < 1 or not tolerance > 0:
+        raise ValueError(
+            f"refine_softly needs at least 1 iteration and a positive tolerance, not {iterations} and "
+            f"{tolerance}"
+        )
+    m, n = spectrum_x.mask.shape[0], spectrum_y.mask.shape[0]
+    matches: Array | None = None
+    if isinstance(pointwise_map, SoftMap):
+        sizes = pointwise_map.queries.shape[0], pointwise_map.database.shape[0]
+        if sizes != (m, n):
+            raise ValueError(
+                f"the start maps {sizes[0]} points to {sizes[1]}, but the shapes have {m} and {n} vertices"
+            )
+    else:
+        sparse = isinstance(pointwise_map, SparseSoftMap)
+        matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
+        if matches.shape[0] != m or matches.ndim != 1 + sparse:
+            raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
     if spectrum_x.eigenvectors.dtype != spectrum_y.eigenvectors.dtype:
         raise ValueError(
             f"the spectrum of X is {spectrum_x.eigenvectors.dtype} and that of Y "
@@ -115,6 +135,7 @@ def refine_softly(
         after, done = last, jnp.asarray(iterations, jnp.int32)
     moved, norm = (jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (after - before, last))
     went = where(start_went == RESULTS.successful, went, start_went)
+    went = diagnose(spectrum_x, spectrum_y, matches, went)
     return SoftRefinement(last, soft_recovery(refiner, recovery, problem, last), went, done, moved / norm)
 
 
@@ -148,8 +169,14 @@ class WaveletPreservationLayer(eqx.Module):
     ) -> SoftRefinement:
         """Match two shapes by features of their vertices: near in feature space is likely the same point.
 
-        **Raises:** see `refine_softly`.
+        **Raises:** `ValueError` if features are not one row per vertex, of one width; and see `refine_softly`.
         """
+        needed = [(s.mask.shape[0], features_x.shape[-1]) for s in (spectrum_x, spectrum_y)]
+        found = [features_x.shape, features_y.shape]
+        if found != needed:
+            raise ValueError(
+                "features have shapes {} and {}, where {} and {} are needed".format(*found, *needed)
+            )
         areas = (jnp.where(s.mask, s.vertex_areas, 0) for s in (spectrum_x, spectrum_y))
         return refine_softly(
             spectrum_x,
