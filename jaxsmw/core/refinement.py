@@ -402,7 +402,7 @@ def checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RE
 
 
 def diagnose(
-    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m *t"] | None, result: RESULTS
+    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, m * t] | None, result: RESULTS
 ) -> RESULTS:
     """How a refinement of a start ended: a fault of the spectra or of the start, or else `result`.
 

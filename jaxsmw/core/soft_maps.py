@@ -375,4 +375,5 @@ def _in_unit(
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     unit = jnp.maximum(unit, jnp.finfo(queries.dtype).eps ** 0.5 * spread)
     unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
-    return jnp.where(temperature > 0, temperature, jnp.nan).astype(queries.dtype) * unit
+    relative = temperature.astype(queries.dtype)
+    return jnp.where(relative > 0, relative, jnp.nan) * unit
