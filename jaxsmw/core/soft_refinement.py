@@ -169,7 +169,7 @@ class WaveletPreservationLayer(eqx.Module):
     ) -> SoftRefinement:
         """Match two shapes by features of their vertices: near in feature space is likely the same point.
 
-        **Raises:** `ValueError` if features are not one row per vertex, of one width; and see `refine_softly`.
+        **Raises:** `ValueError` unless features are one row per vertex, of one width; see `refine_softly`.
         """
         needed = [(s.mask.shape[0], features_x.shape[-1]) for s in (spectrum_x, spectrum_y)]
         found = [features_x.shape, features_y.shape]
