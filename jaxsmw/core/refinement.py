@@ -280,12 +280,8 @@ def refine(
             f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"
         )
 
+    check_same_precision(spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype
-    if spectrum_y.eigenvectors.dtype != dtype:
-        raise ValueError(
-            f"the spectrum of X is {dtype} and that of Y {spectrum_y.eigenvectors.dtype}: compute both with "
-            "the same jax_enable_x64"
-        )
 
     whole = working = refiner.prepare(spectrum_x, spectrum_y)
     working_map = pointwise_map = pointwise_map.astype(jnp.int32)
@@ -393,6 +389,16 @@ _Record = tuple[Array, Array, Array, Array | None]
 """What one turn adds to the four series of `History`."""
 
 
+def check_same_precision(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
+    """**Raises:** `ValueError` if two spectra are of two float types."""
+    dtype_x, dtype_y = spectrum_x.eigenvectors.dtype, spectrum_y.eigenvectors.dtype
+    if dtype_x != dtype_y:
+        raise ValueError(
+            f"the spectrum of X is {dtype_x} and that of Y {dtype_y}: compute both with the same "
+            "jax_enable_x64"
+        )
+
+
 def checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RESULTS) -> RESULTS:
     """How an update came out: a failure that its computation reported says more than a NaN."""
     went_well = result == RESULTS.successful
@@ -402,7 +408,7 @@ def checked(updated: Any, functional_map: Float[Array, "k_out k_in"], result: RE
 
 
 def diagnose(
-    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, m * t] | None, result: RESULTS
+    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
     """How a refinement of a start ended: a fault of the spectra or of the start, or else `result`.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.refinement import Problem, WaveletPreservation, checked, diagnose
+from jaxsmw.core.refinement import WaveletPreservation, check_same_precision, checked, diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
@@ -103,18 +103,17 @@ def refine_softly(
         matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
         if matches.shape[0] != m or matches.ndim != 1 + sparse:
             raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
-    if spectrum_x.eigenvectors.dtype != spectrum_y.eigenvectors.dtype:
-        raise ValueError(
-            f"the spectrum of X is {spectrum_x.eigenvectors.dtype} and that of Y "
-            f"{spectrum_y.eigenvectors.dtype}: compute both with the same jax_enable_x64"
-        )
+    check_same_precision(spectrum_x, spectrum_y)
     problem = refiner.prepare(spectrum_x, spectrum_y)
     start, result = refiner.update(problem, pointwise_map, None)
     start_went = checked(start, start, result)
 
+    def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
+        points = refiner.embeddings(problem, functional_map)
+        return recovery(*points, *_areas(spectrum_x, spectrum_y))
+
     def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        soft = soft_recovery(refiner, recovery, problem, functional_map)
-        following, how = refiner.update(problem, soft, functional_map)
+        following, how = refiner.update(problem, recover(functional_map), functional_map)
         return following, checked(following, following, how)
 
     if differentiation == "implicit":
@@ -136,7 +135,7 @@ def refine_softly(
     moved, norm = (jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (after - before, last))
     went = where(start_went == RESULTS.successful, went, start_went)
     went = diagnose(spectrum_x, spectrum_y, matches, went)
-    return SoftRefinement(last, soft_recovery(refiner, recovery, problem, last), went, done, moved / norm)
+    return SoftRefinement(last, recover(last), went, done, moved / norm)
 
 
 class WaveletPreservationLayer(eqx.Module):
@@ -177,11 +176,10 @@ class WaveletPreservationLayer(eqx.Module):
             raise ValueError(
                 "features have shapes {} and {}, where {} and {} are needed".format(*found, *needed)
             )
-        areas = (jnp.where(s.mask, s.vertex_areas, 0) for s in (spectrum_x, spectrum_y))
         return refine_softly(
             spectrum_x,
             spectrum_y,
-            self.recovery_of_features(features_x, features_y, *areas),
+            self.recovery_of_features(features_x, features_y, *_areas(spectrum_x, spectrum_y)),
             refiner=self.refiner,
             recovery=self.recovery,
             iterations=self.iterations,
@@ -190,16 +188,8 @@ class WaveletPreservationLayer(eqx.Module):
         )
 
 
-def soft_recovery(
-    refiner: WaveletPreservation,
-    recovery: Recovery,
-    problem: Problem,
-    functional_map: Float[Array, "k_out k_in"],
-) -> SoftMap | SparseSoftMap:
-    """The soft map of a functional map."""
-    x, y = problem.spectrum_x, problem.spectrum_y
-    areas_x, areas_y = (jnp.where(s.mask, s.vertex_areas, 0) for s in (x, y))
-    return recovery(*refiner.embeddings(problem, functional_map), areas_x, areas_y)
+def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
+    return (jnp.where(spectrum.mask, spectrum.vertex_areas, 0) for spectrum in spectra)
 
 
 def _fixed_point(
