@@ -156,14 +156,16 @@ class Softmax(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
         """See `Recovery`."""
-        queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
+        queries, database, a, b, scale = _prepared(
+            queries, database, query_areas, database_areas, self.temperature
+        )
         return SoftMap(
             queries,
             database,
             a,
             b,
             jnp.zeros_like(b),
-            _in_unit(self.temperature, queries, database, a, b),
+            scale,
             jnp.asarray(jnp.nan, b.dtype),
             jnp.asarray(False),
             jnp.asarray(0, jnp.int32),
@@ -197,7 +199,9 @@ class NearestFew(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
         """See `Recovery`."""
-        queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
+        queries, database, _, b, scale = _prepared(
+            queries, database, query_areas, database_areas, self.temperature
+        )
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
 
@@ -208,7 +212,7 @@ class NearestFew(Recovery):
         rows = in_blocks(nearest, settled_queries, _BLOCK)
         # One after the other, as all differences take t times the memory.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
-        exponents = -jnp.stack(squares, axis=1) / _in_unit(self.temperature, queries, database, a, b)
+        exponents = -jnp.stack(squares, axis=1) / scale
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
 
 
@@ -292,9 +296,10 @@ def sinkhorn(
     queries, database, query_areas, database_areas = map(
         jnp.asarray, (queries, database, query_areas, database_areas)
     )
-    queries, database, a, b = _prepared(queries, database, query_areas, database_areas)
+    queries, database, a, b, scale = _prepared(
+        queries, database, query_areas, database_areas, jnp.asarray(temperature)
+    )
     dtype, (m, d) = queries.dtype, queries.shape
-    scale = _in_unit(jnp.asarray(temperature), queries, database, a, b)
     log_b, rest = _log(b), -m % _BLOCK
     blocks = (
         jnp.pad(queries, ((0, rest), (0, 0))).reshape(-1, _BLOCK, d),
@@ -352,28 +357,23 @@ def _prepared(
     database: Float[Array, "n d"],
     query_areas: Float[Array, " m"],
     database_areas: Float[Array, " n"],
-) -> tuple[Float[Array, "m d"], Float[Array, "n d"], Float[Array, " m"], Float[Array, " n"]]:
-    """Points about their centre, so that squares of coordinates do not drown distances; areas of sum 1."""
+    temperature: Float[Array, ""],
+) -> tuple[
+    Float[Array, "m d"], Float[Array, "n d"], Float[Array, " m"], Float[Array, " n"], Float[Array, ""]
+]:
+    """What every recovery computes with.
+
+    Points about their centre, so that squares of coordinates do not drown distances; areas of sum 1; and the
+    temperature in the points' squared unit, from one in units of the mean squared nearest distance. NaN if it
+    is not positive, as steps of training may make it: then so is what follows.
+    """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
-    return queries - center, database - center, a, b
-
-
-def _in_unit(
-    temperature: Float[Array, ""],
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
-    a: Float[Array, " m"],
-    b: Float[Array, " n"],
-) -> Float[Array, ""]:
-    """A temperature in the points' squared unit, from one in units of the mean squared nearest distance.
-
-    NaN if it is not positive, as steps of training may make it: then so is what follows.
-    """
+    queries, database = queries - center, database - center
     found = nearest_neighbor(*lax.stop_gradient((queries, database)), database_mask=b > 0)
     spread = jnp.sum(a * jnp.sum((queries - product(a[None, :], queries)) ** 2, axis=1))
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     unit = jnp.maximum(unit, jnp.finfo(queries.dtype).eps ** 0.5 * spread)
     unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
     relative = temperature.astype(queries.dtype)
-    return jnp.where(relative > 0, relative, jnp.nan) * unit
+    return queries, database, a, b, jnp.where(relative > 0, relative, jnp.nan) * unit
