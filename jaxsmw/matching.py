@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import copy_context
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial as partial_function
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.compilation import compile_ahead, compiled
+from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
@@ -35,13 +36,23 @@ from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
-from jaxsmw.geometry.faults import expected_error
+from jaxsmw.geometry.extremities import extremities, likely_pairings
+from jaxsmw.geometry.faults import expected_error, flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, units_of_length
 from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
-from jaxsmw.presets import Preset, Stage, chosen_stages, common_range, refine_in_stages
+from jaxsmw.presets import (
+    Preset,
+    Stage,
+    chosen_stages,
+    common_range,
+    doubt,
+    fitting,
+    refine_in_stages,
+    run_stage,
+)
 
 logger = logging.getLogger("jaxsmw")
 
@@ -286,7 +297,7 @@ def match(
                 if not isinstance(preset, str):
                     raise
                 warnings.warn(f"refinement goes on without descriptors: {error}", stacklevel=2)
-                stages = tuple(replace(stage, number_of_descriptors=0) for stage in stages)
+                stages = tuple(stage.without_descriptors() for stage in stages)
     samples = None
     if number_of_samples := max(stage.number_of_samples or 0 for stage in stages):
         with _stage("samples", seconds):
@@ -477,12 +488,15 @@ def initial_map(
 def other_starts(
     mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
 ) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Initial maps by way of functional maps, one by one, for when `init="shot"` fails.
+    """Initial maps, one by one, for when `init="shot"` fails: where one swaps limbs, another often does not.
 
-    Nearest neighbours of SHOT from Y to X, too, as a functional map, filtered like the paper's, and read
-    back: first the mean of both directions, by neighbourhoods of several sizes side by side; then from Y to X
-    alone, by the usual ones; then the mean of both by these. Where one start swaps limbs, another often does
-    not.
+    Three by way of functional maps: nearest neighbours of SHOT from Y to X, too, as a functional map,
+    filtered like the paper's, and read back: first the mean of both directions, by neighbourhoods of several
+    sizes side by side; then from Y to X alone, by the usual ones; then the mean of both by these.
+
+    Of two whole bodies with descriptors (`describe`) two more, by the ends of their limbs, paired in all ways
+    that distances between them allow: from each, nearest neighbours in SHOT and in distances to the ends,
+    refined with few eigenvectors; the two least doubtful outcomes.
     """
     x, y = _thinned(mesh_x, mesh_y, spectrum_x, spectrum_y)
     spectra = [spectrum.truncate(_PAPER_EIGENVECTORS) for spectrum in (spectrum_x, spectrum_y)]
@@ -498,6 +512,37 @@ def other_starts(
         share = spectra[0].eigenvalues.dtype.type(share_of_back)
         start = compiled(_both_ways)(*jax.device_put((there, back, share)), *spectra)
         yield _extend_to_unused(mesh_x, np.asarray(start).astype(np.int64))
+    if not partial and spectrum_x.descriptors is not None:
+        yield from _starts_from_extremities(x, y)
+
+
+def _starts_from_extremities(x: _Thinned, y: _Thinned) -> Iterator[Int64[np.ndarray, " m"]]:
+    fewest = min(int(side.mesh.used_vertices.sum()) for side in (x, y))
+    stage = fitting(_ROUGHLY, fewest)
+    spectrum_x, spectrum_y = stage.view(x.spectrum, y.spectrum)
+    samples_x, samples_y = (
+        jax.device_put(side.rows(farthest_point_samples(side.mesh, stage.number_of_samples or fewest)))
+        for side in (x, y)
+    )
+    eigenvectors = np.asarray(x.spectrum.eigenvectors)[x.rows(np.arange(len(x.mesh.vertices))), :_JUDGES]
+    outcomes = []
+    ends = _side_by_side(lambda side: extremities(side.mesh), x, y)
+    for landmarks in likely_pairings(*ends, _PAIRINGS):
+        start = _nearest_compared(*_landmark_features(landmarks, x, y, False), y)
+        refinement = run_stage(
+            stage, spectrum_x, jax.device_put(start), spectrum_y=spectrum_y, samples=(samples_x, samples_y)
+        )
+        if refinement.result == RESULTS.successful:
+            found = _everywhere(np.asarray(refinement.pointwise_map).astype(np.int64), x, y)
+            outcomes.append((doubt(refinement, flaw(x.mesh, y.mesh, found, eigenvectors)), found))
+    outcomes.sort(key=lambda outcome: outcome[0])
+    for _, found in outcomes[:_LEAST_DOUBTFUL]:
+        yield _extend_to_unused(x.mesh, found)
+
+
+# Enough to find the place of limbs; judged by as many eigenvectors as what `refine_in_stages` mends.
+_ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8, 1000)
+_PAIRINGS, _LEAST_DOUBTFUL, _JUDGES = 16, 2, 50
 
 
 # Radii, and how much the way back counts. Wide neighbourhoods see more of the body, in less detail.
@@ -528,12 +573,22 @@ def _nearest(
     features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"], x: _Thinned, y: _Thinned
 ) -> Int64[np.ndarray, " m"]:
     """The nearest neighbours of all of X's vertices, from features of those that are compared."""
-    dtype = x.spectrum.eigenvectors.dtype
+    return _everywhere(_nearest_compared(features_x, features_y, y), x, y)
+
+
+def _nearest_compared(
+    features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"], y: _Thinned
+) -> Int64[np.ndarray, " a"]:
+    dtype = y.spectrum.eigenvectors.dtype
     nearest = compiled(nearest_neighbor)(
         *(jax.device_put(features.astype(dtype)) for features in (features_x, features_y)),
         database_mask=y.spectrum.mask,
     )
-    found = np.asarray(nearest).astype(np.int64)
+    return np.asarray(nearest).astype(np.int64)
+
+
+def _everywhere(found: Int64[np.ndarray, " a"], x: _Thinned, y: _Thinned) -> Int64[np.ndarray, " m"]:
+    """A map between vertices that are compared, for all vertices of X."""
     if y.samples is not None:
         found = y.samples.vertices[found]
     return found if x.samples is None else found[x.samples.nearest]
@@ -551,6 +606,10 @@ class _Thinned(NamedTuple):
         if samples is not None:
             spectrum = spectrum.sample(jnp.asarray(samples.vertices))
         return cls(mesh, samples, spectrum)
+
+    def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
+        """Where what is known of vertices, or of the samples nearest to them, stands."""
+        return vertices if self.samples is None else self.samples.nearest[vertices]
 
 
 # Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which

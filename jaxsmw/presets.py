@@ -38,8 +38,8 @@ class Stage:
     - `iterations`: how many; at least 1.
     - `number_of_samples`: take turns on so many samples of each shape, and search all vertices at the end.
     - `stop_when_unchanged`: see `jaxsmw.refine`.
-    - `mending`: where the outcome swaps limbs, do it again up to so many times without their matches: see
-      `refine_in_stages`.
+    - `mending`: what is done, up to four times, where the outcome looks as if limbs were swapped, each time
+      without their matches: see `refine_in_stages`. Of the same eigenvectors and descriptors.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -50,7 +50,7 @@ class Stage:
     iterations: int = 3
     number_of_samples: int | None = None
     stop_when_unchanged: bool = False
-    mending: int = 0
+    mending: Stage | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.refiner, Refiner):
@@ -63,13 +63,20 @@ class Stage:
             raise InputError(
                 f"{self.number_of_descriptors} descriptors were asked for; SHOT has {SHOT_DIMENSION}."
             )
-        if self.mending < 0:
-            raise InputError(f"{self.mending} rounds of mending were asked for; 0 is none.")
+        if self.mending is not None and self._sizes != self.mending._sizes:
+            raise InputError(
+                f"{self._sizes[0]} eigenvectors and {self._sizes[1]} descriptors are to be mended by a stage "
+                f"with {self.mending._sizes[0]} and {self.mending._sizes[1]}: give both the same."
+            )
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
                 f"{self.number_of_samples} samples cannot tell {self.number_of_eigenvectors} eigenvectors "
                 "apart; use more samples (five per eigenvector is usual) or fewer eigenvectors."
             )
+
+    @property
+    def _sizes(self) -> tuple[int, int]:
+        return self.number_of_eigenvectors, self.number_of_descriptors
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -79,6 +86,11 @@ class Stage:
             "iterations": self.iterations,
             "stop_when_unchanged": self.stop_when_unchanged,
         }
+
+    def without_descriptors(self) -> Stage:
+        """The same by eigenvectors alone."""
+        mending = None if self.mending is None else self.mending.without_descriptors()
+        return replace(self, number_of_descriptors=0, mending=mending)
 
     def view(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
@@ -102,20 +114,21 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
     return cut[0], cut[1]
 
 
-def _regression(levels: tuple[int, ...], number_of_samples: int, mending: int = 0) -> Stage:
+def _regression(levels: tuple[int, ...], mending: Stage | None = None) -> Stage:
     """Feature regression, once per level."""
-    return Stage(FeatureRegression(levels), max(levels), 60, len(levels), number_of_samples, mending=mending)
+    return Stage(FeatureRegression(levels), max(levels), 60, len(levels), 1000, mending=mending)
 
 
 Preset = Literal["fast", "paper", "accurate"]
 _PAPER = (Stage(),)
+_COARSE_TO_FINE = (20, 20, 26, 26, 35, 35, 50, 50)
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (Stage(number_of_samples=500),),
     "paper": _PAPER,
     "accurate": (
         *_PAPER,
-        _regression((20, 20, 26, 26, 35, 35, 50, 50), 1000, mending=4),
-        _regression((100, 141, 200), 1000),
+        _regression(_COARSE_TO_FINE, mending=_regression((10, 10, 14, 14, *_COARSE_TO_FINE))),
+        _regression((100, 141, 200)),
     ),
 }
 """The MWP authors' fast variant, the paper's setting, and what docs/accuracy.md arrives at."""
@@ -135,14 +148,14 @@ def chosen_stages(
     if isinstance(preset, str):
         if preset not in PRESETS:
             raise InputError(f"{preset!r} is no preset: choose from {', '.join(PRESETS)}, or give stages.")
-        return tuple(_fitting(stage, vertices, partial) for stage in PRESETS[preset])
+        return tuple(fitting(stage, vertices, partial) for stage in PRESETS[preset])
     stages = (preset,) if isinstance(preset, Stage) else tuple(preset)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(f"preset is {preset!r}; give one of {', '.join(PRESETS)}, or stages.")
     return stages
 
 
-def _fitting(stage: Stage, vertices: int, partial: bool) -> Stage:
+def fitting(stage: Stage, vertices: int, partial: bool = False) -> Stage:
     """A stage with what few vertices can give: eigenvectors up to their half, samples if there are more."""
     samples, refiner = stage.number_of_samples, stage.refiner
     if isinstance(refiner, FeatureRegression):
@@ -152,6 +165,7 @@ def _fitting(stage: Stage, vertices: int, partial: bool) -> Stage:
         refiner=refiner,
         number_of_eigenvectors=max(1, min(stage.number_of_eigenvectors, vertices // 2)),
         number_of_samples=None if samples is None or samples >= vertices else samples,
+        mending=None if stage.mending is None else fitting(stage.mending, vertices, partial),
     )
 
 
@@ -170,9 +184,9 @@ def refine_in_stages(
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. A stage that is to mend this looks for both
-    (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
-    faulty part had no say in. The least flawed map it came by is its outcome. Where that does not help, the
-    stages so far are gone through from other starts, too. Maps that look right are let be.
+    (`jaxsmw.geometry.faults`), by turns, and mends from a functional map that the faulty part had no say in.
+    The least flawed map it came by is its outcome. Where that does not help, the stages so far are gone
+    through from other starts, too. Maps that look right are let be.
 
     **Arguments:**
 
@@ -198,11 +212,8 @@ def refine_in_stages(
             if start is pointwise_map:
                 return refinements, start
             continue
-        doubt = np.log(flawed)
-        if isinstance(last.updated, Regression):
-            doubt += _UNCERTAINTY * float(last.updated.uncertainty)
-        if not best[0] or doubt < least:
-            best, least = (refinements, start), doubt
+        if not best[0] or doubt(last, flawed) < least:
+            best, least = (refinements, start), doubt(last, flawed)
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
             if not suspicious:
@@ -211,6 +222,16 @@ def refine_in_stages(
     refinements, start = best
     so_far = refinements[-1].pointwise_map if refinements else start
     return refinements + through(certain, so_far)[0], start
+
+
+def doubt(refinement: Refinement, flawed: float) -> float:
+    """How doubtful a map is beside others of the same two shapes: the less, the better.
+
+    The logarithm of its `jaxsmw.geometry.faults.flaw`, and if it comes of `FeatureRegression` the uncertainty
+    of that.
+    """
+    uncertainty = refinement.updated.uncertainty if isinstance(refinement.updated, Regression) else 0
+    return float(np.log(flawed) + _UNCERTAINTY * uncertainty)
 
 
 def _through(
@@ -226,12 +247,11 @@ def _through(
     refinements: list[Refinement] = []
     flawed, suspicious = np.inf, True
     for (spectrum_x, spectrum_y), stage in steps:
-        run = partial_function(_run, stage, spectrum_y, samples, history)
-        refinement = run(spectrum_x, pointwise_map)
+        run = partial_function(run_stage, spectrum_y=spectrum_y, samples=samples, history=history)
+        refinement = run(stage, spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            refinement, flawed, suspicious = _mended(
-                refinement, spectrum_x, run, meshes, partial, stage.mending
-            )
+            mend = partial_function(run, stage.mending)
+            refinement, flawed, suspicious = _mended(refinement, spectrum_x, mend, meshes, partial)
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
@@ -239,15 +259,16 @@ def _through(
     return refinements, flawed, suspicious
 
 
-def _run(
+def run_stage(
     stage: Stage,
-    spectrum_y: Spectrum,
-    samples: Samples | None,
-    history: bool,
     spectrum_x: Spectrum,
     pointwise_map: Int[Array, " m"],
+    *,
+    spectrum_y: Spectrum,
+    samples: Samples | None,
+    history: bool = False,
 ) -> Refinement:
-    """One pass through a stage's iterations."""
+    """One pass through a stage's iterations; the spectra are what it sees of both shapes (`Stage.view`)."""
     chosen: dict[str, Any] = {}
     if stage.number_of_samples is not None and samples is not None:
         for side, vertices in zip(("samples_x", "samples_y"), samples, strict=True):
@@ -260,46 +281,47 @@ def _run(
 def _mended(
     refinement: Refinement,
     spectrum_x: Spectrum,
-    run: Callable[[Spectrum, Int[Array, " m"]], Refinement],
+    mend: Callable[[Spectrum, Int[Array, " m"]], Refinement],
     meshes: tuple[Mesh, Mesh],
     partial: bool,
-    rounds: int,
 ) -> tuple[Refinement, float, bool]:
     """The least flawed of a refinement and of others, each begun without what was faulty in the last.
 
     And its flaw, and whether limbs may be swapped still. A small flaw that stays, whatever is left out, is
-    how bodies differ.
+    how bodies differ. Where nothing looks faulty, all have their say, as long as that helps.
     """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
-    best, least, first = refinement, np.inf, np.inf
+    best, least = refinement, np.inf
+    flaws: list[float] = []
     criteria = (
         lambda found: reversed_orientation(*meshes, found, eigenvectors, partial=partial),
         lambda found: torn_off(*meshes, found, partial=partial),
     )
-    for done in range(rounds + 1):
+    for done in range(_ROUNDS + 1):
         found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-        flawed = flaw(*meshes, found, eigenvectors, partial=partial)
-        if done == 0:
-            first = flawed
-        if flawed < least:
-            best, least = refinement, flawed
-        stays = done == rounds and least > _HARDLY * first and first < _SMALL
+        flaws.append(flaw(*meshes, found, eigenvectors, partial=partial))
+        if flaws[-1] < least:
+            best, least = refinement, flaws[-1]
+        stays = done == _ROUNDS and least > _HARDLY * flaws[0] and flaws[0] < _SMALL
         if least < _SUSPICIOUS or stays:
             return best, least, False
         faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
         shares = [areas[:m][fault].sum() / areas.sum() for fault in faults]
         some = [fault for fault, share in zip(faults, shares, strict=True) if _NEGLIGIBLE < share < _TOO_MUCH]
-        if done == rounds or not some:
+        helps = done == 0 or flaws[-1] < _HARDLY * flaws[-2]
+        if done == _ROUNDS or not (some or helps):
             return best, least, bool(max(shares) > _NEGLIGIBLE)
-        sound = jax.device_put(np.where(np.pad(some[0], (0, len(areas) - m)), 0, areas))
-        refinement = run(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
+        faulty = some[0] if some else np.zeros(m, bool)
+        sound = jax.device_put(np.where(np.pad(faulty, (0, len(areas) - m)), 0, areas))
+        refinement = mend(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
         if refinement.result != RESULTS.successful:
             break
     return best, least, True
 
 
+_ROUNDS = 4
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.

@@ -38,7 +38,7 @@ from jaxsmw.report.tables import markdown
 
 GROSS, TENTH = 0.1, 0.1
 # What the preset does after its first stage, without looking for mirrored limbs.
-AS_IT_STARTS = tuple(replace(stage, mending=0) for stage in PRESETS["accurate"][1:])
+AS_IT_STARTS = tuple(replace(stage, mending=None) for stage in PRESETS["accurate"][1:])
 
 
 class Measured(NamedTuple):

@@ -315,7 +315,7 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
         ({"iterations": 0}, "at least 1"),
         ({"number_of_samples": 10}, "cannot tell 100 eigenvectors apart"),
         ({"number_of_descriptors": 353}, "SHOT has 352"),
-        ({"mending": -1}, "0 is none"),
+        ({"mending": Stage(number_of_eigenvectors=99)}, "mended by a stage with 99"),
     ],
     ids=str,
 )

@@ -151,8 +151,7 @@ def _neighbors(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, 
     if n <= _DENSE:
         return mesh.edges, np.arange(n)
     samples = spread_samples(mesh, _SPREAD)
-    pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
-    return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
+    return samples.vertices[samples.neighbors(mesh)], samples.vertices[samples.nearest]
 
 
 def _lengths(

@@ -55,6 +55,11 @@ class Samples(NamedTuple):
     vertices: Int64[np.ndarray, " s"]
     nearest: Int64[np.ndarray, " n"]
 
+    def neighbors(self, mesh: Mesh) -> Int64[np.ndarray, "p 2"]:
+        """Pairs of samples, positions in `vertices`, whose surroundings an edge joins."""
+        pairs = np.unique(np.sort(self.nearest[mesh.edges], axis=1), axis=0)
+        return pairs[pairs[:, 0] != pairs[:, 1]]
+
 
 def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     """About so many vertices, spread evenly over the area however dense the mesh is where.
