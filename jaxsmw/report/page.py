@@ -96,8 +96,8 @@ def write_page(
     - `figures`: captions and PNG files to show at the end.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
 
-    **Raises:** `InputError` if there is no map, the maps, errors or spectra do not fit the meshes, or the file
-    cannot be written.
+    **Raises:** `InputError` if there is no map, the maps, errors or spectra do not fit the meshes, or the
+    file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one.")

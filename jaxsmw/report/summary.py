@@ -71,9 +71,9 @@ def write_report(
 
     **Arguments:**
 
-    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, the map and what it
-      started from, with the figures), `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has any), `quality.png` (with
-      errors only) and `summary.json`.
+    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the map and the
+      one it started from, wavelets and figures), `correspondence.png`, `functional_map.png`, `filters.png`
+      (if a stage has any), `quality.png` (with errors only) and `summary.json`.
     - `correspondence`: the match.
     - `errors`: geodesic errors by name, `initial` that of `correspondence.initial_map`, the last of them that
       of `correspondence.pointwise_map`.
@@ -89,7 +89,7 @@ def write_report(
     m = len(correspondence.pointwise_map)
     per_vertex = {} if final is None else {"Error": _per_vertex(final, m)}
     per_vertex["Expected error"] = expected
-    convention = getattr(correspondence.stages[-1].refiner, "convention", "pullback")
+    convention: Convention = getattr(correspondence.stages[-1].refiner, "convention", "pullback")
 
     figures = {
         "correspondence": draw_correspondence(
@@ -166,8 +166,8 @@ def write_comparison(
 ) -> None:
     """Write an interactive page with several maps of one pair, one shown at a time.
 
-    With their functional maps, and the wavelets of the paper's bank, if the eigenvectors of both meshes can be
-    computed, or else with a warning.
+    It shows their functional maps and the wavelets of the paper's bank as well, unless the eigenvectors of
+    the meshes cannot be computed, of which it warns.
 
     **Arguments:**
 
@@ -206,7 +206,6 @@ def write_comparison(
         shown,
         title=_title(mesh_x, mesh_y),
         spectra=spectra,
-        statistics={},
         figures=figures,
         up=up,
     )
@@ -249,7 +248,8 @@ def _main_figures(error: GeodesicError | None) -> dict[str, str]:
         return {}
     shares = {f"within {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
     area = f"{error.area_under_curve():.3f}"
-    return {"mean error": f"{error.mean:.4f}", "median": f"{error.median:.4f}", **shares, "area under curve": area}
+    mean, median = f"{error.mean:.4f}", f"{error.median:.4f}"
+    return {"mean error (√area)": mean, "median (√area)": median, **shares, "area under curve": area}
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
