@@ -664,6 +664,8 @@ def _evaluate(options: argparse.Namespace) -> None:
             raise InputError(f"{options.page}: a page is written as .html; choose a name that ends in it.")
         check_drawable()
         check_writable(options.page)
+    elif options.partial or options.up:
+        raise InputError("--partial and --up are for --page: name a page, or leave them out.")
     from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
@@ -823,6 +825,8 @@ def _render(options: argparse.Namespace) -> None:
         raise InputError(
             f"{options.output}: a picture shows one map; leave {options.map[1]} out, or name a page (.html)."
         )
+    if not page and options.partial:
+        raise InputError(f"--partial: is for pages; leave it out, or write {options.output} as .html.")
     _keep_inputs(options.output, *filter(None, (options.source, options.target, *options.map)))
     from jaxsmw.evaluation.ground_truth import read_pointwise_map
     from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure

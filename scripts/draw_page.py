@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxsmw.files import atomic_write
 
-WIDTH, HEIGHT = 1280, 800
+WIDTH, HEIGHT = 1280, 770
 
 
 def main() -> None:
@@ -53,8 +53,8 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # 256 colours are enough, and a third of the size.
-        picture.quantize(256).save(temporary, format="png", optimize=True)
+        # 256 colours, dithered, are enough, and half the size.
+        picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -1219,6 +1219,34 @@ def test_switching_between_maps(comparison: OpenPage) -> None:
     assert alike[0] > alike[1] + 0.2
 
 
+def test_maps_of_different_sizes_and_without_functional_map(browser: Any, tmp_path: Path) -> None:
+    n = len(NUMBER)
+    errors = {"Error": np.where(np.arange(n) == 3, np.inf, 0.01)}
+    large = ShownMap(NUMBER, errors, np.diag(np.arange(1.0, 7)))
+    shown = {"large": large, "small": replace(large, functional_map=np.eye(2)), "none": ShownMap(NUMBER)}
+    write_page(tmp_path / "page.html", SOURCE, TARGET, shown, title="Sizes")
+    browser.get_log("browser")
+    page = OpenPage(browser, tmp_path / "page.html")
+    page.run("jaxsmw.pick(3)")
+    assert page.readout.endswith("error without end (on another component)")
+    from selenium.webdriver.common.keys import Keys
+
+    page.find("#matrix").send_keys(Keys.ARROW_DOWN, Keys.SHIFT, Keys.ARROW_DOWN, Keys.ARROW_RIGHT)
+    # The page has no eigenvectors to show.
+    entry = (
+        "C(5, 5) = 6.000: eigenfunction 5 of the source, 5 of the target (not among those this page holds)"
+    )
+    assert page.find("#entry").text == entry
+    assert page.run("return jaxsmw.functions") == {"x": None, "y": None}
+    page.find("input[name=map][value='1']").click()
+    assert page.find("#entry").text.startswith("Point at") and matrix_colors(page).shape == (2, 2, 3)
+    page.find("input[name=map][value='2']").click()
+    assert not page.find("#functional").is_displayed()
+    page.find("input[name=map][value='0']").click()
+    assert page.find("#entry").text == entry and page.find("#functional").is_displayed()
+    assert browser.get_log("browser") == []
+
+
 def test_every_control_is_reached_and_worked_by_keys(comparison: OpenPage) -> None:
     from selenium.webdriver.common.keys import Keys
 

@@ -313,6 +313,8 @@ function shownEntry() {
   const { functional } = maps[state.map];
   if (!entry || !functional) return null;
   const [row, column] = entry;
+  // Another map's may be larger.
+  if (column >= functional.columns || row * functional.columns >= functional.values.length) return null;
   const [x, y] = functional.pushforward ? [column, row] : [row, column];
   const known = bases && x < bases.x.k && y < bases.y.k;
   return { row, column, x, y, known, value: functional.values[row * functional.columns + column] };
@@ -364,7 +366,7 @@ function paint() {
     for (const side of sides) {
       if (functions[side]) colors[side] = colored(functions[side], scales.signed, onSignedScale(limit));
     }
-    const end = limit.toPrecision(2);
+    const end = Number(limit.toPrecision(2));
     byId("signed-low").textContent = `≤ −${end}`;
     byId("signed-high").textContent = `≥ ${end}`;
   }
@@ -391,6 +393,11 @@ function nameFilter() {
   return state.filter ? `wavelet ${state.filter} of ${wavelets}${ends[state.filter] ?? ""}` : "scaling function";
 }
 
+function inWords(error) {
+  if (Number.isNaN(error)) return "not known";
+  return error === Infinity ? "without end (on another component)" : error.toFixed(4);
+}
+
 /** Mark what is picked, and say what the map says of it. */
 function tell() {
   const { x, y } = matched();
@@ -398,7 +405,7 @@ function tell() {
   if (state.picked?.side === "x") {
     text = `Source vertex ${x[0]} → target vertex ${y[0]}`;
     for (const [name, values] of Object.entries(maps[state.map].errors)) {
-      text += ` · ${name.toLowerCase()} ${Number.isNaN(values[x[0]]) ? "not known" : values[x[0]].toFixed(4)}`;
+      text += ` · ${name.toLowerCase()} ${inWords(values[x[0]])}`;
     }
   } else if (state.picked) {
     const named = x.slice(0, NAMED_VERTICES).join(", ") + (x.length > NAMED_VERTICES ? ", …" : "");
@@ -619,7 +626,8 @@ function chooseFilter() {
 }
 
 matrix.addEventListener("pointermove", (event) => {
-  if (event.pointerType !== "touch") chooseEntry(state.entry, entryAt(event));
+  const entry = entryAt(event);
+  if (event.pointerType !== "touch" && String(entry) !== String(state.hoveredEntry)) chooseEntry(state.entry, entry);
 });
 matrix.addEventListener("pointerleave", () => state.hoveredEntry && chooseEntry(state.entry));
 matrix.addEventListener("click", (event) => {
