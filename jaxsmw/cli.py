@@ -158,11 +158,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         help="the true map; the error is printed before and after",
     )
-    match.add_argument(
-        "--partial",
-        action="store_true",
-        help="one mesh shows only a part of the other's body, in the same unit of length",
-    )
+    _add_partial(match)
     _add_method(match)
     _add_reading(match)
     _add_evaluation(match)
@@ -181,6 +177,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--output", metavar="FILE", help="write the figures as JSON, curves included")
     evaluate.add_argument("--figure", metavar="FILE", help="draw the correspondence quality curves")
+    evaluate.add_argument(
+        "--page",
+        metavar="FILE.html",
+        help="write an interactive page to switch between the maps, with their errors",
+    )
+    _add_partial(evaluate)
+    _add_up(evaluate)
     _add_reading(evaluate)
     _add_evaluation(evaluate)
     _add_common(evaluate, _evaluate)
@@ -245,13 +248,16 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="draw a mesh, or a correspondence by its colours")
     render.add_argument("source", metavar="SOURCE", help="the mesh, or the source mesh")
     render.add_argument("target", metavar="TARGET", nargs="?", help="the target mesh")
-    render.add_argument("map", metavar="MAP", nargs="?", help="the map, one target vertex per line")
+    render.add_argument(
+        "map", metavar="MAP", nargs="*", help="the map, one target vertex per line; for a page also several"
+    )
     render.add_argument(
         "--output",
         metavar="FILE",
         required=True,
         help="a picture (.png, .pdf, .svg); of a correspondence also an interactive page (.html)",
     )
+    _add_partial(render)
     _add_up(render)
     _add_reading(render)
     _add_common(render, _render)
@@ -409,6 +415,14 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
         choices=("strips", "exact"),
         default="strips",
         help="strips is nearly always within 0.5 %% of exact, and much faster (default: %(default)s)",
+    )
+
+
+def _add_partial(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--partial",
+        action="store_true",
+        help="one mesh shows only a part of the other's body, in the same unit of length",
     )
 
 
@@ -640,9 +654,18 @@ def _conclude(
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    for output in filter(None, (options.output, options.figure)):
+    for output in filter(None, (options.output, options.figure, options.page)):
         _keep_inputs(output, options.source, options.target, *options.map, *options.ground_truth)
     _check_outputs(options)
+    if options.page:
+        from jaxsmw.report.figures import check_drawable
+
+        if not _is_page(options.page):
+            raise InputError(f"{options.page}: a page is written as .html; choose a name that ends in it.")
+        check_drawable()
+        check_writable(options.page)
+    elif options.partial or options.up:
+        raise InputError("--partial and --up are for --page: name a page, or leave them out.")
     from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
@@ -652,6 +675,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         for path in options.map
     }
     errors = _errors(options, mesh_y, maps, truth)
+    if options.page:
+        _write_comparison(options.page, options, mesh_x, mesh_y, maps, errors)
     for name, error in errors.items():
         print(f"{name}: {error}")
     if options.figure:
@@ -663,6 +688,36 @@ def _evaluate(options: argparse.Namespace) -> None:
         results = {name: error.as_dictionary() for name, error in errors.items()}
         with atomic_write(options.output) as temporary:
             temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
+
+
+def _is_page(path: str) -> bool:
+    return Path(path).suffix.lower() in (".html", ".htm")
+
+
+def _write_comparison(
+    path: str,
+    options: argparse.Namespace,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    maps: Mapping[str, Any],
+    errors: Mapping[str, GeodesicError],
+) -> None:
+    from jaxsmw.report.summary import write_comparison
+
+    # As short as tells them apart.
+    for name in (lambda path: Path(path).stem, lambda path: Path(path).name, str):
+        names = {path: name(path) for path in maps}
+        if len(set(names.values())) == len(maps):
+            break
+    write_comparison(
+        path,
+        mesh_x,
+        mesh_y,
+        {names[path]: pointwise_map for path, pointwise_map in maps.items()},
+        errors={names[path]: error for path, error in errors.items()},
+        partial=options.partial,
+        up=options.up,
+    )
 
 
 def _keep_inputs(output: str, *inputs: str) -> None:
@@ -759,17 +814,23 @@ def _spectrum(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from jaxsmw.evaluation.ground_truth import read_pointwise_map
-    from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
-    from jaxsmw.report.page import write_page
-
-    page = Path(options.output).suffix.lower() in (".html", ".htm")
+    page = _is_page(options.output)
     if options.target and not options.map:
         raise InputError(f"{options.target}: to draw two meshes give the map between them as a third file.")
     if page and not options.map:
         raise InputError(
             f"{options.output}: a page shows a correspondence; give a target mesh and a map too."
         )
+    if not page and len(options.map) > 1:
+        raise InputError(
+            f"{options.output}: a picture shows one map; leave {options.map[1]} out, or name a page (.html)."
+        )
+    if not page and options.partial:
+        raise InputError(f"--partial: is for pages; leave it out, or write {options.output} as .html.")
+    _keep_inputs(options.output, *filter(None, (options.source, options.target, *options.map)))
+    from jaxsmw.evaluation.ground_truth import read_pointwise_map
+    from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
+
     check = check_writable if page else check_figure_path
     check(options.output)
     mesh_x = _read(options.source, options)
@@ -777,11 +838,14 @@ def _render(options: argparse.Namespace) -> None:
         save_figure(options.output, draw_mesh(mesh_x, up=options.up))
         return
     mesh_y = _read(options.target, options)
-    pointwise_map = read_pointwise_map(options.map, mesh_x, mesh_y, index_base=options.index_base or 0)
+    maps = {
+        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+        for path in options.map
+    }
     if page:
-        title = f"{Path(options.source).name} to {Path(options.target).name}"
-        write_page(options.output, mesh_x, mesh_y, pointwise_map, title=title, up=options.up)
+        _write_comparison(options.output, options, mesh_x, mesh_y, maps, {})
     else:
+        (pointwise_map,) = maps.values()
         save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map, up=options.up))
 
 

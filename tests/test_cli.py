@@ -1,5 +1,6 @@
 """The command line as a user meets it."""
 
+import base64
 import json
 import re
 import signal
@@ -140,11 +141,12 @@ def test_a_tiny_mesh_is_told_what_it_lacks(run, tmp_path):
 
 def test_missing_matplotlib_is_told_before_the_work(run, pair, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    meshes = [pair / "x.off", pair / "y.ply"]
+    meshes, truth = [pair / "x.off", pair / "y.ply"], pair / "truth.txt"
     for arguments in (
         ["match", *meshes, "--output", tmp_path / "m", "--report", tmp_path / "r"],
         ["demo", "--output", tmp_path / "demo"],
         ["spectrum", pair / "x.off", "--figure", tmp_path / "s.png"],
+        ["evaluate", *meshes, truth, "--ground-truth", truth, "--page", tmp_path / "p.html"],
     ):
         assert_refused(run(*arguments, "--quiet"), naming="pip install 'jaxsmw[report]'")
     assert list(tmp_path.iterdir()) == []
@@ -237,6 +239,11 @@ def test_report(run, pair, tmp_path):
     assert summary["result"]["vertices"] == "642 to 642"
     assert summary["provenance"]["jax"]
     assert "x.off to y.ply" in (report / "report.html").read_text()
+    refined, initial = shown_maps(report / "report.html")
+    assert (refined["name"], initial["name"]) == ("refined", "initial")
+    assert set(refined["errors"]) == {"Error", "Expected error"} and set(initial["errors"]) == {"Error"}
+    assert refined["functional"]["columns"] == initial["functional"]["columns"] == 20
+    assert refined["functional"] != initial["functional"] and refined["map"] != initial["map"]
 
 
 def test_presets(run, pair, tmp_path):
@@ -264,6 +271,54 @@ def test_evaluate_writes_figures_and_numbers(run, pair, tmp_path):
     perfect, zero = json.loads((tmp_path / "e.json").read_text()).values()
     assert perfect["mean"] == 0 and zero["mean"] > 0.1
     assert (tmp_path / "e.png").read_bytes().startswith(b"\x89PNG")
+
+
+def shown_maps(page: Path) -> list[dict]:
+    data = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)
+    return json.loads(data[1])["maps"]
+
+
+def test_a_page_compares_maps(run, pair, tmp_path):
+    np.savetxt(tmp_path / "zero.txt", np.zeros(642), fmt="%d")
+    meshes, maps = (pair / "x.off", pair / "y.ply"), (pair / "truth.txt", tmp_path / "zero.txt")
+    evaluated, rendered = tmp_path / "evaluated.html", tmp_path / "rendered.html"
+    outcome = run("evaluate", *meshes, *maps, "--ground-truth", pair / "truth.txt", "--page", evaluated)
+    assert outcome.code == 0, outcome.errors
+    assert run("render", *meshes, *maps, "--output", rendered, "--up", "z").code == 0
+    for page in (evaluated, rendered):
+        perfect, zero = shown_maps(page)
+        assert (perfect["name"], zero["name"]) == ("truth", "zero")
+        assert perfect["map"] != zero["map"] and perfect["functional"] != zero["functional"]
+        assert perfect["functional"]["columns"] == 100
+        assert 'value="wavelets"' in page.read_text()
+        names = {"Error"} if page == evaluated else set()
+        assert perfect["errors"].keys() == zero["errors"].keys() == names
+    rows = re.findall(r'<tr><th scope="row">(\w+)</th><td>([\d.]+)<', evaluated.read_text())
+    means = [mean_error(line) for line in outcome.output.splitlines()]
+    assert [name for name, _ in rows] == ["truth", "zero"]
+    assert [float(mean) for _, mean in rows] == pytest.approx(means, abs=1e-4)
+    # Files of one name are told apart by more of their paths.
+    (tmp_path / "other").mkdir()
+    np.savetxt(tmp_path / "other" / "zero.txt", np.ones(642), fmt="%d")
+    two = tmp_path / "zero.txt", tmp_path / "other" / "zero.txt"
+    assert run("render", *meshes, *two, "--output", rendered).code == 0
+    assert [shown["name"] for shown in shown_maps(rendered)] == [str(path) for path in two]
+
+
+@pytest.mark.filterwarnings("default:the page does without wavelets")
+def test_a_page_of_a_part_and_the_whole(run, pair, tmp_path):
+    """Eigenvalues as they are in the same unit, up to the same; where that cannot be, a page all the same."""
+    call = ["render", pair / "x.off", pair / "y.ply", pair / "truth.txt", "--output", tmp_path / "p.html"]
+    assert run(*call, "--partial").code == 0
+    # The smaller has fewer eigenvalues in that range.
+    functional = shown_maps(tmp_path / "p.html")[0]["functional"]
+    rows = len(base64.b64decode(functional["values"])) // (4 * functional["columns"])
+    assert rows < 30 < functional["columns"] == 100
+    mesh = read_mesh(pair / "y.ply")
+    write_mesh(tmp_path / "large.off", make_mesh(1e3 * mesh.vertices, mesh.faces))
+    outcome = run(*call[:2], tmp_path / "large.off", *call[3:], "--partial")
+    assert outcome.code == 0 and "warning: the page does without wavelets" in outcome.errors
+    assert shown_maps(tmp_path / "p.html")[0]["functional"] is None
 
 
 def test_spectrum(run, pair, tmp_path):
@@ -558,6 +613,12 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("spectrum {x} --figure {t}/s.nonsense", "s.nonsense"),
         ("render {x} {y} --output {t}/a.png", "give the map"),
         ("render {x} --output {t}/a.html", "page"),
+        ("render {x} {y} {p}/truth.txt {p}/truth1.txt --output {t}/a.png", "one map"),
+        ("render {x} {y} {p}/truth.txt --output {p}/truth.txt", "would be overwritten"),
+        ("render {x} {y} {p}/truth.txt --partial --output {t}/a.png", "--partial"),
+        ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --page {t}/e.png", ".html"),
+        ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --up z", "--page"),
+        ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --page {t}/no/e.html", "no/e.html"),
         ("render {x} --output {t}/a.nonsense", "a.nonsense"),
         ("demo --output {x}", "cannot be made a directory"),
         ("demo --kind unicorn --output {t}/d", "unicorn"),

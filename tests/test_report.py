@@ -10,9 +10,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
@@ -20,12 +22,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
-from synthetic import grid_mesh, sphere_mesh
+from synthetic import grid_mesh, random_spectrum, sphere_mesh
 
+from jaxsmw.core.filters import Meyer
+from jaxsmw.core.functional_map import encode
+from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.report import colors, figures, rendering
+from jaxsmw.report import page as page_module
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -34,7 +42,7 @@ from jaxsmw.report.figures import (
     draw_quality_curves,
     save_figure,
 )
-from jaxsmw.report.page import write_page
+from jaxsmw.report.page import ShownMap, eigenvectors_on_page, write_page
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render, stand, stand_pair
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -118,6 +126,19 @@ def test_error_colors_darken_with_the_error() -> None:
     assert np.all(np.diff(luminance[:6]) < -0.02)
     assert np.array_equal(color[6], color[5])
     assert np.array_equal(color[7], colors.PLAIN)
+
+
+def test_signed_colors_are_blue_below_and_red_above_as_strongly() -> None:
+    values = np.array([-2, -1, -0.5, 0, 0.5, 1, 2])
+    for on_dark in (False, True):
+        color = colors.signed_colors(values, 1.0, on_dark=on_dark)
+        assert np.array_equal(color[[0, -1]], color[[1, -2]])
+        assert np.ptp(color[3]) < 0.03 and np.all(color[:3, 2] > color[:3, 0] + 0.2)
+        assert np.all(color[4:, 0] > color[4:, 2] + 0.2)
+        luminance = colors.srgb_to_linear(color) @ [0.2126, 0.7152, 0.0722]
+        # Zero is the ground; what is far from it stands out, on either side.
+        assert np.all(np.diff(luminance[3:6]) * (1 if on_dark else -1) > 0.05)
+        assert np.all(np.diff(luminance[1:4]) * (-1 if on_dark else 1) > 0.05)
 
 
 # ---- Standing and looking
@@ -470,7 +491,8 @@ def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
     with pytest.raises(InputError, match=r"pip install 'jaxsmw\[report\]'"):
         draw_functional_map(np.eye(3))
-    write_page(tmp_path / "page.html", TALL, TALL, np.arange(len(TALL.vertices)), title="no figures needed")
+    shown = ShownMap(np.arange(len(TALL.vertices)))
+    write_page(tmp_path / "page.html", TALL, TALL, {"map": shown}, title="no figures needed")
 
 
 def test_matplotlib_is_imported_late_and_pyplot_never() -> None:
@@ -481,8 +503,9 @@ def test_matplotlib_is_imported_late_and_pyplot_never() -> None:
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
 
 
-def _page(*arguments: Any, **options: Any) -> None:
-    write_page(os.devnull, *arguments, title="", **options)
+def _page(mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Any, *, errors: Any = None, **options: Any) -> None:
+    shown = ShownMap(pointwise_map, errors or {})
+    write_page(os.devnull, mesh_x, mesh_y, {"map": shown}, title="", **options)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -520,18 +543,28 @@ def test_page_holds_the_data_and_nothing_from_elsewhere(tmp_path: Path) -> None:
     other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
     errors = np.linspace(0, 0.1, len(number))
     named = {"Error": errors, "Expected <error>": errors / 2}
-    write_page(tmp_path / "page.html", TALL, other, number, title="One", errors=named, error_limit=0.05)
+    matrix = np.arange(6.0).reshape(2, 3)
+    maps = {"A <b>": ShownMap(number, named, matrix, "pushforward"), "B": ShownMap(number[::-1])}
+    write_page(tmp_path / "page.html", TALL, other, maps, title="One", error_limit=0.05)
     page = (tmp_path / "page.html").read_text("utf-8")
     data = embedded(page)
     for side, standing in zip("xy", stand_pair(TALL, other), strict=True):
         assert np.allclose(decode(data[side]["vertices"], "<f4").reshape(-1, 3), standing.vertices, atol=1e-6)
         assert np.array_equal(decode(data[side]["faces"], "<u4").reshape(-1, 3), standing.faces)
-    assert np.array_equal(decode(data["map"], "<u4"), number)
-    for (name, values), shown in zip(named.items(), data["errors"], strict=True):
-        assert shown["name"] == name and np.allclose(decode(shown["values"], "<f4"), values)
-        expected = np.round(255 * colors.error_colors(values, 0.05))
-        assert np.array_equal(decode(shown["colors"], "u1").reshape(-1, 3), expected)
-    assert 'value="error-1">Expected &lt;error&gt;<' in page
+    first, second = data["maps"]
+    assert (first["name"], second["name"]) == ("A <b>", "B")
+    assert np.array_equal(decode(first["map"], "<u4"), number)
+    assert np.array_equal(decode(second["map"], "<u4"), number[::-1])
+    assert list(first["errors"]) == data["error_names"] == list(named) and second["errors"] == {}
+    for name, values in named.items():
+        assert np.allclose(decode(first["errors"][name], "<f4"), values)
+    assert np.array_equal(decode(first["functional"]["values"], "<f4").reshape(2, 3), matrix)
+    assert first["functional"]["pushforward"] and second["functional"] is None
+    scale = decode(data["scales"]["error"], "u1").reshape(-1, 3)
+    assert np.array_equal(scale, np.round(255 * colors.error_colors(np.linspace(0, 0.05, 256), 0.05)))
+    assert data["limit"] == 0.05
+    assert 'value="error-1"><span>Expected &lt;error&gt;<' in page and "<span>A &lt;b&gt;<" in page
+    assert 'value="wavelets"' not in page
     assert "someone" not in page and "other.off · 642 vertices" in page and "≥ 0.05 √area" in page
     assert "{{" not in page.split("<script>")[0]
     # The one address is the name of a namespace, which nobody fetches.
@@ -540,19 +573,60 @@ def test_page_holds_the_data_and_nothing_from_elsewhere(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
 
 
+def test_errors_are_shown_on_the_scale_of_the_best_map(tmp_path: Path) -> None:
+    n = len(TALL.vertices)
+    maps = {
+        name: ShownMap(np.arange(n), {"Error": np.full(n, error)} if error else {})
+        for name, error in {"bad": 0.7, "good": 0.02, "unknown": 0}.items()
+    }
+    write_page(tmp_path / "page.html", TALL, TALL, maps, title="t")
+    assert embedded((tmp_path / "page.html").read_text("utf-8"))["limit"] == pytest.approx(0.02)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_pages_without_what_they_need_are_refused() -> None:
+    n = len(TALL.vertices)
+    with pytest.raises(InputError, match="no map"):
+        write_page(os.devnull, TALL, TALL, {}, title="")
+    shown = {"map": ShownMap(np.arange(n))}
+    with pytest.raises(InputError, match=r"7 vertices, but it has 642"):
+        write_page(
+            os.devnull, TALL, TALL, shown, title="", spectra=(random_spectrum(n, 5), random_spectrum(7, 5))
+        )
+    shown = {"map": ShownMap(np.arange(n), functional_map=np.array([[np.nan]]))}
+    with pytest.raises(InputError, match="functional map"):
+        write_page(os.devnull, TALL, TALL, shown, title="")
+
+
 def test_page_of_a_usual_mesh_is_small(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     n = 7000
     mesh = Mesh(generator.normal(size=(n, 3)), generator.integers(0, n, (2 * n, 3)))
-    write_page(
-        tmp_path / "page.html", mesh, mesh, np.arange(n), title="t", errors={"Error": generator.random(n)}
-    )
-    assert (tmp_path / "page.html").stat().st_size < 1.6e6
+    shown = ShownMap(np.arange(n), {"Error": generator.random(n)}, np.eye(100))
+    for spectra, limit in ((None, 1.6e6), ((random_spectrum(n, 120), random_spectrum(n, 120)), 3.5e6)):
+        write_page(tmp_path / "page.html", mesh, mesh, {"map": shown}, title="t", spectra=spectra)
+        assert (tmp_path / "page.html").stat().st_size < limit
+
+
+def test_large_meshes_get_fewer_eigenvectors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    n = len(TALL.vertices)
+    spectra = random_spectrum(n, 60), random_spectrum(n, 60)
+    for room, eigenvectors in ((10**6, 60), (50 * n, 25), (39 * n, 0)):
+        monkeypatch.setattr(page_module, "_VALUES", room)
+        write_page(tmp_path / "p", TALL, TALL, {"map": ShownMap(np.arange(n))}, title="", spectra=spectra)
+        page = (tmp_path / "p").read_text("utf-8")
+        shown = embedded(page)["x"].get("eigenvectors", {"codes": "", "units": ""})
+        assert len(decode(shown["units"], "<f4")) == eigenvectors
+        assert len(decode(shown["codes"], "i1")) == eigenvectors * n <= room / 2
+        assert ('value="wavelets"' in page) == (eigenvectors > 0)
+        assert min(eigenvectors_on_page(TALL, TALL), 60) == eigenvectors
 
 
 def test_same_input_same_page(tmp_path: Path) -> None:
+    n = len(TALL.vertices)
+    spectra = random_spectrum(n, 30), random_spectrum(n, 30)
     for name in ("a", "b"):
-        write_page(tmp_path / name, TALL, TALL, np.arange(len(TALL.vertices)), title="t")
+        write_page(tmp_path / name, TALL, TALL, {"map": ShownMap(np.arange(n))}, title="t", spectra=spectra)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -607,7 +681,7 @@ class OpenPage:
     """One page in the browser, with a user's eyes and hands."""
 
     def __init__(self, browser: Any, path: Path, *, width: int = 840, height: int = 600) -> None:
-        self.browser = browser
+        self.browser, self.path = browser, path
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         browser.get(path.as_uri())
@@ -696,10 +770,9 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "page.html"
     errors = np.linspace(0, 0.2, len(NUMBER))
     errors[visible_vertices()[1]] = np.nan
-    write_page(
-        path, SOURCE, TARGET, crowded_map(), title="Two bodies", statistics={"Mean": "0.1"},
-        errors={"Error": errors, "Expected error": np.linspace(0.2, 0, len(NUMBER))},
-    )  # fmt: skip
+    named = {"Error": errors, "Expected error": np.linspace(0.2, 0, len(NUMBER))}
+    shown = {"map": ShownMap(crowded_map(), named)}
+    write_page(path, SOURCE, TARGET, shown, title="Two bodies", statistics={"Mean": "0.1"})
     return path
 
 
@@ -719,7 +792,9 @@ def page(browser: Any, page_file: Path) -> Iterator[OpenPage]:
 
 def test_page_draws_both_bodies(page: OpenPage) -> None:
     assert page.browser.title == page.find("h1").text == "Two bodies"
-    assert page.state == {"source": [], "target": [], "pinned": False, "coloring": "transfer"}
+    assert page.state == {
+        "source": [], "target": [], "pinned": False, "coloring": "transfer", "map": "map", "filter": 0, "entry": None,
+    }  # fmt: skip
     for side in "xy":
         view = page.view(side)
         assert min(view.shape[:2]) > 300
@@ -786,6 +861,12 @@ def test_colorings(page: OpenPage) -> None:
     page.choose("error-0")
     error = {side: page.view(side) for side in "xy"}
     assert page.state["coloring"] == "error-0" and page.find(".scale").is_displayed()
+    # Linear interpolation on another grid: one step of the scale apart at most.
+    values = np.linspace(0, 0.2, len(NUMBER))
+    values[visible_vertices()[1]] = np.nan
+    shown = np.reshape(page.run("return jaxsmw.colors('x')"), (-1, 3))
+    limit = embedded((page.path).read_text("utf-8"))["limit"]
+    assert np.abs(shown - 255 * colors.error_colors(values, limit)).max() < 4
     page.choose("error-1")
     assert page.find(".scale").is_displayed() and differ(error["x"], page.view("x")) > 0.1
     page.choose("plain")
@@ -878,7 +959,7 @@ def test_hostile_texts_are_only_texts(browser: Any, tmp_path: Path) -> None:
         tmp_path / "page.html",
         body,
         body,
-        np.arange(len(body.vertices)),
+        {HOSTILE: ShownMap(np.arange(len(body.vertices)), statistics={HOSTILE: HOSTILE})},
         title=HOSTILE,
         statistics={HOSTILE: HOSTILE},
         figures=[(HOSTILE, png.getvalue())],
@@ -890,6 +971,7 @@ def test_hostile_texts_are_only_texts(browser: Any, tmp_path: Path) -> None:
     assert page.run("return document.querySelector('.figures img').naturalWidth") == 6
     assert page.run("return [window.hacked, document.images.length]") == [None, 1]
     assert page.find(".body span").text.startswith("<\\script><\\title><img src=x onerror=")
+    assert page.find("tbody th").text == page.find("tbody td").text == HOSTILE
     assert not browser.find_elements("css selector", "input[value^=error]")
     assert browser.get_log("browser") == []
     # Were a text to get through after all, the page still runs no script but its own.
@@ -897,3 +979,338 @@ def test_hostile_texts_are_only_texts(browser: Any, tmp_path: Path) -> None:
     page.settle()
     assert page.run("return window.hacked") is None
     browser.get_log("browser")
+
+
+# ---- Wavelets, functional maps and several maps, in a browser
+
+EIGENVECTORS, FILTERS = 40, 5
+
+
+@pytest.fixture(scope="module")
+def spectra() -> tuple[Spectrum, Spectrum]:
+    return compute_spectrum(SOURCE, EIGENVECTORS), compute_spectrum(TARGET, EIGENVECTORS)
+
+
+def two_maps() -> dict[str, np.ndarray]:
+    return {"good": NUMBER, "bad": np.random.default_rng(5).permutation(NUMBER)}
+
+
+@pytest.fixture(scope="module")
+def comparison_file(tmp_path_factory: pytest.TempPathFactory, spectra: tuple[Spectrum, Spectrum]) -> Path:
+    path = tmp_path_factory.mktemp("comparison") / "page.html"
+    shown = {
+        name: ShownMap(
+            pointwise_map,
+            {name: np.linspace(0.01, 0.02, len(NUMBER)) * (1 if name == "good" else 9)},
+            encode(jnp.asarray(pointwise_map), *spectra),
+            statistics={"mean": f"{0.1 * len(name):.2f}"},
+        )
+        for name, pointwise_map in two_maps().items()
+    }
+    refiner = WaveletPreservation(Meyer(FILTERS))
+    write_page(path, SOURCE, TARGET, shown, title="Two maps", spectra=spectra, refiner=refiner)
+    return path
+
+
+@pytest.fixture
+def comparison(browser: Any, comparison_file: Path) -> Iterator[OpenPage]:
+    browser.get_log("browser")
+    yield OpenPage(browser, comparison_file, width=1280, height=800)
+    assert browser.get_log("browser") == []
+
+
+def rounding(values: np.ndarray) -> np.ndarray:
+    """How far eigenvectors (n, k) may be from those on the page: by half a level, whose width varies."""
+    largest, half = np.abs(values).max(axis=0), 0.5 / 127
+    return largest * (2 * half * np.sqrt(np.abs(values) / largest) + half**2) + 1e-6 * largest
+
+
+def wavelets(spectrum: Spectrum, vertex: int) -> tuple[np.ndarray, np.ndarray]:
+    """The wavelets around a vertex at all scales (filters, n), and how far those on the page may be off."""
+    responses = np.asarray(Meyer(FILTERS)(spectrum.eigenvalues, spectrum.eigenvalues))
+    values = np.asarray(spectrum.eigenvectors)
+    off = rounding(values)
+    coefficients = responses * values[vertex]
+    bound = np.abs(responses * off[vertex]) @ (np.abs(values) + off).T + np.abs(coefficients) @ off.T
+    return coefficients @ values.T, bound + 1e-4
+
+
+def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, Spectrum]) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    comparison.choose("wavelets")
+    assert comparison.run("return jaxsmw.functions") == {"x": None, "y": None}
+    assert comparison.readout.startswith("Point at a body to see the wavelets")
+    first, second = visible_vertices()[[0, 9]].tolist()
+    slider = comparison.find("#filter")
+    assert (
+        slider.get_attribute("aria-valuetext") == comparison.find("#filter-name").text == "scaling function"
+    )
+    comparison.point_at(*comparison.place("x", first), click=False)
+    assert comparison.state["source"] == [first]
+    comparison.point_at(*comparison.place("x", second), click=True)
+    expected = {
+        "x": wavelets(spectra[0], second),
+        "y": wavelets(spectra[1], int(NUMBER[second])),
+    }
+    views = []
+    for scale in range(FILTERS):
+        shown = comparison.run("return jaxsmw.functions")
+        limit = np.quantile(np.abs(np.concatenate([shown["x"], shown["y"]])), 0.98)
+        for side in "xy":
+            exact, bound = (array[scale] for array in expected[side])
+            error = np.abs(np.array(shown[side]) - exact)
+            assert np.all(error <= bound)
+            # What the eye sees: less than a twentieth of the scale anywhere, a hundredth as a rule.
+            assert error.max() < 0.05 * limit and np.sqrt(np.mean(error**2)) < 0.01 * limit
+            color = np.reshape(comparison.run("return jaxsmw.colors(arguments[0])", side), (-1, 3))
+            expected_color = 255 * colors.signed_colors(np.array(shown[side]), limit)
+            assert np.abs(color - expected_color).max() < 6
+        ends = [comparison.find(f"#signed-{end}").text for end in ("low", "high")]
+        assert [float(end.translate({0x2212: "-"})[2:]) for end in ends] == pytest.approx(
+            [-limit, limit], rel=0.05
+        )
+        x, carried = np.array(shown["x"]), np.array(shown["y"])[NUMBER]
+        areas = np.asarray(spectra[0].vertex_areas)
+        cosine = areas @ (x * carried) / np.sqrt((areas @ x**2) * (areas @ carried**2))
+        told = re.search(r"wavelets alike: cosine (\S+)", comparison.readout)
+        assert told and float(told[1]) == pytest.approx(cosine, abs=2e-3)
+        views.append(comparison.view("x"))
+        slider.send_keys(Keys.ARROW_RIGHT)
+        comparison.settle()
+    assert comparison.state["filter"] == FILTERS - 1
+    assert comparison.find("#filter-name").text == f"wavelet {FILTERS - 1} of {FILTERS - 1} (finest)"
+    assert all(differ(a, b) > 0.02 for a, b in pairwise(views))
+    # The other way round: the wavelet on the source is around what the map takes to the target's vertex.
+    target = int(NUMBER[first])
+    comparison.point_at(*comparison.place("y", target), click=True)
+    exact, bound = wavelets(spectra[0], first)
+    assert np.all(np.abs(comparison.run("return jaxsmw.functions")["x"] - exact[-1]) <= bound[-1])
+
+
+def test_real_wavelets_look_the_same_on_the_page(shared: Path) -> None:
+    """Limbs are what makes rounding hard: eigenvectors that are large on a finger and small elsewhere."""
+    spectrum = compute_spectrum(read_mesh(shared / "data/faust_r/off/tr_reg_062.off"), 100)
+    values = np.asarray(spectrum.eigenvectors)
+    shown = page_module._encode_rounded(values.T)
+    codes = decode(shown["codes"], "i1").reshape(values.T.shape).astype(float)
+    rounded = (np.sign(codes) * codes**2 * decode(shown["units"], "<f4")[:, None]).T
+    assert np.all(np.abs(rounded - values) <= rounding(values))
+    responses = np.asarray(Meyer()(spectrum.eigenvalues, spectrum.eigenvalues))
+    for vertex in range(0, len(values), 500):
+        for response in responses:
+            exact, found = (v @ (response * v[vertex]) for v in (values, rounded))
+            limit = np.quantile(np.abs(exact), 0.98)
+            error = np.abs(np.clip(exact, -limit, limit) - np.clip(found, -limit, limit)) / limit
+            assert np.sqrt(np.mean(error**2)) < 0.02 and np.mean(error > 0.05) < 0.02
+
+
+def matrix_colors(page: OpenPage) -> np.ndarray:
+    pixels = page.run(
+        "const m = document.querySelector('#matrix'), copy = document.createElement('canvas');"
+        "Object.assign(copy, { width: m.width, height: m.height });"
+        "const context = copy.getContext('2d', { willReadFrequently: true });"
+        "context.drawImage(m, 0, 0);"
+        "return [m.height, m.width, Array.from(context.getImageData(0, 0, m.width, m.height).data)]"
+    )
+    return np.reshape(pixels[2], (*pixels[:2], 4))[..., :3]
+
+
+def test_the_functional_map_and_its_eigenfunctions(
+    comparison: OpenPage, spectra: tuple[Spectrum, Spectrum]
+) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    matrices = {name: np.asarray(encode(jnp.asarray(of), *spectra)) for name, of in two_maps().items()}
+    limit = max(np.abs(matrix).max() for matrix in matrices.values())
+    expected = 255 * colors.signed_colors(matrices["good"].ravel(), limit).reshape(
+        EIGENVECTORS, EIGENVECTORS, 3
+    )
+    assert np.abs(matrix_colors(comparison) - expected).max() < 4
+    before = comparison.view("x")
+    canvas = comparison.find("#matrix")
+    comparison.run("arguments[0].scrollIntoView()", canvas)
+    box = comparison.run(
+        "const {left, top, width} = arguments[0].getBoundingClientRect(); return [left, top, width]", canvas
+    )
+    row, column = 7, 12
+    place = [round(box[i] + (index + 0.5) * box[2] / EIGENVECTORS) for i, index in enumerate((column, row))]
+
+    def check(row: int, column: int) -> None:
+        value = f"{matrices['good'][row, column]:.3f}".replace("-", "−")
+        text = comparison.find("#entry").text
+        assert (
+            text == f"C({row}, {column}) = {value}: eigenfunction {row} of the source, {column} of the target"
+        )
+        functions = comparison.run("return jaxsmw.functions")
+        for side, spectrum, index in zip("xy", spectra, (row, column), strict=True):
+            values = np.asarray(spectrum.eigenvectors)
+            assert np.all(np.abs(functions[side] - values[:, index]) <= rounding(values)[:, index])
+
+    comparison.point_at(*place, click=False)
+    check(row, column)
+    assert comparison.state["entry"] is None and comparison.find("#ring").is_displayed()
+    comparison.look_away()
+    assert comparison.run("return jaxsmw.functions") == {"x": None, "y": None}
+    assert not comparison.find("#ring").is_displayed()
+    comparison.point_at(*place, click=True)
+    comparison.look_away()
+    assert comparison.state["entry"] == [row, column]
+    check(row, column)
+    canvas.send_keys(Keys.ARROW_DOWN, Keys.SHIFT, Keys.ARROW_RIGHT)
+    check(row + 1, column + 10)
+    comparison.choose("transfer")
+    assert comparison.state["entry"] is None
+    comparison.run("scrollTo(0, 0)")
+    assert differ(comparison.view("x"), before) == 0
+
+
+def test_the_functional_map_on_a_dark_page(browser: Any, comparison_file: Path) -> None:
+    def emulate(*features: dict[str, str]) -> None:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": list(features)})
+
+    page = OpenPage(browser, comparison_file)
+    light = matrix_colors(page)
+    emulate({"name": "prefers-color-scheme", "value": "dark"})
+    page.settle()
+    dark = matrix_colors(page)
+    assert np.median(light) > 220 and np.median(dark) < 60
+    emulate()
+
+
+def test_switching_between_maps(comparison: OpenPage) -> None:
+    vertex = int(visible_vertices()[4])
+    comparison.run("jaxsmw.pick(arguments[0])", vertex)
+    maps = two_maps()
+
+    def check(name: str, scale: int) -> None:
+        target = int(maps[name][vertex])
+        assert comparison.state["map"] == name and comparison.state["target"] == [target]
+        error = scale * np.linspace(0.01, 0.02, len(NUMBER))[vertex]
+        assert comparison.readout == f"Source vertex {vertex} → target vertex {target} · {name} {error:.4f}"
+        current = comparison.find("[aria-current=true]").text
+        assert current.split() == [name, f"{0.1 * len(name):.2f}"]
+        shown = np.reshape(comparison.run("return jaxsmw.colors('x')"), (-1, 3))
+        target_colors = np.reshape(comparison.run("return jaxsmw.colors('y')"), (-1, 3))
+        assert np.array_equal(shown, target_colors[maps[name]])
+
+    check("good", 1)
+    good, picture = matrix_colors(comparison), comparison.view("x")
+    comparison.find("input[name=map][value='1']").click()
+    check("bad", 9)
+    assert np.abs(matrix_colors(comparison) - good).max() > 50
+    assert differ(picture, comparison.view("x")) > 0.1
+    # What is not known of a map cannot be chosen, and does not stay chosen.
+    assert [comparison.find(f"input[value=error-{i}]").is_enabled() for i in (0, 1)] == [False, True]
+    comparison.choose("error-1")
+    comparison.find("input[name=map][value='0']").click()
+    assert (
+        comparison.state["coloring"] == "transfer" and comparison.find("input[value=transfer]").is_selected()
+    )
+    check("good", 1)
+    # The wavelets follow, too.
+    comparison.choose("wavelets")
+    alike = []
+    for position in (0, 1):
+        comparison.find(f"input[name=map][value='{position}']").click()
+        found = re.search(r"cosine (\S+)", comparison.readout)
+        assert found
+        alike.append(float(found[1]))
+    assert alike[0] > alike[1] + 0.2
+
+
+def test_maps_of_different_sizes_and_without_functional_map(browser: Any, tmp_path: Path) -> None:
+    n = len(NUMBER)
+    errors = {"Error": np.where(np.arange(n) == 3, np.inf, 0.01)}
+    large = ShownMap(NUMBER, errors, np.diag(np.arange(1.0, 7)))
+    shown = {"large": large, "small": replace(large, functional_map=np.eye(2)), "none": ShownMap(NUMBER)}
+    write_page(tmp_path / "page.html", SOURCE, TARGET, shown, title="Sizes")
+    browser.get_log("browser")
+    page = OpenPage(browser, tmp_path / "page.html")
+    page.run("jaxsmw.pick(3)")
+    assert page.readout.endswith("error without end (on another component)")
+    from selenium.webdriver.common.keys import Keys
+
+    page.find("#matrix").send_keys(Keys.ARROW_DOWN, Keys.SHIFT, Keys.ARROW_DOWN, Keys.ARROW_RIGHT)
+    # The page has no eigenvectors to show.
+    entry = (
+        "C(5, 5) = 6.000: eigenfunction 5 of the source, 5 of the target (not among those this page holds)"
+    )
+    assert page.find("#entry").text == entry
+    assert page.run("return jaxsmw.functions") == {"x": None, "y": None}
+    page.find("input[name=map][value='1']").click()
+    assert page.find("#entry").text.startswith("Point at") and matrix_colors(page).shape == (2, 2, 3)
+    page.find("input[name=map][value='2']").click()
+    assert not page.find("#functional").is_displayed()
+    page.find("input[name=map][value='0']").click()
+    assert page.find("#entry").text == entry and page.find("#functional").is_displayed()
+    assert browser.get_log("browser") == []
+
+
+def test_every_control_is_reached_and_worked_by_keys(comparison: OpenPage) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    comparison.choose("wavelets")
+    comparison.find("h1").click()
+    comparison.run("getSelection().setPosition(document.body, 0)")
+    reached: list[str] = []
+    for _ in range(12):
+        comparison.mouse().send_keys(Keys.TAB).perform()
+        name, outline = comparison.run(
+            "const e = document.activeElement, shown = e.type === 'radio' ? e.parentElement : e;"
+            "return [e.id || e.name || e.className || e.tagName, getComputedStyle(shown).outlineStyle]"
+        )
+        if name == "BODY" or name in reached:
+            break
+        assert outline not in ("none", ""), f"{name} does not show that it has the focus"
+        reached.append(name)
+    assert reached == [
+        "map", "coloring", "filter", "linked", "reset", "vertex", "canvas-x", "canvas-y", "matrix", "table",
+    ]  # fmt: skip
+    for selector, keys, key, value in (
+        ("input[name=map]", Keys.ARROW_RIGHT, "map", "bad"),
+        ("input[name=coloring]:checked", Keys.ARROW_LEFT, "coloring", "error-1"),
+        ("#vertex", "3" + Keys.ENTER, "source", [3]),
+        ("#matrix", Keys.ARROW_RIGHT, "entry", [0, 0]),
+        ("#matrix", Keys.ARROW_RIGHT + Keys.ARROW_DOWN, "entry", [1, 1]),
+        ("#matrix", Keys.ESCAPE, "entry", None),
+        ("#canvas-y", Keys.ESCAPE, "source", []),
+    ):
+        comparison.find(selector).send_keys(keys)
+        assert comparison.state[key] == value
+    comparison.find("#linked").send_keys(Keys.SPACE)
+    assert not comparison.find("#linked").is_selected()
+    unnamed = comparison.run(
+        "return [...document.querySelectorAll('input, button, canvas')].filter("
+        "e => !(e.ariaLabel || e.textContent || e.labels?.[0]?.textContent.trim())).length"
+    )
+    assert unnamed == 0
+
+
+@pytest.mark.parametrize("coloring", ["transfer", "wavelets"])
+def test_a_phone_of_360_pixels(browser: Any, comparison_file: Path, coloring: str) -> None:
+    feature = {"name": "prefers-reduced-motion", "value": "reduce"}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    browser.get_log("browser")
+    page = OpenPage(browser, comparison_file, width=360, height=740)
+    page.choose(coloring)
+    assert page.run("return document.documentElement.scrollWidth") <= 360
+    for element in browser.find_elements(
+        "css selector", ".choice label, .view *, .filter *, canvas, .scale, #entry"
+    ):
+        if element.is_displayed():
+            box = element.rect
+            assert box["x"] >= 0 and box["x"] + box["width"] <= 360, element.get_attribute("outerHTML")
+    for element in browser.find_elements("css selector", ".choice label, .view label, .view button"):
+        assert element.rect["height"] >= 32
+    # Both bodies are seen at once, and their vertices can be touched.
+    boxes = [page.find(f"#canvas-{side}").rect for side in "xy"]
+    assert max(box["y"] + box["height"] for box in boxes) - min(box["y"] for box in boxes) < 740
+    page.run("document.querySelector('.bodies').scrollIntoView()")
+    vertex = int(visible_vertices()[0])
+    page.point_at(*page.place("x", vertex), click=True)
+    assert page.state["source"] == [vertex] and page.state["target"] == [int(NUMBER[vertex])]
+    # Nothing moves by itself.
+    assert page.run("return document.getAnimations().length") == 0
+    assert browser.get_log("browser") == []
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

@@ -36,6 +36,29 @@ _ERROR_SCALE = np.array(
     ]
 )
 
+# From the largest negative (blue) over none to the largest positive (red), as light at both ends, so that
+# neither sign stands out; the middle is paper white, or night on a dark ground.
+_SIGNED_SCALE = {
+    False: np.array(
+        [
+            [0.44, -0.03, -0.16],
+            [0.68, -0.05, -0.11],
+            [0.96, 0.00, 0.005],
+            [0.68, 0.12, 0.07],
+            [0.44, 0.16, 0.08],
+        ]
+    ),
+    True: np.array(
+        [
+            [0.82, -0.06, -0.09],
+            [0.58, -0.05, -0.13],
+            [0.23, 0.00, -0.01],
+            [0.58, 0.16, 0.07],
+            [0.82, 0.09, 0.06],
+        ]
+    ),
+}
+
 PLAIN = np.array([0.76, 0.77, 0.79])
 """What a surface without a message wears, and a vertex whose error nobody knows."""
 
@@ -97,11 +120,30 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float) -> Float64[np.nd
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """
     known = ~np.isnan(errors)
-    stops = np.linspace(0, limit, len(_ERROR_SCALE))
-    lab = np.stack(
-        [np.interp(np.where(known, errors, 0), stops, channel) for channel in _ERROR_SCALE.T], axis=1
-    )
-    return np.where(known[:, None], _oklab_to_srgb(lab), PLAIN)
+    found = _on_scale(np.where(known, errors, 0), 0.0, limit, _ERROR_SCALE)
+    return np.where(known[:, None], found, PLAIN)
+
+
+def signed_colors(
+    values: Float[np.ndarray, " m"], limit: float, *, on_dark: bool = False
+) -> Float64[np.ndarray, "m 3"]:
+    """The colour of each value on a scale from `-limit` (blue) to `limit` (red), ends for what lies beyond.
+
+    **Arguments:**
+
+    - `values`: of a function, an entry of a matrix.
+    - `limit`: positive.
+    - `on_dark`: zero is dark instead of white, to be shown on a dark ground.
+
+    **Returns:** sRGB colours (m, 3) in [0, 1].
+    """
+    return _on_scale(values, -limit, limit, _SIGNED_SCALE[on_dark])
+
+
+def _on_scale(values: np.ndarray, low: float, high: float, scale: np.ndarray) -> np.ndarray:
+    """Colours between those of a scale, the first of which is for `low` and the last for `high`."""
+    stops = np.linspace(low, high, len(scale))
+    return _oklab_to_srgb(np.stack([np.interp(values, stops, channel) for channel in scale.T], axis=1))
 
 
 def _oklab_to_srgb(lab: np.ndarray) -> np.ndarray:

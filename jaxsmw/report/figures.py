@@ -16,7 +16,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write, check_writable
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import PLAIN, error_colors, position_colors
-from jaxsmw.report.inputs import check_errors, check_map, describe
+from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
 from jaxsmw.report.rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
 
 if TYPE_CHECKING:
@@ -125,11 +125,7 @@ def draw_functional_map(
 
     **Raises:** `InputError` if C is not a finite matrix, or matplotlib is missing.
     """
-    matrix = np.asarray(functional_map, dtype=float)
-    if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
-        raise InputError(
-            f"a functional map is a matrix of finite numbers, but this one has shape {matrix.shape}."
-        )
+    matrix = check_functional_map(functional_map)
     figure = _new_figure(5.0, 4.3, plot=True)
     axes = figure.add_subplot()
     limit = np.abs(matrix).max() or 1.0

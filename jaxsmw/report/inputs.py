@@ -64,6 +64,21 @@ def check_errors(
     return checked, limit
 
 
+def check_functional_map(
+    functional_map: Float[np.ndarray | Array, "k_out k_in"],
+) -> Float64[np.ndarray, "k_out k_in"]:
+    """C in NumPy float64.
+
+    **Raises:** `InputError` if it is not a finite matrix.
+    """
+    matrix = np.asarray(functional_map, dtype=float)
+    if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
+        raise InputError(
+            f"a functional map is a matrix of finite numbers, but this one has shape {matrix.shape}."
+        )
+    return matrix
+
+
 def describe(mesh: Mesh) -> tuple[str, str]:
     """What the caption of a body says: the file's name without its directory, and the size."""
     # A file's name need not be text; what is not becomes a question mark.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import logging
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,13 +14,18 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.core.compilation import compiled
 from jaxsmw.core.filters import FilterBank
+from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.files import atomic_write, make_directory
-from jaxsmw.matching import Correspondence
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching import Correspondence, paired_spectra
 from jaxsmw.provenance import machine, versions
 from jaxsmw.report.figures import (
     draw_correspondence,
@@ -26,7 +34,8 @@ from jaxsmw.report.figures import (
     draw_quality_curves,
     save_figure,
 )
-from jaxsmw.report.page import write_page
+from jaxsmw.report.inputs import check_map
+from jaxsmw.report.page import ShownMap, eigenvectors_on_page, write_page
 from jaxsmw.report.rendering import Axis
 
 if TYPE_CHECKING:
@@ -44,6 +53,9 @@ REPORT_FILES = (
 """What `write_report` may write."""
 
 
+_QUALITY_CAPTION = "The share of vertices within a geodesic error."
+
+
 def write_report(
     directory: str | os.PathLike[str],
     correspondence: Correspondence,
@@ -59,11 +71,12 @@ def write_report(
 
     **Arguments:**
 
-    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the figures),
-      `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has any), `quality.png` (with
-      errors only) and `summary.json`.
+    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the map and the
+      one it started from, wavelets and figures), `correspondence.png`, `functional_map.png`, `filters.png`
+      (if a stage has any), `quality.png` (with errors only) and `summary.json`.
     - `correspondence`: the match.
-    - `errors`: geodesic errors by name, the last of them that of `correspondence.pointwise_map`.
+    - `errors`: geodesic errors by name, `initial` that of `correspondence.initial_map`, the last of them that
+      of `correspondence.pointwise_map`.
     - `settings`: what else to note in the summary.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
 
@@ -73,9 +86,10 @@ def write_report(
     errors = errors or {}
     final = list(errors.values())[-1] if errors else None
     expected = correspondence.expected_error()
-    per_vertex = {"Expected error": expected}
-    if final is not None:
-        per_vertex = {"Error": _per_vertex(final, len(correspondence.pointwise_map)), **per_vertex}
+    m = len(correspondence.pointwise_map)
+    per_vertex = {} if final is None else {"Error": _per_vertex(final, m)}
+    per_vertex["Expected error"] = expected
+    convention: Convention = getattr(correspondence.stages[-1].refiner, "convention", "pullback")
 
     figures = {
         "correspondence": draw_correspondence(
@@ -85,35 +99,51 @@ def write_report(
             errors=per_vertex,
             up=up,
         ),
-        "functional_map": draw_functional_map(
-            correspondence.functional_map,
-            convention=getattr(correspondence.stages[-1].refiner, "convention", "pullback"),
-        ),
+        "functional_map": draw_functional_map(correspondence.functional_map, convention=convention),
     }
-    captions = {"functional_map": "The functional map C."}
+    captions = {}
+    refiner = WaveletPreservation()
     for stage in correspondence.stages:
         if isinstance(stage.refiner, WaveletPreservation):
+            refiner = stage.refiner
             eigenvalues = np.asarray(correspondence.spectrum_x.eigenvalues)[: stage.number_of_eigenvectors]
             figures["filters"] = draw_bank(stage.refiner.bank, eigenvalues)
             captions["filters"] = "The filters over the eigenvalues of the source (area 1)."
     if errors:
         figures["quality"] = draw_errors(errors)
-        captions["quality"] = "The share of vertices within a geodesic error."
+        captions["quality"] = _QUALITY_CAPTION
     for name, figure in figures.items():
         save_figure(directory / f"{name}.png", figure)
 
-    facts = summarize(correspondence, errors, expected)
+    spectra = correspondence.spectrum_x, correspondence.spectrum_y
+    start = ShownMap(
+        correspondence.initial_map,
+        {"Error": _per_vertex(errors["initial"], m)} if "initial" in errors else {},
+        _encoded(correspondence.initial_map, *spectra, convention),
+        convention,
+        _main_figures(errors.get("initial")),
+    )
+    outcome = ShownMap(
+        correspondence.pointwise_map,
+        per_vertex,
+        correspondence.functional_map,
+        convention,
+        _main_figures(final),
+    )
+    others = {name: error for name, error in list(errors.items())[:-1] if name != "initial"}
     write_page(
         directory / "report.html",
         correspondence.mesh_x,
         correspondence.mesh_y,
-        correspondence.pointwise_map,
-        title=f"{Path(correspondence.mesh_x.name).name} to {Path(correspondence.mesh_y.name).name}",
-        statistics=facts,
-        errors=per_vertex,
+        {"refined": outcome, "initial": start},
+        title=_title(correspondence.mesh_x, correspondence.mesh_y),
+        spectra=spectra,
+        refiner=refiner,
+        statistics=summarize(correspondence, others, expected),
         figures=[(caption, (directory / f"{name}.png").read_bytes()) for name, caption in captions.items()],
         up=up,
     )
+    facts = summarize(correspondence, errors, expected)
     summary = {
         "settings": dict(settings or {}),
         "result": facts,
@@ -122,6 +152,104 @@ def write_report(
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+
+
+def write_comparison(
+    path: str | os.PathLike[str],
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_maps: Mapping[str, Int[np.ndarray | Array, " m"]],
+    *,
+    errors: Mapping[str, GeodesicError] | None = None,
+    partial: bool = False,
+    up: Axis | None = None,
+) -> None:
+    """Write an interactive page with several maps of one pair, one shown at a time.
+
+    It shows their functional maps and the wavelets of the paper's bank as well, unless the eigenvectors of
+    the meshes cannot be computed, of which it warns.
+
+    **Arguments:**
+
+    - `path`: the HTML file.
+    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
+    - `pointwise_maps`: T: X -> Y (m,) by name, in this order.
+    - `errors`: their geodesic errors by the same names; the page shows them in colours, states the main
+      figures of all maps side by side, and has their correspondence quality curves.
+    - `partial`: whether one mesh shows a part of the other; see `jaxsmw.match`.
+    - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+
+    **Raises:** `InputError` if the maps do not fit the meshes, or the file cannot be written; with errors if
+    matplotlib is missing.
+    """
+    errors = errors or {}
+    maps = {name: check_map(mesh_x, mesh_y, pointwise_map) for name, pointwise_map in pointwise_maps.items()}
+    spectra = _spectra_on_page(mesh_x, mesh_y, partial)
+    figures = []
+    if errors:
+        curves = io.BytesIO()
+        draw_errors(errors).savefig(curves, format="png", metadata={})
+        figures = [(_QUALITY_CAPTION, curves.getvalue())]
+    shown = {
+        name: ShownMap(
+            pointwise_map,
+            {"Error": _per_vertex(errors[name], len(pointwise_map))} if name in errors else {},
+            _encoded(pointwise_map, *spectra) if spectra else None,
+            statistics=_main_figures(errors.get(name)),
+        )
+        for name, pointwise_map in maps.items()
+    }
+    write_page(
+        path,
+        mesh_x,
+        mesh_y,
+        shown,
+        title=_title(mesh_x, mesh_y),
+        spectra=spectra,
+        figures=figures,
+        up=up,
+    )
+
+
+def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
+    fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
+    number = min(eigenvectors_on_page(mesh_x, mesh_y), fewest // 2)
+    if not number:
+        return None
+    logging.getLogger("jaxsmw").info("eigenbases")
+    try:
+        return paired_spectra(mesh_x, mesh_y, number, partial=partial)
+    except InputError as error:
+        warnings.warn(f"the page does without wavelets: {error}", stacklevel=3)
+        return None
+
+
+def _encoded(
+    pointwise_map: Int[np.ndarray, " m"],
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    convention: Convention = "pullback",
+) -> Float[np.ndarray, "k_out k_in"]:
+    """The functional map of a pointwise map, in the precision of the spectra."""
+    with jax.enable_x64(spectrum_x.eigenvectors.dtype == np.float64):
+        encoded = compiled(encode)(
+            jax.device_put(pointwise_map), spectrum_x, spectrum_y, convention=convention
+        )
+        return np.asarray(encoded)
+
+
+def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
+    return f"{Path(mesh_x.name).name} to {Path(mesh_y.name).name}"
+
+
+def _main_figures(error: GeodesicError | None) -> dict[str, str]:
+    """What stands in a row of a table of maps."""
+    if error is None:
+        return {}
+    shares = {f"within {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
+    area = f"{error.area_under_curve():.3f}"
+    mean, median = f"{error.mean:.4f}", f"{error.median:.4f}"
+    return {"mean error (√area)": mean, "median (√area)": median, **shares, "area under curve": area}
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:

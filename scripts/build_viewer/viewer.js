@@ -1,4 +1,5 @@
-// The interactive page: two bodies to turn, and the map between their vertices under the pointer.
+// The interactive page: two bodies to turn, the map between their vertices under the pointer, wavelets around
+// it, and the functional map.
 // Bundled with three.js into jaxsmw/report/assets/viewer.js by build.mjs; the page around it is page.html.
 
 import {
@@ -32,6 +33,7 @@ const KEY_TURN = Math.PI / 18;
 const KEY_ZOOM = 1.15;
 const CLICK_TOLERANCE = 5; // pixels that the pointer may move between press and release
 const NAMED_VERTICES = 12; // of those mapped to one target vertex
+const WITHIN_SCALE = 0.98; // of the values of functions; the rest takes the last colours
 
 const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
@@ -40,12 +42,27 @@ const decode = (text, Type) => new Type(Uint8Array.from(atob(text), (c) => c.cha
 // Screen colours in bytes to the light intensities that three.js interpolates and shades.
 const LINEAR = Float32Array.from({ length: 256 }, (_, byte) => new Color().setRGB(byte / 255, 0, 0, SRGBColorSpace).r);
 
-const pointwiseMap = decode(data.map, Uint32Array);
-const errors = (data.errors ?? []).map(({ name, values, colors }) => ({
-  name: name.toLowerCase(),
-  values: decode(values, Float32Array),
-  colors: decode(colors, Uint8Array),
+const maps = data.maps.map(({ name, map, errors, functional }) => ({
+  name,
+  pointwise: decode(map, Uint32Array),
+  errors: Object.fromEntries(Object.entries(errors).map(([of, values]) => [of, decode(values, Float32Array)])),
+  functional: functional && { ...functional, values: decode(functional.values, Float32Array) },
 }));
+const scales = Object.fromEntries(
+  Object.entries(data.scales).map(([name, colors]) => [name, decode(colors, Uint8Array)]),
+);
+
+// Of each shape: k eigenvectors of n numbers one after the other, and responses of one filter after the other.
+// Null where the page has none.
+const bases = data.x.eigenvectors && { x: readBasis(data.x), y: readBasis(data.y) };
+function readBasis({ eigenvectors, responses }) {
+  const units = decode(eigenvectors.units, Float32Array);
+  const codes = decode(eigenvectors.codes, Int8Array);
+  const [k, n] = [units.length, codes.length / units.length];
+  const values = Float32Array.from(codes, (code, at) => units[Math.floor(at / n)] * code * Math.abs(code));
+  return { k, n, values, responses: decode(responses, Float32Array) };
+}
+const filters = bases ? bases.x.responses.length / bases.x.k : 0;
 
 // White with a black rim, to be seen on every colour; faint where the body is in front.
 const CORE = new SphereGeometry(1, 20, 14);
@@ -58,6 +75,8 @@ const MARK_LOOKS = [
 
 /** One body in its canvas: the surface, its light, camera and marks. */
 class Body {
+  #areas = null;
+
   constructor(canvas, { vertices, faces }) {
     this.canvas = canvas;
     this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: true });
@@ -104,9 +123,23 @@ class Body {
 
   /** Give every vertex its colour, three bytes each. */
   paint(colors) {
+    this.colors = colors;
     const attribute = this.surface.geometry.attributes.color;
     for (let i = 0; i < colors.length; i++) attribute.array[i] = LINEAR[colors[i]];
     attribute.needsUpdate = true;
+  }
+
+  /** Barycentric areas of the vertices. */
+  get areas() {
+    if (this.#areas) return this.#areas;
+    this.#areas = new Float32Array(this.positions.length / 3);
+    const corners = this.surface.geometry.index.array;
+    for (let f = 0; f < corners.length; f += 3) {
+      const [a, b, c] = [0, 1, 2].map((corner) => this.vertex(corners[f + corner]));
+      const third = b.sub(a).cross(c.sub(a)).length() / 6;
+      for (let corner = 0; corner < 3; corner++) this.#areas[corners[f + corner]] += third;
+    }
+    return this.#areas;
   }
 
   /** Mark vertices, in place of those marked before. */
@@ -209,66 +242,278 @@ function draw() {
   });
 }
 
+// ---- What is shown
+
+const sides = ["x", "y"];
+const state = {
+  map: 0,
+  coloring: "transfer",
+  filter: 0,
+  picked: null, // { side, vertex }, under the pointer or kept
+  pinned: false,
+  entry: null, // [row, column] of the functional map, kept
+  hoveredEntry: null,
+};
+let functions = { x: null, y: null }; // those in colours on the bodies, if any
+let preimages = readPreimages(maps[0]);
+
+/** The source vertices of each target vertex j: `sources` from starts[j] to starts[j + 1]. */
+function readPreimages({ pointwise }) {
+  const starts = new Uint32Array(bodies.y.positions.length / 3 + 1);
+  for (const j of pointwise) starts[j + 1]++;
+  for (let j = 1; j < starts.length; j++) starts[j] += starts[j - 1];
+  const sources = new Uint32Array(pointwise.length);
+  const next = starts.slice();
+  pointwise.forEach((j, i) => (sources[next[j]++] = i));
+  return { starts, sources };
+}
+
+/** The vertices of both shapes that belong to what is picked. */
+function matched() {
+  if (!state.picked) return { x: [], y: [] };
+  const { side, vertex } = state.picked;
+  if (side === "x") return { x: [vertex], y: [maps[state.map].pointwise[vertex]] };
+  const { starts, sources } = preimages;
+  return { x: Array.from(sources.subarray(starts[vertex], starts[vertex + 1])), y: [vertex] };
+}
+
+// ---- Functions on the bodies
+
+function eigenfunction(side, index) {
+  const { n, values } = bases[side];
+  return values.slice(index * n, (index + 1) * n);
+}
+
+/** sum_i g(lambda_i) phi_i(vertex) phi_i, of the chosen filter. */
+function wavelet(side, vertex) {
+  const { k, n, values, responses } = bases[side];
+  const result = new Float32Array(n);
+  for (let i = 0; i < k; i++) {
+    const coefficient = responses[state.filter * k + i] * values[i * n + vertex];
+    if (coefficient) for (let v = 0, at = i * n; v < n; v++, at++) result[v] += coefficient * values[at];
+  }
+  return result;
+}
+
+/** The cosine of the angle between a function on the source and one on the target, carried over by the map. */
+function alikeness(x, y) {
+  let both = 0, squareX = 0, squareY = 0;
+  bodies.x.areas.forEach((area, i) => {
+    const carried = y[maps[state.map].pointwise[i]];
+    both += area * x[i] * carried;
+    squareX += area * x[i] * x[i];
+    squareY += area * carried * carried;
+  });
+  return both / Math.sqrt(squareX * squareY || 1);
+}
+
+/** The entry of the functional map that is shown, as eigenfunctions of the source and of the target. */
+function shownEntry() {
+  const entry = state.hoveredEntry ?? state.entry;
+  const { functional } = maps[state.map];
+  if (!entry || !functional) return null;
+  const [row, column] = entry;
+  // Another map's may be larger.
+  if (column >= functional.columns || row * functional.columns >= functional.values.length) return null;
+  const [x, y] = functional.pushforward ? [column, row] : [row, column];
+  const known = bases && x < bases.x.k && y < bases.y.k;
+  return { row, column, x, y, known, value: functional.values[row * functional.columns + column] };
+}
+
 // ---- Colours
 
 const colorsY = decode(data.colors, Uint8Array);
-const colorsX = new Uint8Array(3 * pointwiseMap.length);
-pointwiseMap.forEach((j, i) => colorsX.set(colorsY.subarray(3 * j, 3 * j + 3), 3 * i));
-const plain = (body) => new Uint8Array(body.positions.length).map((_, i) => data.plain[i % 3]);
-const colorings = {
-  transfer: { x: colorsX, y: colorsY },
-  plain: { x: plain(bodies.x), y: plain(bodies.y) },
-};
-errors.forEach(({ colors }, i) => (colorings[`error-${i}`] = { x: colors, y: colorings.plain.y }));
 
-let coloring;
-function color(name) {
-  coloring = name;
-  for (const side of ["x", "y"]) bodies[side].paint(colorings[name][side]);
-  document.body.dataset.coloring = name;
+function colored(values, scale, index) {
+  const colors = new Uint8Array(3 * values.length);
+  values.forEach((value, i) => {
+    const at = 3 * index(value);
+    colors.set(Number.isNaN(value) ? data.plain : scale.subarray(at, at + 3), 3 * i);
+  });
+  return colors;
+}
+
+const onErrorScale = (value) => Math.round(255 * Math.min(value / data.limit, 1)) || 0;
+const onSignedScale = (limit) => (value) => 127 + Math.round(127 * Math.max(-1, Math.min(1, value / limit)));
+
+/** Colour both bodies by what is chosen. */
+function paint() {
+  const { pointwise, errors } = maps[state.map];
+  const entry = shownEntry();
+  let shown = state.coloring.split("-")[0];
+  functions = { x: null, y: null };
+  if (entry?.known) {
+    functions = { x: eigenfunction("x", entry.x), y: eigenfunction("y", entry.y) };
+    shown = "signed";
+  } else if (shown === "wavelets") {
+    const { x, y } = matched();
+    if (x.length) functions.x = wavelet("x", x[0]);
+    if (y.length) functions.y = wavelet("y", y[0]);
+    shown = state.picked ? "signed" : "plain";
+  }
+
+  const colors = { x: null, y: null };
+  if (shown === "transfer") {
+    colors.y = colorsY;
+    colors.x = new Uint8Array(3 * pointwise.length);
+    pointwise.forEach((j, i) => colors.x.set(colorsY.subarray(3 * j, 3 * j + 3), 3 * i));
+  } else if (shown === "error") {
+    const name = data.error_names[Number(state.coloring.split("-")[1])];
+    colors.x = colored(errors[name], scales.error, onErrorScale);
+  } else if (shown === "signed") {
+    const sizes = Float32Array.from([...(functions.x ?? []), ...(functions.y ?? [])], Math.abs).sort();
+    const limit = sizes[Math.round(WITHIN_SCALE * (sizes.length - 1))] || 1;
+    for (const side of sides) {
+      if (functions[side]) colors[side] = colored(functions[side], scales.signed, onSignedScale(limit));
+    }
+    const end = Number(limit.toPrecision(2));
+    byId("signed-low").textContent = `≤ −${end}`;
+    byId("signed-high").textContent = `≥ ${end}`;
+  }
+  for (const side of sides) {
+    const plain = () => new Uint8Array(bodies[side].positions.length).map((_, i) => data.plain[i % 3]);
+    bodies[side].paint(colors[side] ?? plain());
+  }
+  document.body.dataset.shown = shown;
+  document.body.dataset.coloring = state.coloring;
   draw();
 }
 
-// ---- Marks
-
-// The source vertices of each target vertex, one after the other; those of j begin at starts[j].
-const starts = new Uint32Array(colorsY.length / 3 + 1);
-for (const j of pointwiseMap) starts[j + 1]++;
-for (let j = 1; j < starts.length; j++) starts[j] += starts[j - 1];
-const sources = new Uint32Array(pointwiseMap.length);
-const next = starts.slice();
-pointwiseMap.forEach((j, i) => (sources[next[j]++] = i));
+// ---- Words and marks
 
 const invitation = byId("readout").textContent;
-let pinned = false;
 
-/** Mark a vertex of one side (or none: null) and what the map says of it. */
-function show(side, vertex) {
-  const marks = { x: [], y: [] };
+function say(id, text) {
+  if (byId(id).textContent !== text) byId(id).textContent = text;
+}
+
+function nameFilter() {
+  const wavelets = filters - 1;
+  const ends = { 1: " (coarsest)", [wavelets]: " (finest)" };
+  return state.filter ? `wavelet ${state.filter} of ${wavelets}${ends[state.filter] ?? ""}` : "scaling function";
+}
+
+function inWords(error) {
+  if (Number.isNaN(error)) return "not known";
+  return error === Infinity ? "without end (on another component)" : error.toFixed(4);
+}
+
+/** Mark what is picked, and say what the map says of it. */
+function tell() {
+  const { x, y } = matched();
   let text = invitation;
-  if (vertex !== null && side === "x") {
-    marks.x = [vertex];
-    marks.y = [pointwiseMap[vertex]];
-    text = `Source vertex ${vertex} → target vertex ${marks.y[0]}`;
-    for (const { name, values } of errors) {
-      text += ` · ${name} ${Number.isNaN(values[vertex]) ? "not known" : values[vertex].toFixed(4)}`;
+  if (state.picked?.side === "x") {
+    text = `Source vertex ${x[0]} → target vertex ${y[0]}`;
+    for (const [name, values] of Object.entries(maps[state.map].errors)) {
+      text += ` · ${name.toLowerCase()} ${inWords(values[x[0]])}`;
     }
-  } else if (vertex !== null) {
-    marks.x = Array.from(sources.subarray(starts[vertex], starts[vertex + 1]));
-    marks.y = [vertex];
-    const named = marks.x.slice(0, NAMED_VERTICES).join(", ") + (marks.x.length > NAMED_VERTICES ? ", …" : "");
-    const count = marks.x.length === 1 ? "source vertex" : `${marks.x.length} source vertices:`;
-    text = `Target vertex ${vertex} ← ${marks.x.length ? `${count} ${named}` : "no source vertex"}`;
+  } else if (state.picked) {
+    const named = x.slice(0, NAMED_VERTICES).join(", ") + (x.length > NAMED_VERTICES ? ", …" : "");
+    const count = x.length === 1 ? "source vertex" : `${x.length} source vertices:`;
+    text = `Target vertex ${y[0]} ← ${x.length ? `${count} ${named}` : "no source vertex"}`;
   }
-  for (const key of ["x", "y"]) bodies[key].mark(marks[key]);
-  if (byId("readout").textContent !== text) byId("readout").textContent = text;
+  const entry = shownEntry();
+  if (entry?.known && !state.picked) text = `Eigenfunction ${entry.x} of the source, ${entry.y} of the target`;
+  if (state.coloring === "wavelets" && !entry?.known) {
+    if (functions.x && functions.y) text += ` · wavelets alike: cosine ${alikeness(functions.x, functions.y).toFixed(3)}`;
+    else if (!state.picked) text = "Point at a body to see the wavelets around that point, and around its match.";
+  }
+  for (const side of sides) bodies[side].mark(matched()[side]);
+  say("readout", text);
   draw();
 }
 
-function pin(side, vertex) {
-  pinned = vertex !== null;
-  byId("vertex").value = pinned && side === "x" ? vertex : "";
-  show(side, vertex);
+/** Let the pointer, or for good a click, pick a vertex of one side; null for none. */
+function pick(side, vertex, pinned = false) {
+  state.picked = vertex === null ? null : { side, vertex };
+  state.pinned = pinned && vertex !== null;
+  if (pinned) byId("vertex").value = state.picked && side === "x" ? vertex : "";
+  if (state.coloring === "wavelets" && !shownEntry()?.known) paint();
+  tell();
+}
+const pin = (side, vertex) => pick(side, vertex, true);
+
+function chooseColoring(name) {
+  state.coloring = name;
+  chooseEntry(null);
+}
+
+function chooseMap(index) {
+  state.map = index;
+  preimages = readPreimages(maps[index]);
+  for (const input of document.querySelectorAll("input[name=coloring]")) {
+    const of = data.error_names[Number(input.value.split("-")[1])];
+    input.disabled = of !== undefined && !Object.hasOwn(maps[index].errors, of);
+    // What is not known of this map cannot stay chosen.
+    if (input.disabled && state.coloring === input.value) {
+      document.querySelector("input[value=transfer]").checked = true;
+      state.coloring = "transfer";
+    }
+  }
+  document.querySelectorAll("tbody tr").forEach((row, i) => row.setAttribute("aria-current", i === index));
+  drawMatrix();
+  paint();
+  tell();
+  tellEntry();
+}
+
+// ---- The functional map
+
+const matrix = byId("matrix");
+const darkness = matchMedia("(prefers-color-scheme: dark)");
+const largestEntry = maps.reduce(
+  (largest, { functional }) => (functional?.values ?? []).reduce((a, b) => Math.max(a, Math.abs(b)), largest),
+  0,
+);
+
+function drawMatrix() {
+  const { functional } = maps[state.map];
+  byId("functional").hidden = !functional;
+  if (!functional) return;
+  matrix.width = functional.columns;
+  matrix.height = functional.values.length / functional.columns;
+  const scale = darkness.matches ? scales.signed_dark : scales.signed;
+  const colors = colored(functional.values, scale, onSignedScale(largestEntry || 1));
+  const picture = new ImageData(matrix.width, matrix.height);
+  for (let i = 0; i < functional.values.length; i++) {
+    picture.data.set(colors.subarray(3 * i, 3 * i + 3), 4 * i);
+    picture.data[4 * i + 3] = 255;
+  }
+  matrix.getContext("2d").putImageData(picture, 0, 0);
+  const end = largestEntry.toPrecision(2);
+  byId("matrix-low").textContent = `−${end}`;
+  byId("matrix-high").textContent = end;
+  const names = functional.pushforward ? ["target", "source"] : ["source", "target"];
+  byId("matrix-axes").textContent = `rows: ${names[0]}, columns: ${names[1]}`;
+}
+
+function entryAt(event) {
+  const box = matrix.getBoundingClientRect();
+  const at = (place, size, count) => Math.max(0, Math.min(count - 1, Math.floor((place / size) * count)));
+  return [
+    at(event.clientY - box.top, box.height, matrix.height),
+    at(event.clientX - box.left, box.width, matrix.width),
+  ];
+}
+
+function tellEntry() {
+  const entry = shownEntry();
+  const ring = byId("ring");
+  ring.hidden = !entry;
+  if (entry) {
+    ring.style.left = `${(100 * (entry.column + 0.5)) / matrix.width}%`;
+    ring.style.top = `${(100 * (entry.row + 0.5)) / matrix.height}%`;
+    const value = entry.value.toFixed(3).replace("-", "−");
+    const where = entry.known ? "" : " (not among those this page holds)";
+    say("entry", `C(${entry.row}, ${entry.column}) = ${value}: eigenfunction ${entry.x} of the source, ${entry.y} of the target${where}`);
+  } else say("entry", "Point at an entry to see its two eigenfunctions.");
+}
+
+function chooseEntry(entry, hovered = null) {
+  Object.assign(state, { entry, hoveredEntry: hovered });
+  paint();
+  tell();
+  tellEntry();
 }
 
 // ---- Cameras
@@ -324,7 +569,10 @@ function onKey(body, event) {
     controls.update();
     untouched = false;
   } else if (event.key === "0" || event.key === "Home") resetView();
-  else if (event.key === "Escape") pin("x", null);
+  else if (event.key === "Escape") {
+    pin("x", null);
+    chooseEntry(null);
+  }
   else return;
   event.preventDefault();
 }
@@ -346,10 +594,10 @@ for (const [side, body] of Object.entries(bodies)) {
 
   let hovered = null; // the newest pointer position not yet looked at
   canvas.addEventListener("pointermove", (event) => {
-    if (pinned || event.buttons || event.pointerType === "touch") return;
+    if (state.pinned || event.buttons || event.pointerType === "touch") return;
     if (!hovered) {
       requestAnimationFrame(() => {
-        if (hovered && !pinned) show(side, body.vertexAt(hovered));
+        if (hovered && !state.pinned) pick(side, body.vertexAt(hovered));
         hovered = null;
       });
     }
@@ -357,13 +605,51 @@ for (const [side, body] of Object.entries(bodies)) {
   });
   canvas.addEventListener("pointerleave", () => {
     hovered = null;
-    if (!pinned) show(side, null);
+    if (!state.pinned) pick(side, null);
   });
 }
 
+// A click, also where the choice stays the same: it leaves eigenfunctions for what was shown before.
 for (const input of document.querySelectorAll("input[name=coloring]")) {
-  input.addEventListener("change", () => color(input.value));
+  input.addEventListener("click", () => chooseColoring(input.value));
 }
+for (const input of document.querySelectorAll("input[name=map]")) {
+  input.addEventListener("click", () => chooseMap(Number(input.value)));
+}
+byId("filter").addEventListener("input", chooseFilter);
+function chooseFilter() {
+  state.filter = byId("filter").valueAsNumber;
+  say("filter-name", nameFilter());
+  byId("filter").setAttribute("aria-valuetext", nameFilter());
+  paint();
+  tell();
+}
+
+matrix.addEventListener("pointermove", (event) => {
+  const entry = entryAt(event);
+  if (event.pointerType !== "touch" && String(entry) !== String(state.hoveredEntry)) chooseEntry(state.entry, entry);
+});
+matrix.addEventListener("pointerleave", () => state.hoveredEntry && chooseEntry(state.entry));
+matrix.addEventListener("click", (event) => {
+  const entry = entryAt(event);
+  chooseEntry(String(entry) === String(state.entry) ? null : entry);
+});
+matrix.addEventListener("keydown", (event) => {
+  if (event.altKey || event.ctrlKey || event.metaKey) return;
+  const move = turns[event.key];
+  if (move) {
+    const step = event.shiftKey ? 10 : 1;
+    const [row, column] = state.entry ?? [0, 0];
+    const within = (index, size) => Math.max(0, Math.min(size - 1, index));
+    // The first key shows where one is.
+    const [across, down] = state.entry ? move : [0, 0];
+    chooseEntry([within(row + step * down, matrix.height), within(column + step * across, matrix.width)]);
+  } else if (event.key === "Escape") chooseEntry(null);
+  else return;
+  event.preventDefault();
+});
+darkness.addEventListener("change", drawMatrix);
+
 byId("reset").addEventListener("click", resetView);
 byId("linked").addEventListener("change", () => follow(bodies.x));
 byId("vertex").addEventListener("change", ({ target }) => {
@@ -382,14 +668,24 @@ const observer = new ResizeObserver(() => {
 });
 for (const body of everyBody) observer.observe(body.canvas);
 
-// Some browsers remember the choice over a reload.
-color(document.querySelector("input[name=coloring]:checked").value);
+// Some browsers remember choices over a reload.
+const chosen = (name) => document.querySelector(`input[name=${name}]:checked`)?.value;
+state.coloring = chosen("coloring");
+byId("filter").disabled = filters < 2;
+chooseFilter();
+chooseMap(Number(chosen("map") ?? 0));
 
-// For scripts and tests: mark a source vertex, see what is marked and where a vertex is in the window.
+// For scripts and tests: mark a source vertex, see what is marked, what is shown, and where a vertex is in the
+// window.
 window.jaxsmw = {
   pick: (vertex) => pin("x", vertex),
   project: (side, vertex) => bodies[side].project(vertex),
+  colors: (side) => Array.from(bodies[side].colors),
+  get functions() {
+    return { x: functions.x && Array.from(functions.x), y: functions.y && Array.from(functions.y) };
+  },
   get state() {
-    return { source: bodies.x.marked, target: bodies.y.marked, pinned, coloring };
+    const { map, coloring, filter, pinned, entry } = state;
+    return { source: bodies.x.marked, target: bodies.y.marked, map: maps[map].name, coloring, filter, pinned, entry };
   },
 };

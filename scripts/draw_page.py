@@ -1,0 +1,61 @@
+"""A picture of an interactive page: wavelets around one point, in headless Chromium.
+
+Run as `python scripts/draw_page.py PAGE.html PICTURE.png`. Needs the extra `test`, Chromium and its driver.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shutil
+import tempfile
+from pathlib import Path
+
+from jaxsmw.files import atomic_write
+
+WIDTH, HEIGHT = 1280, 770
+
+
+def main() -> None:
+    """Draw the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("page", metavar="PAGE.html", type=Path)
+    parser.add_argument("picture", metavar="PICTURE.png", type=Path)
+    parser.add_argument("--vertex", type=int, default=4127, help="of the source (default: %(default)s)")
+    parser.add_argument("--scale", type=int, default=4, help="0 is the coarsest (default: %(default)s)")
+    options = parser.parse_args()
+    from PIL import Image
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    with tempfile.TemporaryDirectory() as directory:
+        settings = webdriver.ChromeOptions()
+        settings.binary_location = shutil.which("chromium") or ""
+        for argument in (
+            "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+            "--hide-scrollbars", f"--user-data-dir={directory}",
+        ):  # fmt: skip
+            settings.add_argument(argument)
+        browser = webdriver.Chrome(options=settings, service=Service(shutil.which("chromedriver")))
+        try:
+            size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            browser.get(options.page.resolve().as_uri())
+            browser.execute_async_script(
+                "const [vertex, scale, done] = arguments, slider = document.querySelector('#filter');"
+                "document.querySelector('input[value=wavelets]').click();"
+                "slider.value = scale; slider.dispatchEvent(new Event('input')); jaxsmw.pick(vertex);"
+                "requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 100)))",
+                options.vertex,
+                options.scale,
+            )
+            picture = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+        finally:
+            browser.quit()
+    with atomic_write(options.picture) as temporary:
+        # 256 colours, dithered, are enough, and half the size.
+        picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
