@@ -330,5 +330,5 @@ _TOO_MUCH = 0.5
 # other it does if it stays so, but for a tenth.
 _SUSPICIOUS, _SMALL, _HARDLY = 2.5, 3.5, 0.9
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
-# the mirror image the larger flaw. From half to twice of this, nearly the same outcomes are chosen.
-_UNCERTAINTY = 12.0
+# the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
+_UNCERTAINTY = 10.0
