@@ -124,7 +124,8 @@ def _parser() -> argparse.ArgumentParser:
         "--output",
         metavar="FILE",
         required=True,
-        help="gets one target vertex per source vertex, one per line, counted from 0",
+        help="gets one target vertex per source vertex, one per line, counted from 0; or, with the suffix "
+        ".mat, as the column T12 for MATLAB, counted from 1",
     )
     match.add_argument(
         "--surface-points",
@@ -171,7 +172,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="measure a map against the truth")
     evaluate.add_argument("source", metavar="SOURCE", help="the source mesh")
     evaluate.add_argument("target", metavar="TARGET", help="the target mesh")
-    evaluate.add_argument("map", metavar="MAP", nargs="+", help="maps, one target vertex per line")
+    evaluate.add_argument(
+        "map", metavar="MAP", nargs="+", help="maps, one target vertex per line, or .mat files (from 1)"
+    )
     evaluate.add_argument(
         "--ground-truth",
         metavar="FILE",
@@ -234,7 +237,10 @@ def _parser() -> argparse.ArgumentParser:
         "--eigenvectors", type=_integer(1), default=100, help="how many (default: %(default)s)"
     )
     spectrum.add_argument(
-        "--output", metavar="FILE.npz", help="write eigenvalues, eigenvectors and vertex_areas (area 1)"
+        "--output",
+        metavar="FILE",
+        help="write eigenvalues, eigenvectors and vertex_areas (area 1) as .npz; or as .mat a struct S with "
+        "evals, evecs, A and surface",
     )
     _add_bank(spectrum)
     spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
@@ -245,7 +251,9 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="draw a mesh, or a correspondence by its colours")
     render.add_argument("source", metavar="SOURCE", help="the mesh, or the source mesh")
     render.add_argument("target", metavar="TARGET", nargs="?", help="the target mesh")
-    render.add_argument("map", metavar="MAP", nargs="?", help="the map, one target vertex per line")
+    render.add_argument(
+        "map", metavar="MAP", nargs="?", help="the map, one target vertex per line, or a .mat file (from 1)"
+    )
     render.add_argument(
         "--output",
         metavar="FILE",
@@ -393,7 +401,7 @@ def _add_reading(parser: argparse.ArgumentParser, *, indices: bool = True) -> No
             type=int,
             choices=(0, 1),
             help="number of the first vertex in map, landmark and ground-truth files (default: 0, and 1 in "
-            ".vts, .baryc_gt and two-column ground-truth files)",
+            ".mat, .vts, .baryc_gt and two-column ground-truth files)",
         )
 
 
@@ -648,7 +656,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
     maps = {
-        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=_index_base(path, options))
         for path in options.map
     }
     errors = _errors(options, mesh_y, maps, truth)
@@ -726,31 +734,34 @@ def _errors(
 
 def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options)
-    if options.output and Path(options.output).suffix != ".npz":
-        raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
+    if options.output:
+        from jaxsmw.exchange import check_spectrum_path
+
+        check_spectrum_path(options.output)
     if not options.figure and (options.filters is not None or options.bank is not None):
         raise InputError("--bank and --filters are for --figure: name a figure, or leave them out.")
     bank = _bank(options)
-    import numpy as np
-
-    from jaxsmw.geometry.eigenbasis import eigenpairs
+    from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
     from jaxsmw.geometry.mesh import diagnose
     from jaxsmw.geometry.mesh_files import read_mesh
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
-    eigenvalues, eigenvectors, vertex_areas = eigenpairs(
-        mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver
-    )
+    pairs = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver)
+    eigenvalues = pairs[0]
     print("\n".join((*mesh.notes, *diagnose(mesh).sentences())))
     print(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
     for start in range(0, len(eigenvalues), 10):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[start : start + 10])
         print(f"{start:5}  {row}")
     if options.output:
-        with atomic_write(options.output) as temporary:
-            np.savez(temporary, eigenvalues=eigenvalues, eigenvectors=eigenvectors, vertex_areas=vertex_areas)
+        import jax
+
+        from jaxsmw.exchange import write_spectrum
+
+        with jax.enable_x64(True):
+            write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
     if options.figure:
         from jaxsmw.report.figures import save_figure
         from jaxsmw.report.summary import draw_bank
@@ -777,7 +788,8 @@ def _render(options: argparse.Namespace) -> None:
         save_figure(options.output, draw_mesh(mesh_x, up=options.up))
         return
     mesh_y = _read(options.target, options)
-    pointwise_map = read_pointwise_map(options.map, mesh_x, mesh_y, index_base=options.index_base or 0)
+    base = _index_base(options.map, options)
+    pointwise_map = read_pointwise_map(options.map, mesh_x, mesh_y, index_base=base)
     if page:
         title = f"{Path(options.source).name} to {Path(options.target).name}"
         write_page(options.output, mesh_x, mesh_y, pointwise_map, title=title, up=options.up)
@@ -796,6 +808,15 @@ def _read(path: str, options: argparse.Namespace) -> Mesh:
     return mesh
 
 
+def _index_base(path: str, options: argparse.Namespace) -> Any:
+    """What a file counts from, where its form leaves it open; where nobody said it, the user is told."""
+    from jaxsmw.geometry.mat_files import is_mat_file
+
+    if options.index_base is None and is_mat_file(path):
+        _say(f"note: {path} is read as MATLAB counts, from 1; if it counts from 0, add --index-base 0.")
+    return options.index_base
+
+
 def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
     from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
 
@@ -804,7 +825,7 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
         return kind
     if path and kind in ("landmarks", "map"):
         read = read_landmarks if kind == "landmarks" else read_pointwise_map
-        return read(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+        return read(path, mesh_x, mesh_y, index_base=_index_base(path, options))
     raise InputError(
         f"--init {options.init}: is no initial map: choose shot, wks, hks, wavelet, functional, "
         "landmarks:FILE or map:FILE."
