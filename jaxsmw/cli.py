@@ -495,12 +495,7 @@ def _match(options: argparse.Namespace) -> None:
     files = options.output, options.surface_points, options.one_to_one, options.expected_error
     for path in filter(None, files):
         check_writable(path)
-    from jaxsmw.evaluation.ground_truth import (
-        GroundTruth,
-        read_ground_truth,
-        write_ground_truth,
-        write_pointwise_map,
-    )
+    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     if options.one_to_one:
@@ -509,7 +504,7 @@ def _match(options: argparse.Namespace) -> None:
         check_one_to_one(int(mesh_x.used_vertices.sum()), int(mesh_y.used_vertices.sum()))
     truth = None
     if options.ground_truth:
-        truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+        truth = _read_truth(options, mesh_x, mesh_y)
     directory = make_directory(options.report) if options.report else None
     textured = make_directory(options.texture) if options.texture else None
     correspondence = _run_match(options, mesh_x, mesh_y)
@@ -651,10 +646,10 @@ def _evaluate(options: argparse.Namespace) -> None:
     for output in filter(None, (options.output, options.figure)):
         _keep_inputs(output, options.source, options.target, *options.map, *options.ground_truth)
     _check_outputs(options)
-    from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
+    from jaxsmw.evaluation.ground_truth import read_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
-    truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+    truth = _read_truth(options, mesh_x, mesh_y)
     maps = {
         path: read_pointwise_map(path, mesh_x, mesh_y, index_base=_index_base(path, options))
         for path in options.map
@@ -806,6 +801,14 @@ def _read(path: str, options: argparse.Namespace) -> Mesh:
         for sentence in (*mesh.notes, *diagnose(mesh).sentences()):
             _say(f"{path}: {sentence}")
     return mesh
+
+
+def _read_truth(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> GroundTruth:
+    from jaxsmw.evaluation.ground_truth import read_ground_truth
+
+    for path in options.ground_truth:
+        _index_base(path, options)
+    return read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
 
 
 def _index_base(path: str, options: argparse.Namespace) -> Any:

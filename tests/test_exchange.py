@@ -204,6 +204,7 @@ def test_spectrum_of_what_looks_like_geomfum(spectra):
     same_spectrum(make_spectrum(shape), spectra[0], tolerance=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:Sparse CSC tensor support")
 @pytest.mark.parametrize("layout", ["sparse_csc", "sparse_coo", "strided", "gradient"])
 def test_tensors_of_pytorch(bodies, spectra, layout):
     torch = pytest.importorskip("torch", reason="pip install geomfum")
@@ -214,7 +215,11 @@ def test_tensors_of_pytorch(bodies, spectra, layout):
     if layout == "gradient":
         vectors, mass = vectors.requires_grad_(), areas.requires_grad_()
     else:
-        mass = torch.diag(areas).to_sparse(layout=getattr(torch, layout)) if layout != "strided" else torch.diag(areas)
+        mass = (
+            torch.diag(areas).to_sparse(layout=getattr(torch, layout))
+            if layout != "strided"
+            else torch.diag(areas)
+        )
     same_spectrum(make_spectrum(values, vectors, mass), spectra[0], tolerance=1e-12)
     x = bodies[0]
     tensors = torch.tensor(x.vertices, requires_grad=True), torch.tensor(x.faces)
@@ -366,7 +371,9 @@ def mat_file(path: Path, **variables: object) -> Path:
 def test_shapes_of_other_matlab_code(spectra, tmp_path, form, nested):
     spectrum = spectra[0].scale(30.0)
     areas = np.asarray(spectrum.vertex_areas)
-    field = {"sparse": {"A": sp.diags_array(areas)}, "diagonal": {"A": areas}, "row": {"area": areas[None]}}[form]
+    field = {"sparse": {"A": sp.diags_array(areas)}, "diagonal": {"A": areas}, "row": {"area": areas[None]}}[
+        form
+    ]
     fields = {
         "evals": np.asarray(spectrum.eigenvalues)[None],
         "evecs": np.asarray(spectrum.eigenvectors),
@@ -460,7 +467,12 @@ READERS = {
     "pointwise map": lambda path, bodies, _: jaxsmw.read_pointwise_map(path, *bodies),
 }
 M, N = 642, 162
-SURFACE = {"X": np.eye(4)[0], "Y": np.eye(4)[1], "Z": np.eye(4)[2], "TRIV": np.array([[1, 2, 3], [1, 2, 4.0]])}
+SURFACE = {
+    "X": np.eye(4)[0],
+    "Y": np.eye(4)[1],
+    "Z": np.eye(4)[2],
+    "TRIV": np.array([[1, 2, 3], [1, 2, 4.0]]),
+}
 BASIS = {"evals": np.arange(3.0), "evecs": np.eye(8, 3)}
 BAD_VARIABLES = {
     "map counted from 0": ("pointwise map", {"T12": np.arange(M) % N}, r"row 1: 0 is not .* numbered 1 to 162.*--index-base 0"),
@@ -506,7 +518,7 @@ def test_missing_files_are_told(bodies, spectra, tmp_path, reader):
 
 
 def test_what_cannot_be_written_is_told(bodies, spectra, tmp_path):
-    x, y = spectra
+    x, _ = spectra
     (tmp_path / "damaged.npz").write_bytes(b"no archive")
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
