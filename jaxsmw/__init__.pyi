@@ -59,6 +59,13 @@ from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
+from .exchange import (
+    make_spectrum,
+    read_functional_map,
+    read_spectrum,
+    write_functional_map,
+    write_spectrum,
+)
 from .geometry.assignment import one_to_one_map
 from .geometry.creature import CreaturePair, creature_pair
 from .geometry.eigenbasis import compute_spectrum
@@ -148,6 +155,7 @@ __all__ = [
     "heat_kernel_signature",
     "initial_map",
     "make_mesh",
+    "make_spectrum",
     "match",
     "multiscale_kernel",
     "nearest_neighbor",
@@ -156,9 +164,11 @@ __all__ = [
     "open_data_set",
     "paired_spectra",
     "pull_back",
+    "read_functional_map",
     "read_ground_truth",
     "read_mesh",
     "read_pointwise_map",
+    "read_spectrum",
     "refine",
     "refine_pairs",
     "refine_softly",
@@ -170,6 +180,8 @@ __all__ = [
     "wave_kernel_signature",
     "wavelet_energy",
     "wavelet_signature",
+    "write_functional_map",
     "write_mesh",
     "write_pointwise_map",
+    "write_spectrum",
 ]

@@ -124,7 +124,8 @@ def _parser() -> argparse.ArgumentParser:
         "--output",
         metavar="FILE",
         required=True,
-        help="gets one target vertex per source vertex, one per line, counted from 0",
+        help="gets one target vertex per source vertex, one per line, counted from 0; or, with the suffix "
+        ".mat, as the column T12 for MATLAB, counted from 1",
     )
     match.add_argument(
         "--surface-points",
@@ -167,7 +168,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="measure a map against the truth")
     evaluate.add_argument("source", metavar="SOURCE", help="the source mesh")
     evaluate.add_argument("target", metavar="TARGET", help="the target mesh")
-    evaluate.add_argument("map", metavar="MAP", nargs="+", help="maps, one target vertex per line")
+    evaluate.add_argument(
+        "map", metavar="MAP", nargs="+", help="maps, one target vertex per line, or .mat files (from 1)"
+    )
     evaluate.add_argument(
         "--ground-truth",
         metavar="FILE",
@@ -237,7 +240,10 @@ def _parser() -> argparse.ArgumentParser:
         "--eigenvectors", type=_integer(1), default=100, help="how many (default: %(default)s)"
     )
     spectrum.add_argument(
-        "--output", metavar="FILE.npz", help="write eigenvalues, eigenvectors and vertex_areas (area 1)"
+        "--output",
+        metavar="FILE",
+        help="write eigenvalues, eigenvectors and vertex_areas (area 1) as .npz; or as .mat a struct S with "
+        "evals, evecs, A and surface",
     )
     _add_bank(spectrum)
     spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
@@ -249,7 +255,10 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("source", metavar="SOURCE", help="the mesh, or the source mesh")
     render.add_argument("target", metavar="TARGET", nargs="?", help="the target mesh")
     render.add_argument(
-        "map", metavar="MAP", nargs="*", help="the map, one target vertex per line; for a page also several"
+        "map",
+        metavar="MAP",
+        nargs="*",
+        help="the map, one target vertex per line, or a .mat file (from 1); for a page also several",
     )
     render.add_argument(
         "--output",
@@ -399,7 +408,7 @@ def _add_reading(parser: argparse.ArgumentParser, *, indices: bool = True) -> No
             type=int,
             choices=(0, 1),
             help="number of the first vertex in map, landmark and ground-truth files (default: 0, and 1 in "
-            ".vts, .baryc_gt and two-column ground-truth files)",
+            ".mat, .vts, .baryc_gt and two-column ground-truth files)",
         )
 
 
@@ -501,12 +510,7 @@ def _match(options: argparse.Namespace) -> None:
     files = options.output, options.surface_points, options.one_to_one, options.expected_error
     for path in filter(None, files):
         check_writable(path)
-    from jaxsmw.evaluation.ground_truth import (
-        GroundTruth,
-        read_ground_truth,
-        write_ground_truth,
-        write_pointwise_map,
-    )
+    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     if options.one_to_one:
@@ -515,7 +519,7 @@ def _match(options: argparse.Namespace) -> None:
         check_one_to_one(int(mesh_x.used_vertices.sum()), int(mesh_y.used_vertices.sum()))
     truth = None
     if options.ground_truth:
-        truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+        truth = _read_truth(options, mesh_x, mesh_y)
     directory = make_directory(options.report) if options.report else None
     textured = make_directory(options.texture) if options.texture else None
     correspondence = _run_match(options, mesh_x, mesh_y)
@@ -666,14 +670,10 @@ def _evaluate(options: argparse.Namespace) -> None:
         check_writable(options.page)
     elif options.partial or options.up:
         raise InputError("--partial and --up are for --page: name a page, or leave them out.")
-    from jaxsmw.evaluation.ground_truth import read_ground_truth, read_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
-    truth = read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
-    maps = {
-        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=options.index_base or 0)
-        for path in options.map
-    }
+    truth = _read_truth(options, mesh_x, mesh_y)
+    maps = _read_maps(options, mesh_x, mesh_y)
     errors = _errors(options, mesh_y, maps, truth)
     if options.page:
         _write_comparison(options.page, options, mesh_x, mesh_y, maps, errors)
@@ -781,31 +781,34 @@ def _errors(
 
 def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options)
-    if options.output and Path(options.output).suffix != ".npz":
-        raise InputError(f"{options.output}: spectra are written as .npz; choose a name that ends in it.")
+    if options.output:
+        from jaxsmw.exchange import check_spectrum_path
+
+        check_spectrum_path(options.output)
     if not options.figure and (options.filters is not None or options.bank is not None):
         raise InputError("--bank and --filters are for --figure: name a figure, or leave them out.")
     bank = _bank(options)
-    import numpy as np
-
-    from jaxsmw.geometry.eigenbasis import eigenpairs
+    from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
     from jaxsmw.geometry.mesh import diagnose
     from jaxsmw.geometry.mesh_files import read_mesh
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
-    eigenvalues, eigenvectors, vertex_areas = eigenpairs(
-        mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver
-    )
+    pairs = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver)
+    eigenvalues = pairs[0]
     print("\n".join((*mesh.notes, *diagnose(mesh).sentences())))
     print(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
     for start in range(0, len(eigenvalues), 10):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[start : start + 10])
         print(f"{start:5}  {row}")
     if options.output:
-        with atomic_write(options.output) as temporary:
-            np.savez(temporary, eigenvalues=eigenvalues, eigenvectors=eigenvectors, vertex_areas=vertex_areas)
+        import jax
+
+        from jaxsmw.exchange import write_spectrum
+
+        with jax.enable_x64(True):
+            write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
     if options.figure:
         from jaxsmw.report.figures import save_figure
         from jaxsmw.report.summary import draw_bank
@@ -828,7 +831,6 @@ def _render(options: argparse.Namespace) -> None:
     if not page and options.partial:
         raise InputError(f"--partial: is for pages; leave it out, or write {options.output} as .html.")
     _keep_inputs(options.output, *filter(None, (options.source, options.target, *options.map)))
-    from jaxsmw.evaluation.ground_truth import read_pointwise_map
     from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
 
     check = check_writable if page else check_figure_path
@@ -838,10 +840,7 @@ def _render(options: argparse.Namespace) -> None:
         save_figure(options.output, draw_mesh(mesh_x, up=options.up))
         return
     mesh_y = _read(options.target, options)
-    maps = {
-        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=options.index_base or 0)
-        for path in options.map
-    }
+    maps = _read_maps(options, mesh_x, mesh_y)
     if page:
         _write_comparison(options.output, options, mesh_x, mesh_y, maps, {})
     else:
@@ -860,6 +859,32 @@ def _read(path: str, options: argparse.Namespace) -> Mesh:
     return mesh
 
 
+def _read_truth(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> GroundTruth:
+    from jaxsmw.evaluation.ground_truth import read_ground_truth
+
+    for path in options.ground_truth:
+        _index_base(path, options)
+    return read_ground_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+
+
+def _read_maps(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> dict[str, Any]:
+    from jaxsmw.evaluation.ground_truth import read_pointwise_map
+
+    return {
+        path: read_pointwise_map(path, mesh_x, mesh_y, index_base=_index_base(path, options))
+        for path in options.map
+    }
+
+
+def _index_base(path: str, options: argparse.Namespace) -> Any:
+    """What a file counts from, where its form leaves it open; where nobody said it, the user is told."""
+    from jaxsmw.geometry.mat_files import is_mat_file
+
+    if options.index_base is None and is_mat_file(path):
+        _say(f"note: {path} is read as MATLAB counts, from 1; if it counts from 0, add --index-base 0.")
+    return options.index_base
+
+
 def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
     from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
 
@@ -868,7 +893,7 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
         return kind
     if path and kind in ("landmarks", "map"):
         read = read_landmarks if kind == "landmarks" else read_pointwise_map
-        return read(path, mesh_x, mesh_y, index_base=options.index_base or 0)
+        return read(path, mesh_x, mesh_y, index_base=_index_base(path, options))
     raise InputError(
         f"--init {options.init}: is no initial map: choose shot, wks, hks, wavelet, functional, "
         "landmarks:FILE or map:FILE."

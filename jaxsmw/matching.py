@@ -40,7 +40,7 @@ from jaxsmw.geometry.extremities import extremities, likely_pairings
 from jaxsmw.geometry.faults import expected_error, flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.laplacian import Laplacian
-from jaxsmw.geometry.mesh import Mesh, units_of_length
+from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh, units_of_length
 from jaxsmw.geometry.sampling import Samples, farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.presets import (
@@ -224,8 +224,8 @@ def _embeddings(
 
 
 def match(
-    mesh_x: Mesh,
-    mesh_y: Mesh,
+    mesh_x: Mesh | MeshLike,
+    mesh_y: Mesh | MeshLike,
     *,
     preset: Preset | Stage | Sequence[Stage] = "accurate",
     init: Start | ArrayLike = "shot",
@@ -241,7 +241,8 @@ def match(
 
     **Arguments:**
 
-    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
+    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices); or meshes of trimesh, pyFM, geomfum
+      or PyVista, or tuples of vertices and faces, as `make_mesh` takes them.
     - `preset`: how the map is refined: `"accurate"`; `"paper"`, as the MWP paper has it; `"fast"`, the same
       on samples; or stages of your own, for example
       `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See `jaxsmw.PRESETS`, of which
@@ -263,6 +264,10 @@ def match(
     **Raises:** `InputError` for anything about the arguments that cannot work; `ArithmeticError` if numbers
     went wrong on the way.
     """
+    mesh_x, mesh_y = (
+        mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
+        for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
+    )
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
     fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
     stages = chosen_stages(preset, fewest, partial=partial)

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.io
 import trimesh
 from synthetic import bumpy_mesh, grid_mesh
 
@@ -333,6 +334,37 @@ def test_spectrum(run, pair, tmp_path):
     assert (tmp_path / "s.png").stat().st_size > 1000
 
 
+def test_spectrum_for_matlab(run, pair, tmp_path):
+    outcome = run("spectrum", pair / "y.ply", "--eigenvectors", 12, "--output", tmp_path / "s.mat")
+    assert outcome.code == 0, outcome.errors
+    shape = scipy.io.loadmat(tmp_path / "s.mat")["S"][0, 0]
+    np.testing.assert_allclose(shape["evecs"].T @ shape["A"] @ shape["evecs"], np.eye(12), atol=1e-8)
+    assert len(read_mesh(tmp_path / "s.mat").faces) == len(read_mesh(pair / "y.ply").faces)
+
+
+def test_maps_for_and_from_matlab(run, pair, tmp_path):
+    meshes = pair / "x.off", pair / "y.ply"
+    truth = np.loadtxt(pair / "truth.txt", dtype=int)
+    scipy.io.savemat(tmp_path / "truth.mat", {"T12": truth + 1})
+    scipy.io.savemat(tmp_path / "from_0.mat", {"T12": truth})
+    written = tmp_path / "map.mat"
+    init = f"map:{tmp_path / 'truth.mat'}"
+    for name in ("map.txt", "map.mat"):
+        outcome = run("match", *meshes, *SMALL, "--init", init, "--output", tmp_path / name, "--quiet")
+        assert outcome.code == 0 and "counts, from 1" in outcome.errors
+    found = scipy.io.loadmat(written)["T12"]
+    np.testing.assert_array_equal(found[:, 0] - 1, np.loadtxt(tmp_path / "map.txt"))
+    # The truth, too, is read as MATLAB counts, and a note says how maps are.
+    call = ("evaluate", *meshes, tmp_path / "truth.mat", "--ground-truth", tmp_path / "truth.mat", "--quiet")
+    outcome = run(*call)
+    assert outcome.code == 0 and mean_error(outcome.output) == 0
+    assert outcome.errors.count(f"note: {tmp_path / 'truth.mat'} is read as MATLAB counts, from 1") == 2
+    from_0 = ("evaluate", *meshes, tmp_path / "from_0.mat", "--ground-truth", pair / "truth.txt", "--quiet")
+    assert run(*from_0).code == 2
+    outcome = run(*from_0, "--index-base", "0")
+    assert outcome.code == 0 and mean_error(outcome.output) == 0 and not outcome.errors
+
+
 def test_render(run, pair, tmp_path):
     for name, inputs in {
         "one.png": ["x.off"],
@@ -609,7 +641,7 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("spectrum {x} --eigenvectors 642", "641"),
         ("spectrum {x} --bank regular --filters 6 --figure {t}/f.png", "is fixed"),
         ("spectrum {x} --filters 6", "--figure"),
-        ("spectrum {x} --output {t}/s.txt", ".npz"),
+        ("spectrum {x} --output {t}/s.txt", ".npz or .mat"),
         ("spectrum {x} --figure {t}/s.nonsense", "s.nonsense"),
         ("render {x} {y} --output {t}/a.png", "give the map"),
         ("render {x} --output {t}/a.html", "page"),

@@ -217,8 +217,12 @@ def test_tosca_in_matlab_files(tmp_path):
     scipy.io.savemat(tmp_path / "other.mat", {"shape": 1})
     (tmp_path / "damaged.mat").write_bytes((tmp_path / "cat0.mat").read_bytes()[:200])
     (tmp_path / "text.mat").write_text("no MATLAB at all")
-    for name in ("other", "damaged", "text"):
-        with pytest.raises(InputError, match=f"{name}.mat: holds no struct 'surface'"):
+    for name, fault in (
+        ("other", "holds no struct 'surface'"),
+        ("damaged", "is damaged"),
+        ("text", "is damaged or no file"),
+    ):
+        with pytest.raises(InputError, match=f"{name}.mat: {fault}"):
             read_mesh(tmp_path / f"{name}.mat")
 
 

@@ -5,9 +5,10 @@ import re
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
-from jaxsmw import RESULTS, creature_pair, write_mesh
+from jaxsmw import RESULTS, GroundTruth, creature_pair, geodesic_error, write_mesh
 
 ROOT = Path(__file__).parents[1]
 
@@ -17,7 +18,8 @@ def code_blocks(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("page", "least"), [("README.md", 2), ("docs/frames.md", 2), ("docs/gradients.md", 1)]
+    ("page", "least"),
+    [("README.md", 2), ("docs/frames.md", 2), ("docs/gradients.md", 1), ("docs/exchange.md", 1)],
 )
 def test_code_blocks_run(page, least, tmp_path, monkeypatch):
     pair = creature_pair(vertices=700)
@@ -42,5 +44,10 @@ def test_code_blocks_run(page, least, tmp_path, monkeypatch):
         assert 0 < float(namespace["value"]) < 0.01
         for leaf in jax.tree.leaves(namespace["gradient"]):
             assert 0 < float(abs(leaf).max()) < float("inf")
+    if page == "docs/exchange.md":
+        np.testing.assert_array_equal(namespace["T"], namespace["result"].pointwise_map)
+        np.testing.assert_allclose(namespace["C"], namespace["functional_map"], atol=1e-6)
+        error = geodesic_error(pair.target, namespace["p2p_21"], GroundTruth.of_all_vertices(pair.truth))
+        assert error.mean < 0.1
     if page == "docs/frames.md":
         assert namespace["result"] == RESULTS.successful

@@ -1,7 +1,7 @@
 """Ground truth in every form in which it circulates, pointwise maps and landmarks in files.
 
-All are text, one row per line. What their indices count from a file does not say, so each form has the base
-with which it circulates.
+Text, one row per line, or a matrix in MATLAB's `.mat` format, one row each. What their indices count from a
+file does not say, so each form has the base with which it circulates; in `.mat` files that is always 1.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.geometry.mesh import Mesh
 
 IndexBase = Literal[0, 1]
@@ -83,7 +84,8 @@ def read_ground_truth(
     - `.baryc_gt` or `.baryc_gt_sym`: for each source vertex a face of the target and three barycentric
       weights; 1-based.
     - two columns: a source vertex and its target vertex; 1-based.
-    - one column: for each source vertex its target vertex; 0-based, as `write_pointwise_map` writes.
+    - one column: for each source vertex its target vertex; 0-based, in `.mat` files 1-based, as
+      `write_pointwise_map` writes.
 
     The truth of the mirrored body (`.sym.vts`, `.baryc_gt_sym`) is ground truth like any other.
 
@@ -101,19 +103,16 @@ def read_ground_truth(
     if len(files) not in (1, 2):
         raise InputError(f"ground truth: {len(files)} files were given: give one, or the two of a pair.")
 
-    def base(usual: IndexBase) -> IndexBase:
-        return usual if index_base is None else index_base
-
     if len(files) == 2:
         tables = [_Table(file, columns=1) for file in files]
-        if len(tables[0].words) != len(tables[1].words):
+        if tables[0].rows != tables[1].rows:
             raise InputError(
-                f"{files[1]}: has {len(tables[1].words)} lines where {files[0]} has {len(tables[0].words)}, "
+                f"{files[1]}: has {tables[1].rows} lines where {files[0]} has {tables[0].rows}, "
                 "but equal lines should be the same point: give two files of one set."
             )
         return GroundTruth(
             *(
-                table.vertices(0, mesh, base(1 if table.path.suffix == ".vts" else 0))
+                table.vertices(0, mesh, table.base(index_base, usual=1 if table.path.suffix == ".vts" else 0))
                 for table, mesh in zip(tables, (mesh_x, mesh_y), strict=True)
             )
         )
@@ -124,17 +123,19 @@ def read_ground_truth(
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
         table = _Table(file, columns=4)
         table.require_rows(mesh_x)
-        return GroundTruth.of_all_vertices(SurfacePoints(table.faces(0, mesh_y, base(1)), table.weights(1)))
+        base = table.base(index_base, usual=1)
+        return GroundTruth.of_all_vertices(SurfacePoints(table.faces(0, mesh_y, base), table.weights(1)))
     table = _Table(file)
     if table.columns == 2:
-        return GroundTruth(table.vertices(0, mesh_x, base(1)), table.vertices(1, mesh_y, base(1)))
+        base = table.base(index_base, usual=1)
+        return GroundTruth(table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base))
     if table.columns != 1:
         raise InputError(
             f"{file}, line 1: has {table.columns} numbers: give a truth with one per line (target vertex) "
             "or two (source and target vertex), or with the suffix .baryc_gt four (face and weights)."
         )
     table.require_rows(mesh_x)
-    return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, base(0)))
+    return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.base(index_base)))
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
@@ -161,15 +162,17 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
 
 def read_pointwise_map(
-    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase = 0
+    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
 ) -> Int64[np.ndarray, " m"]:
-    """Read a pointwise map T: X -> Y, one target vertex per line.
+    """Read a pointwise map T: X -> Y, one target vertex per line, or from a `.mat` file.
 
     **Arguments:**
 
-    - `path`: the file.
+    - `path`: the file. One with the suffix `.mat` holds a single list of numbers, or among others one called
+        `T12` (X is 1, Y is 2).
     - `mesh_x`, `mesh_y`: X (m vertices) and Y.
-    - `index_base`: what the indices in the file count from; many published maps count from 1.
+    - `index_base`: what the indices in the file count from. By default 1 in `.mat` files, as MATLAB counts,
+        and 0 in all others, though many published maps count from 1.
 
     **Returns:** The target vertex of each source vertex (m,), 0-based.
 
@@ -177,26 +180,30 @@ def read_pointwise_map(
     """
     table = _Table(Path(path), columns=1)
     table.require_rows(mesh_x)
-    return table.vertices(0, mesh_y, index_base)
+    return table.vertices(0, mesh_y, table.base(index_base))
 
 
 def read_landmarks(
-    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase = 0
+    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
 ) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks, two columns: a vertex of X and the vertex of Y that is the same point.
 
-    **Arguments:** As in `read_pointwise_map`.
+    **Arguments:** As in `read_pointwise_map`; a `.mat` file holds a single matrix of two columns.
 
     **Returns:** Pairs of vertices (l, 2), 0-based.
 
     **Raises:** `InputError` that names the file, the line and the fault.
     """
     table = _Table(Path(path), columns=2)
-    return np.stack([table.vertices(0, mesh_x, index_base), table.vertices(1, mesh_y, index_base)], axis=1)
+    base = table.base(index_base)
+    return np.stack([table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base)], axis=1)
 
 
 def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) -> None:
-    """Write a pointwise map T: X -> Y, one 0-based target vertex per line; never half of it.
+    """Write a pointwise map T: X -> Y; never half of it.
+
+    One 0-based target vertex per line; or, where the name ends in `.mat`, the column `T12` in MATLAB's
+    format, which counts from 1 as MATLAB does.
 
     **Arguments:**
 
@@ -211,15 +218,29 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
             f"{path}: what should be written is not a pointwise map: one vertex index, at least 0, is needed "
             "for each source vertex."
         )
+    if is_mat_file(path):
+        write_variables(path, {POINTWISE_MAP: targets.astype(np.float64) + 1})
+        return
     with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{target}\n" for target in targets.tolist()), encoding="ascii")
 
 
 class _Table:
-    """The numbers in a text file, as many in each line."""
+    """The numbers in a file, as many in each line of text or row of a matrix."""
 
     def __init__(self, path: Path, *, columns: int | None = None) -> None:
         self.path = path
+        self.is_mat = is_mat_file(path)
+        if self.is_mat:
+            self.values = read_matrix(path, POINTWISE_MAP, columns=columns)
+        else:
+            self._words = self._read_text(columns)
+            self.values = np.array(self._words, dtype=np.float64)
+        self.rows, self.columns = self.values.shape
+
+    def _read_text(self, columns: int | None) -> list[list[str]]:
+        """The numbers as they are written."""
+        path = self.path
         try:
             text = path.read_bytes().decode("utf-8-sig")
         except OSError as error:
@@ -231,32 +252,43 @@ class _Table:
         if "\0" in text:
             raise InputError(f"{path}: is not a text file: give a file of numbers, one row per line.")
         lines = re.split("\r\n|\r|\n", text.rstrip())
-        self.words = [line.split() for line in lines]
-        if not self.words[0]:
+        rows = [line.split() for line in lines]
+        if not rows[0]:
             what = "is empty" if len(lines) == 1 else "begins with an empty line"
             raise InputError(f"{path}: {what}: give a file of numbers, one row per line.")
-        self.columns = columns or len(self.words[0])
-        for row, words in enumerate(self.words):
+        columns = columns or len(rows[0])
+        for row, words in enumerate(rows):
             for word in words:
                 if not _NUMBER.fullmatch(word):
                     raise InputError(f"{self._at(row)}: {word[:40]!a} is not a number: correct the line.")
-            if len(words) != self.columns:
+            if len(words) != columns:
                 raise InputError(
-                    f"{self._at(row)}: has {len(words)} numbers where {self.columns} should be: correct the "
+                    f"{self._at(row)}: has {len(words)} numbers where {columns} should be: correct the "
                     "line, or give the file that belongs here."
                 )
-        self.values = np.array(self.words, dtype=np.float64)
+        return rows
+
+    def base(self, asked: IndexBase | None, *, usual: IndexBase = 0) -> IndexBase:
+        """What indices count from: as asked, else as usual for the form, and as in MATLAB in its files."""
+        if asked is not None:
+            return asked
+        return 1 if self.is_mat else usual
 
     def _at(self, row: int) -> str:
-        return f"{self.path}, line {row + 1}"
+        return f"{self.path}, {'row' if self.is_mat else 'line'} {row + 1}"
+
+    def _word(self, row: int, column: int) -> str:
+        """A number as it is written."""
+        return f"{self.values[row, column]:.15g}" if self.is_mat else self._words[row][column][:40]
 
     def require_rows(self, mesh_x: Mesh) -> None:
         """One for each source vertex."""
         m = len(mesh_x.vertices)
-        if len(self.words) != m:
+        if self.rows != m:
             raise InputError(
-                f"{self.path}: has {len(self.words)} lines, but one is needed for each of the {m} vertices "
-                f"of {mesh_x.name}: give the file that belongs to this pair, in this direction."
+                f"{self.path}: has {self.rows} {'rows' if self.is_mat else 'lines'}, but one is needed for "
+                f"each of the {m} vertices of {mesh_x.name}: give the file that belongs to this pair, in "
+                "this direction."
             )
 
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
@@ -272,7 +304,7 @@ class _Table:
         if dropped.any():
             row = int(dropped.argmax())
             raise InputError(
-                f"{self._at(row)}: face {self.words[row][column]} was dropped from {mesh.name}, for it "
+                f"{self._at(row)}: face {self._word(row, column)} was dropped from {mesh.name}, for it "
                 "repeats a vertex or another face: name a face that was kept."
             )
         return faces
@@ -289,7 +321,7 @@ class _Table:
             elif base == 1 and numbers.min() == 0 and numbers.max() < count:
                 cure = "the file looks 0-based: pass index_base=0 (--index-base 0)"
             raise InputError(
-                f"{self._at(row)}: {self.words[row][column][:40]} is not one of the {what}, which are "
+                f"{self._at(row)}: {self._word(row, column)} is not one of the {what}, which are "
                 f"numbered {base} to {count - 1 + base}: {cure}."
             )
         return numbers.astype(np.int64) - base
@@ -301,8 +333,9 @@ class _Table:
         good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE
         if not good.all():
             row = int(good.argmin())
+            written = " ".join(self._word(row, at) for at in range(column, self.columns))
             raise InputError(
-                f"{self._at(row)}: {' '.join(self.words[row][column:])[:80]} are no barycentric weights, "
+                f"{self._at(row)}: {written[:80]} are no barycentric weights, "
                 "which are at least 0 and sum to 1: correct the line."
             )
         weights = np.maximum(weights, 0)

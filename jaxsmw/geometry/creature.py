@@ -268,7 +268,8 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
     numbers, cubes = np.unique(numbers, return_inverse=True)
     nodes = np.stack(np.unravel_index(numbers, 3 * [2 * size]), axis=1) - size
     nodes = (nodes + shift) * spacing @ turn
-    vertices, faces, _ = igl.marching_cubes(body.signed_distance(nodes), nodes, cubes.reshape(-1, 8))
+    # Since 2.6.3 libigl returns a third thing, too.
+    vertices, faces = igl.marching_cubes(body.signed_distance(nodes), nodes, cubes.reshape(-1, 8))[:2]
     return vertices, faces
 
 

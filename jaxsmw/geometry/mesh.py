@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import igl
 import numpy as np
@@ -15,6 +15,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jaxsmw.errors import InputError
+
+# A mesh of another library, told by its attributes, as none of those is imported; see `make_mesh`.
+MeshLike: TypeAlias = Any
 
 # A triangle lower than this fraction of its longest edge counts as degenerate: well above the rounding error
 # of coordinates that lie a few sizes of the body away from the origin, well below any triangle on purpose.
@@ -263,8 +266,8 @@ def count_of(number: int, noun: str) -> str:
 
 
 def make_mesh(
-    vertices: ArrayLike,
-    faces: ArrayLike,
+    vertices: ArrayLike | MeshLike,
+    faces: ArrayLike | None = None,
     *,
     name: str = "mesh",
     weld: bool = False,
@@ -272,12 +275,16 @@ def make_mesh(
 ) -> Mesh:
     """Check and clean vertices and faces: the one door through which every mesh comes.
 
+    Meshes of other libraries come through it, too: `make_mesh(mesh)`. Vertex i is vertex i of their mesh.
+
     Faces that repeat a vertex and faces with the same three vertices as an earlier one are dropped. Vertices
     are never dropped or renumbered.
 
     **Arguments:**
 
-    - `vertices`: positions (n, 3), any integer or float type, in any unit; copied.
+    - `vertices`: positions (n, 3), any integer or float type, in any unit; copied. Or all in one, and then no
+        `faces`: a mesh of trimesh, pyFM or geomfum (whatever has `vertices` and `faces`), a `PolyData` of
+        PyVista (`points` and `faces`), or a tuple of vertices and faces, as potpourri3d takes and gives.
     - `faces`: vertex indices (f, 3), 0-based, any integer type (or whole floats); copied.
     - `name`: how messages call this mesh.
     - `weld`: let faces use the lowest-numbered of all vertices at exactly the same position. The others stay
@@ -291,8 +298,10 @@ def make_mesh(
     **Raises:**
 
     `InputError` for arrays of another shape or type, coordinates that are not finite, a size beyond
-    1e-60 … 1e60, indices out of range, no faces, or no area.
+    1e-60 … 1e60, indices out of range, no faces, no area, or something that is no triangle mesh.
     """
+    if faces is None:
+        vertices, faces = _parts(vertices, name)
     position = _numeric(vertices, "vertices", name)
     with np.errstate(over="ignore"):  # from a wider float type; the infinity is reported
         position = np.array(position, dtype=np.float64, order="C")
@@ -347,11 +356,36 @@ def make_mesh(
     return replace(mesh, notes=tuple(notes))
 
 
+def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
+    """The vertices and faces of a mesh of any library, told by the names of its attributes."""
+    if isinstance(mesh, tuple) and len(mesh) == 2:
+        return mesh
+    faces = getattr(mesh, "faces", None)
+    if faces is not None and hasattr(mesh, "vertices"):
+        return mesh.vertices, faces
+    if faces is not None and hasattr(mesh, "points"):  # each face after the number of its corners
+        table = np.asarray(faces)
+        if table.ndim == 1:
+            if len(table) % 4 or (table[::4] != 3).any():
+                raise InputError(f"{name}: not all its faces are triangles: triangulate it first.")
+            table = table.reshape(-1, 4)[:, 1:]
+        return mesh.points, table
+    raise InputError(
+        f"{name}: {type(mesh).__name__} is no triangle mesh, for it has no faces beside vertices: give "
+        "vertices and faces, or a mesh of trimesh, pyFM, geomfum or PyVista."
+    )
+
+
+def to_host(values: Any) -> Any:
+    """What NumPy can make an array of, also from a PyTorch tensor on a device or with a gradient."""
+    return values.detach().cpu() if hasattr(values, "detach") else values
+
+
 def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
     """The values as a non-empty array (…, 3) of integers or floats."""
     expected = f"{name}: {what} must be a numeric array of shape (number of {what}, 3)"
     try:
-        array = np.asarray(values)
+        array = np.asarray(to_host(values))
         if array.dtype == object:  # integers too large for any integer type end here
             array = array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):

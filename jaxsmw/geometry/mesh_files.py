@@ -8,7 +8,6 @@ trimesh splits and drops vertices of OBJ files and cannot read polygons of mixed
 from __future__ import annotations
 
 import codecs
-import io
 import os
 import re
 from collections.abc import Callable
@@ -16,12 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy.io
 from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
+from jaxsmw.geometry.mat_files import find_structs, parse_variables
 from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
 
 # Reading takes up to fifteen times a file's size in memory; text of this size has ten million vertices.
@@ -39,7 +38,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
     - `path`: the file; its suffix, in either case, tells the format. OFF: text, also with colours or normals
         (COFF, NOFF). OBJ: `v` and `f` lines. PLY: text and binary, either byte order. STL: text and binary.
-        MAT: a struct `surface` with X, Y, Z and TRIV, counted from 1, as TOSCA comes.
+        MAT: a struct `surface` with X, Y, Z (or VERT) and TRIV, counted from 1, as TOSCA comes, or a shape of
+        which it is a field, as `write_spectrum` writes.
     - `weld`: as in `make_mesh`.
 
     **Returns:**
@@ -399,18 +399,23 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
 
 
 def _parse_mat(data: bytes) -> _Polygons:
-    """MATLAB's format as the TOSCA shapes use it: a struct `surface` with columns X, Y, Z and faces TRIV."""
+    """MATLAB's format: a struct with faces TRIV and columns X, Y, Z (or a matrix VERT), at any depth."""
+    structs = find_structs(parse_variables(data), "TRIV")
+    if len(structs) > 1:
+        raise InputError(
+            f"holds {len(structs)} shapes, {', '.join(structs)}: save each in a file of its own."
+        )
     try:
-        # SciPy answers damaged files with whatever goes wrong first.
-        surface = scipy.io.loadmat(io.BytesIO(data), squeeze_me=True)["surface"]
-        vertices = np.stack([surface[axis].item() for axis in "XYZ"], axis=-1).astype(np.float64)
-        faces = surface["TRIV"].item().astype(np.float64)
+        (surface,) = structs.values()
+        columns = [surface[axis] for axis in "XYZ"] if "X" in surface else surface["VERT"].T
+        vertices = np.stack(list(columns), axis=-1).astype(np.float64)
+        faces = surface["TRIV"].astype(np.float64)
         if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
             raise ValueError
-    except Exception:
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(
-            "holds no struct 'surface' with X, Y, Z and TRIV, as the TOSCA shapes do, in MATLAB's format "
-            "before version 7.3: save it so, or export the mesh as OFF or PLY."
+            "holds no struct 'surface' with X, Y, Z (or VERT) and TRIV, as the TOSCA shapes do: save it so, "
+            "or export the mesh as OFF or PLY."
         ) from None
     return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
 

@@ -1,0 +1,537 @@
+"""What goes to other libraries does there what it does here, and what comes from them is checked.
+
+Where a package is not installed a stand-in with its attributes is read instead; `pip install '.[peers]' pyvista`
+brings all of them.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse as sp
+import trimesh
+from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
+
+import jaxsmw
+from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh, make_spectrum
+
+K = 12
+
+
+@pytest.fixture(scope="module")
+def bodies() -> tuple[Mesh, Mesh]:
+    """Two of different sizes and numbers of vertices, neither of area 1."""
+    x, (vertices, faces) = bumpy_mesh(3), sphere_mesh(2)
+    return make_mesh(3 * x.vertices, x.faces, name="x"), make_mesh(vertices * [5, 7, 6], faces, name="y")
+
+
+@pytest.fixture(scope="module")
+def spectra(bodies) -> tuple[Spectrum, Spectrum]:
+    return jaxsmw.paired_spectra(*bodies, K)
+
+
+@pytest.fixture(scope="module")
+def pointwise_map(bodies) -> np.ndarray:
+    x, y = bodies
+    return np.random.default_rng(0).integers(0, len(y.vertices), len(x.vertices))
+
+
+def same_spectrum(a: Spectrum, b: Spectrum, *, tolerance: float = 1e-6) -> None:
+    """Equal up to eigenvectors' signs."""
+    np.testing.assert_allclose(a.eigenvalues, b.eigenvalues, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(a.vertex_areas, b.vertex_areas, rtol=tolerance, atol=1e-12)
+    signs = np.sign(np.sum(np.asarray(a.eigenvectors * b.eigenvectors), axis=0))
+    np.testing.assert_allclose(np.asarray(a.eigenvectors) * signs, b.eigenvectors, atol=1e3 * tolerance)
+    np.testing.assert_array_equal(a.mask, b.mask)
+
+
+# -------------------------------------------------------------------------------------------- meshes
+
+
+def as_trimesh(mesh: Mesh) -> object:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def as_pyfm(mesh: Mesh) -> object:
+    return pytest.importorskip("pyFM.mesh", reason="pip install pyfmaps").TriMesh(mesh.vertices, mesh.faces)
+
+
+def as_geomfum(mesh: Mesh) -> object:
+    shape = pytest.importorskip("geomfum.shape", reason="pip install geomfum")
+    return shape.TriangleMesh(mesh.vertices, mesh.faces)
+
+
+def as_pyvista(mesh: Mesh) -> object:
+    return pytest.importorskip("pyvista").PolyData.from_regular_faces(mesh.vertices, mesh.faces)
+
+
+def like_pyvista(mesh: Mesh) -> object:
+    table = np.insert(mesh.faces, 0, 3, axis=1).ravel()
+    return SimpleNamespace(points=mesh.vertices, faces=table, n_faces=len(mesh.faces))
+
+
+def as_tuple(mesh: Mesh) -> object:
+    return mesh.vertices, mesh.faces
+
+
+LIBRARIES: list[Callable[[Mesh], object]] = [
+    as_trimesh,
+    as_pyfm,
+    as_geomfum,
+    as_pyvista,
+    like_pyvista,
+    as_tuple,
+]
+
+
+@pytest.mark.parametrize("convert", LIBRARIES)
+def test_meshes_of_other_libraries_come_as_they_are(bodies, convert):
+    for body in bodies:
+        mesh = make_mesh(convert(body))
+        np.testing.assert_allclose(mesh.vertices, body.vertices, rtol=1e-15)
+        np.testing.assert_array_equal(mesh.faces, body.faces)
+
+
+def test_a_mesh_is_a_mesh(bodies):
+    np.testing.assert_array_equal(make_mesh(bodies[0]).faces, bodies[0].faces)
+
+
+def test_match_takes_them(bodies, spectra, pointwise_map):
+    stage = jaxsmw.Stage(jaxsmw.WaveletPreservation(), number_of_eigenvectors=K, iterations=1)
+    x, y = bodies
+    ours = jaxsmw.match(x, y, preset=stage, init=pointwise_map)
+    theirs = jaxsmw.match(as_trimesh(x), as_tuple(y), preset=stage, init=pointwise_map)
+    np.testing.assert_array_equal(theirs.pointwise_map, ours.pointwise_map)
+    assert theirs.mesh_x.name == "source mesh" and theirs.mesh_y.name == "target mesh"
+
+
+NO_MESHES = {
+    "a number": (3, "int is no triangle mesh"),
+    "vertices alone": (np.zeros((4, 3)), "ndarray is no triangle mesh"),
+    "a point cloud": (SimpleNamespace(vertices=np.zeros((4, 3)), faces=None), "no faces beside vertices"),
+    "polygons": (
+        SimpleNamespace(points=np.eye(4, 3), faces=np.array([4, 0, 1, 2, 3])), "not all its faces are triangles"),
+    "triangles and a polygon": (
+        SimpleNamespace(points=np.eye(5, 3), faces=np.array([3, 0, 1, 2, 7, 0, 1, 2, 3, 4, 0, 1])),
+        "not all its faces are triangles"),
+    "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is no triangle mesh"),
+    "a path": ("body.off", "str is no triangle mesh"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "fault"), NO_MESHES.values(), ids=NO_MESHES)
+def test_what_is_no_mesh_is_told(given, fault):
+    with pytest.raises(InputError, match=fault) as caught:
+        make_mesh(given, name="my body")
+    assert str(caught.value).startswith("my body: ")
+
+
+def test_the_package_imports_none_of_them():
+    code = (
+        "import jaxsmw, jaxsmw.exchange, jaxsmw.matching, sys;"
+        "print([name for name in ('pyFM', 'geomfum', 'trimesh', 'pyvista', 'torch', 'potpourri3d') "
+        "if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# ------------------------------------------------------------------------------------------- spectra
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 50.0])
+@pytest.mark.parametrize("form", ["list", "dense", "sparse", "object"])
+def test_an_eigenbasis_in_any_unit_is_scaled_to_area_1(spectra, unit, form):
+    spectrum = spectra[0].scale(unit**2)
+    areas = np.asarray(spectrum.vertex_areas)
+    if form == "object":
+        found = make_spectrum(spectrum)
+    else:
+        given = {"list": areas, "dense": np.diag(areas), "sparse": sp.diags_array(areas)}[form]
+        found = make_spectrum(spectrum.eigenvalues, spectrum.eigenvectors, given)
+    same_spectrum(found, spectra[0], tolerance=1e-12)
+
+
+def test_vertices_without_area_are_masked(spectra):
+    padded = spectra[0].pad(spectra[0].mask.shape[0] + 3)
+    vectors = np.asarray(padded.eigenvectors).copy()
+    vectors[-1] = 7  # what an eigensolver leaves there means nothing
+    found = make_spectrum(padded.eigenvalues, vectors, padded.vertex_areas)
+    same_spectrum(found, padded, tolerance=1e-12)
+
+
+def test_spectra_are_of_the_default_float_type():
+    given = random_spectrum(30, 5)
+    arrays = map(np.asarray, (given.eigenvalues, given.eigenvectors, given.vertex_areas))
+    with jax.enable_x64(False):
+        assert make_spectrum(*arrays).eigenvectors.dtype == jnp.float32
+
+
+def test_spectrum_of_pyfm(bodies, spectra):
+    for body, ours in zip(bodies, spectra, strict=True):
+        theirs = as_pyfm(body)
+        with pytest.raises(InputError, match="no eigenvectors yet"):
+            make_spectrum(theirs)
+        theirs.process(K)
+        np.testing.assert_allclose(theirs.area, body.area)
+        same_spectrum(make_spectrum(theirs), ours)
+
+
+@pytest.mark.parametrize("use_k", [K, 5])
+def test_spectrum_of_geomfum(bodies, spectra, use_k):
+    laplacian = pytest.importorskip("geomfum.laplacian", reason="pip install geomfum")
+    for body, ours in zip(bodies, spectra, strict=True):
+        theirs = as_geomfum(body)
+        finder = laplacian.LaplacianSpectrumFinder(K, laplacian_finder=laplacian.LaplacianFinder())
+        theirs.laplacian.find_spectrum(laplacian_spectrum_finder=finder)
+        theirs.basis.use_k = use_k
+        same_spectrum(make_spectrum(theirs), ours.truncate(use_k))
+
+
+def test_spectrum_of_what_looks_like_geomfum(spectra):
+    ours = spectra[0].scale(9.0)
+    shape = SimpleNamespace(
+        basis=SimpleNamespace(vals=np.asarray(ours.eigenvalues), vecs=np.asarray(ours.eigenvectors)),
+        laplacian=SimpleNamespace(mass_matrix=sp.dia_matrix(np.diag(np.asarray(ours.vertex_areas)))),
+    )
+    same_spectrum(make_spectrum(shape), spectra[0], tolerance=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:Sparse CSC tensor support")
+@pytest.mark.parametrize("layout", ["sparse_csc", "sparse_coo", "strided", "gradient"])
+def test_tensors_of_pytorch(bodies, spectra, layout):
+    torch = pytest.importorskip("torch", reason="pip install geomfum")
+    ours = spectra[0].scale(4.0)
+    values, vectors, areas = (
+        torch.tensor(np.asarray(array)) for array in (ours.eigenvalues, ours.eigenvectors, ours.vertex_areas)
+    )
+    if layout == "gradient":
+        vectors, mass = vectors.requires_grad_(), areas.requires_grad_()
+    else:
+        mass = (
+            torch.diag(areas).to_sparse(layout=getattr(torch, layout))
+            if layout != "strided"
+            else torch.diag(areas)
+        )
+    same_spectrum(make_spectrum(values, vectors, mass), spectra[0], tolerance=1e-12)
+    x = bodies[0]
+    tensors = torch.tensor(x.vertices, requires_grad=True), torch.tensor(x.faces)
+    np.testing.assert_array_equal(make_mesh(*tensors).vertices, x.vertices)
+
+
+VALUES, (VECTORS, AREAS) = (
+    np.array([0.0, 1.0, 2.0]),
+    (np.asarray(random_spectrum(8, 3).eigenvectors), np.asarray(random_spectrum(8, 3).vertex_areas)),
+)
+BAD_SPECTRA = {
+    "nothing": ((3,), "int has no eigenbasis"),
+    "eigenvalues alone": ((VALUES,), "ndarray has no eigenbasis"),
+    "no areas": ((VALUES, VECTORS), "vertex areas are no numeric array"),
+    "transposed": ((VALUES, VECTORS.T, AREAS), "do not fit each other"),
+    "too many eigenvalues": ((np.arange(4.0), VECTORS, AREAS), "do not fit each other"),
+    "too few areas": ((VALUES, VECTORS, AREAS[:-1]), "do not fit each other"),
+    "a matrix of eigenvalues": ((np.diag(VALUES), VECTORS, AREAS), "do not fit each other"),
+    "complex": ((VALUES * 1j, VECTORS, AREAS), "eigenvalues are no numeric array"),
+    "words": ((["a", "b", "c"], VECTORS, AREAS), "eigenvalues are no numeric array"),
+    "not finite": ((VALUES, VECTORS * np.nan, AREAS), "eigenvectors are not all finite"),
+    "negative areas": ((VALUES, VECTORS, -AREAS), "must not be negative"),
+    "no area": ((VALUES, VECTORS, 0 * AREAS), "not all zero"),
+    "negative semi-definite": ((-VALUES[::-1], VECTORS, AREAS), "change its sign"),
+    "descending": ((VALUES[::-1], VECTORS, AREAS), "do not ascend"),
+    "areas of another unit": ((VALUES, VECTORS, 100 * AREAS), "not orthonormal"),
+    "orthonormal without areas": ((VALUES, np.linalg.qr(VECTORS)[0], AREAS), "not orthonormal"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("arrays", "fault"), BAD_SPECTRA.values(), ids=BAD_SPECTRA)
+def test_bad_spectra_end_in_one_sentence(arrays, fault):
+    with pytest.raises(InputError, match=fault) as caught:
+        make_spectrum(*arrays, name="my basis")
+    message = str(caught.value)
+    assert message.startswith("my basis: ") and "\n" not in message and message.endswith(".")
+
+
+# ---------------------------------------------------------------------------------- functional maps
+
+
+def test_maps_of_pyfm_are_ours(spectra, pointwise_map):
+    """Its shape 1 is our Y, its shape 2 our X: `FM_12` is C, `p2p_21` is T."""
+    convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
+    x, y = spectra
+    basis_1, basis_2 = np.asarray(y.eigenvectors), np.asarray(x.eigenvectors)
+    theirs = convert.p2p_to_FM(pointwise_map, basis_1, basis_2, A2=np.asarray(x.vertex_areas))
+    ours = encode(jnp.asarray(pointwise_map), x, y)
+    np.testing.assert_allclose(theirs, ours, atol=1e-12)
+    np.testing.assert_allclose(
+        convert.p2p_to_FM(pointwise_map, basis_1, basis_2),
+        encode(jnp.asarray(pointwise_map), x, y, pseudo_inverse="least_squares"),
+        atol=1e-12,
+    )
+    rectangular = np.asarray(ours)[:, : K - 4]
+    np.testing.assert_array_equal(
+        convert.FM_to_p2p(rectangular, basis_1, basis_2),
+        decode(jnp.asarray(rectangular), x, y.truncate(K - 4)),
+    )
+
+
+def test_zoomout_of_pyfm_on_our_basis(spectra, pointwise_map):
+    refine = pytest.importorskip("pyFM.refine", reason="pip install pyfmaps")
+    x, y = spectra
+    first = encode(jnp.asarray(pointwise_map), x.truncate(4), y.truncate(4))
+    theirs, points = refine.zoomout_refine(
+        np.asarray(first),
+        np.asarray(y.eigenvectors),
+        np.asarray(x.eigenvectors),
+        nit=K - 4,
+        A2=sp.diags_array(np.asarray(x.vertex_areas)).tocsr(),
+        return_p2p=True,
+    )
+    ours = first
+    for k in range(5, K + 1):
+        found = decode(ours, x.truncate(k - 1), y.truncate(k - 1))
+        ours = encode(found, x.truncate(k), y.truncate(k))
+    np.testing.assert_allclose(theirs, ours, atol=1e-12)
+    np.testing.assert_array_equal(points, decode(ours, x, y))
+
+
+def test_maps_between_pyfm_meshes_in_their_own_unit(bodies, pointwise_map):
+    """`make_spectrum` says how such a map becomes one between spectra of area 1."""
+    functional = pytest.importorskip("pyFM.functional", reason="pip install pyfmaps")
+    convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
+    x, y = (as_pyfm(body).process(K) for body in bodies)
+    theirs = convert.mesh_p2p_to_FM(pointwise_map, y, x)
+    ours = encode(jnp.asarray(pointwise_map), make_spectrum(x), make_spectrum(y))
+    np.testing.assert_allclose(theirs * np.sqrt(y.area / x.area), ours, atol=1e-10)
+    assert abs(y.area / x.area - 1) > 1
+    # Of meshes of area 1 they are the same, and so is what their object makes of ours.
+    x, y = x.area_normalize(), y.area_normalize()
+    model = functional.FunctionalMapping(y, x)
+    model.FM_12 = np.asarray(ours)
+    np.testing.assert_array_equal(model.get_p2p(), decode(ours, make_spectrum(x), make_spectrum(y)))
+
+
+def test_maps_of_geomfum_are_ours(spectra, pointwise_map):
+    """Its shape a is our Y, its shape b our X."""
+    convert = pytest.importorskip("geomfum.convert", reason="pip install geomfum")
+    basis = pytest.importorskip("geomfum.basis", reason="pip install geomfum")
+    x, y = spectra
+    b, a = (basis.EigenBasis(*map(np.asarray, (s.eigenvalues, s.eigenvectors))) for s in spectra)
+    ours = encode(jnp.asarray(pointwise_map), x, y, pseudo_inverse="least_squares")
+    np.testing.assert_allclose(convert.FmFromP2pConverter()(pointwise_map, a, b), ours, atol=1e-12)
+    rectangular = np.asarray(ours)[:, : K - 4]
+    np.testing.assert_array_equal(
+        convert.P2pFromFmConverter()(rectangular, a, b),
+        decode(jnp.asarray(rectangular), x, y.truncate(K - 4)),
+    )
+
+
+# --------------------------------------------------------------------------------------- .mat files
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".npz"])
+def test_spectra_survive_files(bodies, spectra, tmp_path, suffix):
+    for body, spectrum in zip(bodies, spectra, strict=True):
+        path = tmp_path / f"body{suffix}"
+        jaxsmw.write_spectrum(path, spectrum.scale(4.0), body)
+        same_spectrum(jaxsmw.read_spectrum(path), spectrum, tolerance=1e-12)
+
+
+def test_a_shape_for_matlab(bodies, spectra, tmp_path):
+    body, spectrum = bodies[0], spectra[0]
+    jaxsmw.write_spectrum(tmp_path / "x.mat", spectrum, body)
+    shape = scipy.io.loadmat(tmp_path / "x.mat", squeeze_me=False)["S"][0, 0]
+    n = len(body.vertices)
+    assert shape["evals"].shape == (K, 1) and shape["evecs"].shape == (n, K) and shape["A"].shape == (n, n)
+    assert shape["nv"].item() == n and shape["nf"].item() == len(body.faces)
+    np.testing.assert_allclose(shape["evecs"].T @ shape["A"] @ shape["evecs"], np.eye(K), atol=1e-9)
+    surface = shape["surface"][0, 0]
+    assert surface["X"].shape == (n, 1) and surface["TRIV"].dtype == np.float64
+    np.testing.assert_array_equal(surface["TRIV"], body.faces + 1)
+    # All of one surface: that of the spectrum.
+    mesh = jaxsmw.read_mesh(tmp_path / "x.mat")
+    np.testing.assert_allclose(mesh.area, shape["area"].item(), rtol=1e-12)
+    np.testing.assert_allclose(mesh.vertex_areas, shape["A"].diagonal(), rtol=1e-9)
+    np.testing.assert_allclose(mesh.vertices * np.sqrt(body.area), body.vertices, rtol=1e-12)
+
+
+def mat_file(path: Path, **variables: object) -> Path:
+    scipy.io.savemat(path, variables)
+    return path
+
+
+@pytest.mark.parametrize("form", ["sparse", "diagonal", "row"])
+@pytest.mark.parametrize("nested", [False, True])
+def test_shapes_of_other_matlab_code(spectra, tmp_path, form, nested):
+    spectrum = spectra[0].scale(30.0)
+    areas = np.asarray(spectrum.vertex_areas)
+    field = {"sparse": {"A": sp.diags_array(areas)}, "diagonal": {"A": areas}, "row": {"area": areas[None]}}[
+        form
+    ]
+    fields = {
+        "evals": np.asarray(spectrum.eigenvalues)[None],
+        "evecs": np.asarray(spectrum.eigenvectors),
+        **field,
+    }
+    path = mat_file(tmp_path / "s.mat", **({"shape": fields, "about": "a body"} if nested else fields))
+    same_spectrum(jaxsmw.read_spectrum(path), spectra[0], tolerance=1e-12)
+
+
+def test_matlab_code_composes_what_we_write(bodies, spectra, pointwise_map, tmp_path):
+    """C21 = S1.evecs' * S1.A * S2.evecs(T12, :), and T12 = knnsearch(S2.evecs * C21', S1.evecs)."""
+    x, y = spectra
+    ours = encode(jnp.asarray(pointwise_map), x, y)
+    jaxsmw.write_spectrum(tmp_path / "1.mat", x, bodies[0])
+    jaxsmw.write_spectrum(tmp_path / "2.mat", y)
+    jaxsmw.write_functional_map(tmp_path / "c.mat", ours)
+    jaxsmw.write_pointwise_map(tmp_path / "t.mat", pointwise_map)
+    s_1, s_2 = (scipy.io.loadmat(tmp_path / f"{i}.mat")["S"][0, 0] for i in (1, 2))
+    t_12, c_21 = scipy.io.loadmat(tmp_path / "t.mat")["T12"], scipy.io.loadmat(tmp_path / "c.mat")["C21"]
+    assert t_12.shape == (len(pointwise_map), 1) and t_12.dtype == np.float64 and t_12.min() >= 1
+    composed = s_1["evecs"].T @ s_1["A"] @ s_2["evecs"][t_12[:, 0].astype(int) - 1]
+    np.testing.assert_allclose(c_21, composed, atol=1e-12)
+    distances = np.linalg.norm((s_2["evecs"] @ c_21.T)[None] - s_1["evecs"][:, None], axis=2)
+    np.testing.assert_array_equal(distances.argmin(axis=1), decode(ours, x, y))
+    np.testing.assert_array_equal(jaxsmw.read_functional_map(tmp_path / "c.mat", x, y), np.asarray(ours))
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(tmp_path / "t.mat", *bodies), pointwise_map)
+
+
+@pytest.mark.parametrize("shape", ["column", "row"])
+def test_pointwise_maps_of_other_matlab_code(bodies, pointwise_map, tmp_path, shape):
+    table = (pointwise_map + 1)[:, None] if shape == "column" else (pointwise_map + 1)[None]
+    x, y = bodies
+    for variables in (
+        {"anything": table},
+        {"T12": table.astype(np.int32), "T21": np.ones((len(y.vertices), 1)), "C21": np.eye(5), "note": "x"},
+    ):
+        path = mat_file(tmp_path / "t.mat", **variables)
+        np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y), pointwise_map)
+        truth = jaxsmw.read_ground_truth(path, x, y) if len(variables) == 1 else None
+        if truth is not None:
+            np.testing.assert_array_equal(truth.targets, pointwise_map)
+    zero_based = mat_file(tmp_path / "zero.mat", T12=table - 1)
+    read = jaxsmw.read_pointwise_map(zero_based, x, y, index_base=0)
+    np.testing.assert_array_equal(read, pointwise_map)
+
+
+def test_pairs_of_vertices_in_mat_files(bodies, pointwise_map, tmp_path):
+    from jaxsmw.evaluation.ground_truth import read_landmarks
+
+    x, y = bodies
+    pairs = np.stack([np.arange(9), pointwise_map[:9]], axis=1)
+    path = mat_file(tmp_path / "pairs.mat", pairs=pairs + 1)
+    np.testing.assert_array_equal(read_landmarks(path, x, y), pairs)
+    truth = jaxsmw.read_ground_truth(path, x, y)
+    np.testing.assert_array_equal(np.stack([truth.source_vertices, truth.targets], axis=1), pairs)
+
+
+def hostile_file(kind: str, path: Path) -> None:
+    scipy.io.savemat(path, {"T12": np.arange(1.0, 400), "evals": np.ones(3)})
+    whole = path.read_bytes()
+    damaged = {
+        "truncated": whole[:-30],
+        "cut in its header": whole[:60],
+        "empty": b"",
+        "text": b"not MATLAB's at all\n" * 20,
+        "7.3": b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n",
+        "hdf5": b"\x89HDF\r\n\x1a\n".ljust(600),
+    }
+    path.write_bytes(damaged[kind])
+
+
+@pytest.mark.parametrize("kind", ["truncated", "cut in its header", "empty", "text", "7.3", "hdf5"])
+@pytest.mark.parametrize("reader", ["mesh", "spectrum", "functional map", "pointwise map"])
+def test_damaged_mat_files_end_in_one_sentence(bodies, spectra, tmp_path, kind, reader):
+    path = tmp_path / "hostile.mat"
+    hostile_file(kind, path)
+    with pytest.raises(InputError) as caught:
+        READERS[reader](path, bodies, spectra)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message and message.endswith(".")
+    if kind in ("7.3", "hdf5"):
+        assert "format 7.3" in message and "'-v7'" in message
+    else:
+        assert "damaged" in message
+
+
+READERS = {
+    "mesh": lambda path, *_: jaxsmw.read_mesh(path),
+    "spectrum": lambda path, *_: jaxsmw.read_spectrum(path),
+    "functional map": lambda path, _, spectra: jaxsmw.read_functional_map(path, *spectra),
+    "pointwise map": lambda path, bodies, _: jaxsmw.read_pointwise_map(path, *bodies),
+}
+M, N = 642, 162
+SURFACE = {
+    "X": np.eye(4)[0],
+    "Y": np.eye(4)[1],
+    "Z": np.eye(4)[2],
+    "TRIV": np.array([[1, 2, 3], [1, 2, 4.0]]),
+}
+BASIS = {"evals": np.arange(3.0), "evecs": np.eye(8, 3)}
+BAD_VARIABLES = {
+    "map counted from 0": ("pointwise map", {"T12": np.arange(M) % N}, r"row 1: 0 is not .* numbered 1 to 162.*--index-base 0"),
+    "map out of range": ("pointwise map", {"T12": np.arange(M) % N + 2}, "row 162: 163 is not one of the vertices of y"),
+    "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but one is needed for each of the 642"),
+    "map of fractions": ("pointwise map", {"T12": np.full(M, 1.5)}, "row 1: 1.5 is not one of"),
+    "map of NaN": ("pointwise map", {"T12": np.full(M, np.nan)}, "row 1: nan is not one of"),
+    "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "holds 'T12', and no list of numbers"),
+    "two maps": ("pointwise map", {"a": np.ones(M), "b": np.ones(M)}, "more than one list of numbers, a, b: call .* T12"),
+    "no variable": ("pointwise map", {}, "is empty"),
+    "words": ("pointwise map", {"T12": "one two"}, "no list of numbers"),
+    "complex": ("functional map", {"C21": np.eye(3) * 1j}, "no matrix"),
+    "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): transpose it"),
+    "infinite": ("functional map", {"C21": np.full((3, 3), np.inf)}, "not finite"),
+    "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "call the one that is meant C21"),
+    "no basis": ("spectrum", {"S": {"evals": np.arange(3.0)}}, "no evals and evecs"),
+    "two bases": ("spectrum", {"S1": BASIS, "S2": BASIS}, "holds 2 eigenbases, S1, S2"),
+    "no areas": ("spectrum", BASIS, "no areas beside its evecs"),
+    "one area": ("spectrum", {**BASIS, "area": 3.0}, "no areas beside its evecs"),
+    "areas of another shape": ("spectrum", {**BASIS, "A": np.ones(7)}, "do not fit each other"),
+    "another mass matrix": ("spectrum", {**BASIS, "A": np.full(8, 2.0)}, "not orthonormal"),
+    "no faces": ("mesh", {"surface": {"X": np.ones(4)}}, "no struct 'surface' with X, Y, Z"),
+    "no coordinates": ("mesh", {"surface": {"TRIV": np.ones((4, 3))}}, "no struct 'surface' with X, Y, Z"),
+    "coordinates of other lengths": ("mesh", {"S": {"surface": {**SURFACE, "Z": np.ones(5)}}}, "no struct 'surface' with X, Y, Z"),
+    "two shapes": ("mesh", {"S1": {"surface": SURFACE}, "S2": {"surface": SURFACE}}, "holds 2 shapes, S1.surface, S2.surface"),
+    "faces from 0": ("mesh", {"surface": {**SURFACE, "TRIV": np.array([[0, 1, 2], [1, 2, 3]])}}, "triangle 0 uses vertex -1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("reader", "variables", "fault"), BAD_VARIABLES.values(), ids=BAD_VARIABLES)
+def test_bad_variables_end_in_one_sentence(bodies, spectra, tmp_path, reader, variables, fault):
+    path = mat_file(tmp_path / "bad.mat", **variables)
+    with pytest.raises(InputError, match=fault) as caught:
+        READERS[reader](path, bodies, spectra)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message and message.endswith(".")
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_missing_files_are_told(bodies, spectra, tmp_path, reader):
+    with pytest.raises(InputError, match=r"nowhere\.mat: "):
+        READERS[reader](tmp_path / "nowhere.mat", bodies, spectra)
+
+
+def test_what_cannot_be_written_is_told(bodies, spectra, tmp_path):
+    x, _ = spectra
+    (tmp_path / "damaged.npz").write_bytes(b"no archive")
+    np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
+    for fault, call in {
+        "written as .npz or .mat": lambda: jaxsmw.write_spectrum(tmp_path / "x.txt", x),
+        "has 642 vertices and y 162": lambda: jaxsmw.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
+        "written as .mat": lambda: jaxsmw.write_functional_map(tmp_path / "c.txt", np.eye(3)),
+        "not all finite": lambda: jaxsmw.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
+        "read from .npz and .mat": lambda: jaxsmw.read_spectrum(tmp_path / "x.txt"),
+        "does not exist": lambda: jaxsmw.read_spectrum(tmp_path / "x.npz"),
+        "damaged or lacks": lambda: jaxsmw.read_spectrum(tmp_path / "damaged.npz"),
+        "lacks one of": lambda: jaxsmw.read_spectrum(tmp_path / "fields.npz"),
+        "not a pointwise map": lambda: jaxsmw.write_pointwise_map(tmp_path / "t.mat", [0.5]),
+    }.items():
+        with pytest.raises(InputError, match=fault):
+            call()
+    assert not list(tmp_path.glob("*.mat")) and not list(tmp_path.glob("*.txt"))
