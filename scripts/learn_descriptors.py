@@ -72,7 +72,6 @@ from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.shot import SHOT_DIMENSION
-from jaxsmw.provenance import made_with
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
 # Of the parts of the loss without labels that are no lengths.
@@ -322,7 +321,7 @@ def of_pair(pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
 REFERENCE, START, REFINED = "SHOT", ", start", ", refined"
 
 
-def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
+def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
     """The page, in parts."""
     yield "# Learned descriptors\n"
     yield (
@@ -339,7 +338,7 @@ def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
             for data_set, pairs in measured.items()
         }
         yield comparison(here, names, seed)
-    yield made_with() + "\n"
+    yield begun_with + "\n"
 
 
 def draw(curves: Mapping[str, Trained], path: Path) -> None:
@@ -375,7 +374,7 @@ def main() -> None:
                 steps=run.steps,
                 seed=run.seed,
                 directory=run.directory,
-                watched=run.data.unseen[:WATCHED_PAIRS],
+                watched=run.data.unseen[: min(WATCHED_PAIRS, run.test_pairs)],
             )
             path = run.directory / f"descriptors_{name}.eqx"
             save(curves[name].model, path)
@@ -387,7 +386,7 @@ def main() -> None:
             seed=run.seed,
             directory=run.directory,
         )
-        page = "\n".join(summary(measured, run.steps, run.seed))
+        page = "\n".join(summary(measured, run.steps, run.seed, run.begun_with))
         with atomic_write(run.directory / "summary.md") as temporary:
             temporary.write_text(page, "utf-8")
         draw({f"from {name}": curve for name, curve in curves.items()}, run.directory / "curves.png")

@@ -63,7 +63,6 @@ from jaxsmw.core.filters import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.files import atomic_write
-from jaxsmw.provenance import made_with
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6
 TEMPERATURE, LEARNING_RATE, FLOOR = 0.1, 0.3, 0.05
@@ -167,7 +166,7 @@ def of_pair(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[
     return errors(pair, mesh_x, mesh_y, maps, seed)
 
 
-def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
+def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
     """The page, in parts."""
     yield "# Learned frames\n"
     yield (
@@ -176,7 +175,7 @@ def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
         "intervals of the mean difference from Meyer's frame, pair by pair.\n"
     )
     yield comparison(measured, list(next(iter(measured.values()))[0]), seed)
-    yield made_with() + "\n"
+    yield begun_with + "\n"
 
 
 def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path: Path) -> None:
@@ -225,7 +224,7 @@ def main() -> None:
             seed=run.seed,
             directory=run.directory,
         )
-        page = "\n".join(summary(measured, run.steps, run.seed))
+        page = "\n".join(summary(measured, run.steps, run.seed, run.begun_with))
         with atomic_write(run.directory / "summary.md") as temporary:
             temporary.write_text(page, "utf-8")
         draw(banks, losses, run.directory / "frames.png")

@@ -23,7 +23,7 @@ from jaxsmw.evaluation.datasets import DataPair, open_data_set
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.evaluation.journal import Journal, claimed_directory
 from jaxsmw.files import atomic_write, make_directory
-from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
+from jaxsmw.provenance import code_digest, commit, machine, made_with, measured_code, versions
 from jaxsmw.report.tables import markdown
 
 EIGENVECTORS, ITERATIONS = 100, 3
@@ -141,13 +141,6 @@ def train(
     not finite.
     """
 
-    @eqx.filter_jit
-    def improve(state: State, pair: Prepared) -> State:
-        value, gradient = eqx.filter_value_and_grad(loss)(state.model, pair)
-        change, following = optimizer.update(gradient, state.optimizer)
-        noted = state.losses.at[state.step].set(value / (1 if unit is None else unit(pair)))
-        return State(eqx.apply_updates(state.model, change), following, state.step + 1, noted, state.watched)
-
     looks = np.append(np.arange(0, steps, _WATCHED_EVERY), steps) if watched else np.zeros(0, int)
     dtype = jnp.result_type(float)
     state = State(
@@ -162,14 +155,12 @@ def train(
         with reading(saved) as stream:
             state = eqx.tree_deserialise_leaves(stream, state)
 
-    look = eqx.filter_jit(loss)
-
     def watch(state: State) -> State:
         """The loss of pairs not trained on, if this is a step at which it is noted."""
         here = np.flatnonzero(looks == int(state.step))
         if not len(here):
             return state
-        mean = np.mean([float(look(state.model, prepare(pair))) for pair in watched])
+        mean = np.mean([float(_look(loss, state.model, prepare(pair))) for pair in watched])
         return eqx.tree_at(lambda s: s.watched, state, state.watched.at[here[0]].set(mean))
 
     order = np.random.default_rng(seed).integers(0, len(pairs), steps)
@@ -177,7 +168,7 @@ def train(
     progress = tqdm(range(begun, steps), desc=f"learning {name}", unit="step", initial=begun, total=steps)
     for step in progress:
         pair = pairs[order[step]]
-        state = improve(watch(state), prepare(pair))
+        state = _improve(watch(state), prepare(pair), loss, optimizer, unit)
         value = float(state.losses[step])
         if not np.isfinite(value):
             raise ArithmeticError(f"the loss became {value} at step {step} ({pair.name})")
@@ -188,6 +179,28 @@ def train(
             with atomic_write(saved) as temporary, open(temporary, "wb") as stream:
                 eqx.tree_serialise_leaves(stream, state)
     return Trained(state.model, np.asarray(state.losses), looks, np.asarray(state.watched))
+
+
+# Out here, so that they are compiled once for the same loss and optimiser.
+@eqx.filter_jit
+def _improve(
+    state: State,
+    pair: Prepared,
+    loss: Callable[[Model, Prepared], Float[Array, ""]],
+    optimizer: optax.GradientTransformation,
+    unit: Callable[[Prepared], Float[Array, ""]] | None,
+) -> State:
+    value, gradient = eqx.filter_value_and_grad(loss)(state.model, pair)
+    change, following = optimizer.update(gradient, state.optimizer)
+    losses = state.losses.at[state.step].set(value / (1 if unit is None else unit(pair)))
+    return State(eqx.apply_updates(state.model, change), following, state.step + 1, losses, state.watched)
+
+
+@eqx.filter_jit
+def _look(
+    loss: Callable[[Model, Prepared], Float[Array, ""]], model: Model, pair: Prepared
+) -> Float[Array, ""]:
+    return loss(model, pair)
 
 
 @contextmanager
@@ -246,7 +259,10 @@ def measure(
     seed: int,
     directory: Path,
 ) -> Measured:
-    """Figures of some unseen people's pairs and of TOSCA's, kept in `errors.csv` as they come."""
+    """Figures of some unseen people's pairs and of TOSCA's, kept in `errors.csv` as they come.
+
+    The first pairs of a larger number are those of a smaller.
+    """
     generator, journal = np.random.default_rng(seed), Journal(directory / "errors.csv", ["source", "target"])
     measured: Measured = {}
     for title, pairs in (("people not seen", data.unseen), ("TOSCA", data.animals)):
@@ -255,8 +271,10 @@ def measure(
             if pair.names not in journal:
                 names = {"source": pair.source, "target": pair.target}
                 journal.append([{"data": title, **names, **of_pair(pair)}])
+        labels = "data", "source", "target"
         measured[title] = [
-            {name: float(value) for name, value in list(journal[pair.names].items())[3:]} for pair in chosen
+            {name: float(value) for name, value in journal[pair.names].items() if name not in labels}
+            for pair in chosen
         ]
     return measured
 
@@ -294,13 +312,14 @@ def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentPar
 
 
 class Run(NamedTuple):
-    """What was asked for, and where it goes."""
+    """What was asked for, where it goes, and what began it, in one line."""
 
     data: Data
     directory: Path
     steps: int
     test_pairs: int
     seed: int
+    begun_with: str
 
 
 @contextmanager
@@ -318,13 +337,13 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
     script = Path(sys.argv[0])
     try:
         data, directory = open_data(options.data), make_directory(options.output)
-        asked = {"steps": steps, "test_pairs": test_pairs, "seed": options.seed, **settings}
+        asked = {"steps": steps, "seed": options.seed, **settings}
         code = code_digest([*measured_code(), Path(__file__), script])
         origin = {"settings": asked, "versions": versions() | {"code": code}}
         command = shlex.join(["python", f"scripts/{script.name}", *_public(options)])
         noted = {"commit": commit(), "machine": machine(), "command": command}
         with claimed_directory(directory, origin, noted):
-            yield Run(data, directory, steps, test_pairs, options.seed)
+            yield Run(data, directory, steps, test_pairs, options.seed, made_with())
     except InputError as error:
         arguments.error(str(error))
 

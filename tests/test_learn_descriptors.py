@@ -78,31 +78,32 @@ def network():
 NAMED = [SimpleNamespace(names=("a", letter), name=f"a to {letter}") for letter in "bc"]
 
 
-def learn(network, pair, directory, *, steps=6, loss="labels", prepare=None, watched=NAMED[1:]):
-    optimizer = optax.adam(2e-3)
-    prepare = prepare or (lambda _: pair)
+OPTIMIZER, STEPS = optax.adam(2e-3), 6
+
+
+def learn(network, pair, directory, *, loss="labels", prepare=None):
     return train(
         loss,
         LOSSES[loss],
         network,
         NAMED,
-        prepare,
-        optimizer,
-        steps=steps,
+        prepare or (lambda _: pair),
+        OPTIMIZER,
+        steps=STEPS,
         seed=1,
         directory=directory,
-        watched=watched,
+        watched=NAMED[1:],
     )
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_learning_lowers_the_loss(network, pair, tmp_path, loss):
-    trained = learn(network, pair, tmp_path, steps=8, loss=loss)
-    assert trained.losses.shape == (8,) and trained.losses[-1] < trained.losses[0]
+    trained = learn(network, pair, tmp_path, loss=loss)
+    assert trained.losses.shape == (STEPS,) and trained.losses[-1] < trained.losses[0]
     # What is watched is this very pair, before the first step and after the last.
-    np.testing.assert_array_equal(trained.steps, [0, 8])
+    np.testing.assert_array_equal(trained.steps, [0, STEPS])
     np.testing.assert_allclose(trained.watched[0], trained.losses[0], rtol=1e-9)
-    assert trained.watched[1] < trained.losses[-2]
+    assert trained.watched[1] < trained.losses[0]
 
 
 def test_descriptors_do_not_depend_on_signs(network, spectra):
@@ -247,7 +248,7 @@ def test_the_summary_and_the_figure_say_how_it_went(tmp_path):
         {"SHOT, start": 220.0, "learned, start": 110.0, "SHOT, refined": 10.0, "learned, refined": 10.5},
         {"SHOT, start": 210.0, "learned, start": 120.0, "SHOT, refined": 12.0, "learned, refined": 11.0},
     ]
-    page = "\n".join(summary({"people": rows}, 5, 0))
+    page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
     assert "| people, start | 3 | 210.0 | 110.0 (−100.0 [" in page
     assert "| people, refined | 3 | 14.0 | 14.2 (+0.2 [" in page
     curve = learning.Trained(None, np.linspace(1, 0.5, 30), np.array([0, 20, 30]), np.array([1.0, 0.8, 0.7]))

@@ -111,5 +111,5 @@ def test_the_summary_says_whether_it_helped():
         {"Meyer": 10.0, "learned": 9.0},
         {"Meyer": 12.0, "learned": 12.5},
     ]
-    page = "\n".join(summary({"people": rows}, 5, 0))
+    page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
     assert "| people | 3 | 14.0 | 13.2 (−0.8 [" in page

@@ -263,6 +263,28 @@ def test_the_layer_learns_features_that_match(pair):
     assert len(jax.tree.leaves(layer)) == 2
 
 
+def test_the_layer_is_a_function_for_models_of_any_library(pair):
+    x, y, _ = pair
+    layer = WaveletPreservationLayer(recovery_of_features=Softmax(10.0), recovery=Softmax(10.0), iterations=1)
+
+    def apply(parameters, inputs):
+        """As flax's modules have it: a pure function of nested dictionaries."""
+        return inputs @ parameters["params"]["kernel"]
+
+    def loss(parameters, layer):
+        outcome = layer(apply(parameters, x.eigenvectors), apply(parameters, y.eigenvectors), x, y)
+        return jnp.mean((outcome.soft_map.pull_back(y.eigenvectors) - x.eigenvectors) ** 2)
+
+    parameters = {"params": {"kernel": jnp.eye(K)[:, :5]}}
+    beside, slope = jax.jit(jax.value_and_grad(lambda p: loss(p, layer)))(parameters)
+    inside, slopes = jax.jit(jax.value_and_grad(lambda p: loss(p, p["layer"])))(parameters | {"layer": layer})
+    assert beside == pytest.approx(float(inside))
+    np.testing.assert_allclose(slope["params"]["kernel"], slopes["params"]["kernel"])
+    assert 0 < float(jnp.abs(slope["params"]["kernel"]).max()) < float("inf")
+    # As one of the parameters, what it is made of is learned, too.
+    assert 0 < abs(float(slopes["layer"].recovery.temperature)) < float("inf")
+
+
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
 def test_padding_changes_nothing(pair, recovery):
     x, y, start = pair
