@@ -43,6 +43,11 @@ def commit() -> str:
         return metadata.version("jaxsmw")
 
 
+def made_with() -> str:
+    """Commit, machine and versions in one line, for the foot of a page."""
+    return f"Commit {commit()}, {machine()}, " + ", ".join(f"{k} {v}" for k, v in versions().items()) + "."
+
+
 def measured_code() -> list[Path]:
     """The library's modules on which numbers depend, without command line and drawing."""
     parts = (_LIBRARY / part for part in ("core", "geometry", "evaluation"))

@@ -33,7 +33,7 @@ from jaxsmw.files import atomic_write
 from jaxsmw.geometry.faults import flaw, stretch
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS
-from jaxsmw.provenance import commit, machine, versions
+from jaxsmw.provenance import made_with
 from jaxsmw.report.tables import markdown
 
 GROSS, TENTH = 0.1, 0.1
@@ -146,8 +146,7 @@ def main() -> None:
     measured: dict[str, list[Measured]] = {}
     for data_set, pair in tqdm(chosen, unit="pair"):
         measured.setdefault(data_set.name, []).append(measure(pair, options.seed))
-    made_by = f"Commit {commit()}, {machine()}, " + ", ".join(f"{k} {v}" for k, v in versions().items()) + "."
-    page = "\n".join((*tables(measured), made_by + "\n"))
+    page = "\n".join((*tables(measured), made_with() + "\n"))
     print(page)
     if options.output:
         with atomic_write(options.output) as temporary:

@@ -41,6 +41,7 @@ def test_code_blocks_run(page, least, tmp_path, monkeypatch):
     for refinement in refinements.values():
         assert refinement.result == RESULTS.successful
     if page == "docs/gradients.md":
+        assert namespace["losses"][-1] < namespace["losses"][0]
         assert 0 < float(namespace["value"]) < 0.01
         for leaf in jax.tree.leaves(namespace["gradient"]):
             assert 0 < float(abs(leaf).max()) < float("inf")

@@ -7,13 +7,15 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from synthetic import random_spectrum
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import learn_frame
-from learn_frame import LOSSES, Sampled, bank_of, like_meyer, load, save, summary, train
+import learning
+from learn_frame import LOSSES, Sampled, bank_of, like_meyer, load, save, summary
 
 from jaxsmw import Meyer, Spectrum
 
@@ -42,6 +44,25 @@ def pairs(monkeypatch):
         yield [pair for pair, _ in made], {pair.names: sampled for pair, sampled in made}
 
 
+def train(name, pairs, steps, seed, directory, prepared):
+    directory.mkdir(exist_ok=True)
+    loss = LOSSES[name]
+    trained = learning.train(
+        name,
+        loss,
+        like_meyer(),
+        pairs,
+        lambda pair: prepared[pair.names],
+        optax.adam(optax.cosine_decay_schedule(0.3, steps)),
+        steps=steps,
+        seed=seed,
+        directory=directory,
+        unit=lambda pair: loss(like_meyer(), pair),
+    )
+    assert not len(trained.watched)
+    return trained.model, trained.losses
+
+
 @pytest.mark.parametrize("name", LOSSES)
 def test_learning_lowers_the_loss(pairs, tmp_path, name):
     listed, prepared = pairs
@@ -63,7 +84,7 @@ class Stops(dict):
 
 
 def test_goes_on_where_it_was(pairs, tmp_path, monkeypatch):
-    monkeypatch.setattr(learn_frame, "_SAVED_EVERY", 2)
+    monkeypatch.setattr(learning, "_SAVED_EVERY", 2)
     listed, prepared = pairs
     frame, losses = train("labels", listed, 6, 1, tmp_path / "whole", prepared)
     with pytest.raises(KeyboardInterrupt):
@@ -90,5 +111,5 @@ def test_the_summary_says_whether_it_helped():
         {"Meyer": 10.0, "learned": 9.0},
         {"Meyer": 12.0, "learned": 12.5},
     ]
-    page = "\n".join(summary({"people": rows}, 5, 0))
+    page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
     assert "| people | 3 | 14.0 | 13.2 (−0.8 [" in page

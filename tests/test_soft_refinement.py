@@ -263,6 +263,28 @@ def test_the_layer_learns_features_that_match(pair):
     assert len(jax.tree.leaves(layer)) == 2
 
 
+def test_the_layer_is_a_function_for_models_of_any_library(pair):
+    x, y, _ = pair
+    layer = WaveletPreservationLayer(recovery_of_features=Softmax(10.0), recovery=Softmax(10.0), iterations=1)
+
+    def apply(parameters, inputs):
+        """As flax's modules have it: a pure function of nested dictionaries."""
+        return inputs @ parameters["params"]["kernel"]
+
+    def loss(parameters, layer):
+        outcome = layer(apply(parameters, x.eigenvectors), apply(parameters, y.eigenvectors), x, y)
+        return jnp.mean((outcome.soft_map.pull_back(y.eigenvectors) - x.eigenvectors) ** 2)
+
+    parameters = {"params": {"kernel": jnp.eye(K)[:, :5]}}
+    beside, slope = jax.jit(jax.value_and_grad(lambda p: loss(p, layer)))(parameters)
+    inside, slopes = jax.jit(jax.value_and_grad(lambda p: loss(p, p["layer"])))(parameters | {"layer": layer})
+    assert beside == pytest.approx(float(inside))
+    np.testing.assert_allclose(slope["params"]["kernel"], slopes["params"]["kernel"])
+    assert 0 < float(jnp.abs(slope["params"]["kernel"]).max()) < float("inf")
+    # As one of the parameters, what it is made of is learned, too.
+    assert 0 < abs(float(slopes["layer"].recovery.temperature)) < float("inf")
+
+
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
 def test_padding_changes_nothing(pair, recovery):
     x, y, start = pair
@@ -369,9 +391,8 @@ def test_functions_of_another_shape_are_refused(pair):
 
 def test_settings_that_do_not_exist(pair):
     x, y, start = pair
-    for options in ({"iterations": 0}, {"tolerance": 0.0}):
-        with pytest.raises(ValueError, match="at least 1 iteration and a positive tolerance"):
-            refine_softly(x, y, start, **options)
+    with pytest.raises(ValueError, match="positive tolerance, not 0"):
+        refine_softly(x, y, start, tolerance=0.0)
     with pytest.raises((TypeError, TypeCheckError)):
         refine_softly(x, y, start, recovery=0.1)
     with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
@@ -392,3 +413,42 @@ def test_settings_that_do_not_exist(pair):
     for recovery in (Softmax, NearestFew, Sinkhorn):
         with pytest.raises(ValueError, match=f"temperature of {recovery.__name__}"):
             recovery(temperature=0.0)
+
+
+@pytest.mark.parametrize("loop", [refine, refine_softly])
+def test_iterations_are_any_integer_and_nothing_else(pair, loop):
+    x, y, start = pair
+    two = loop(x, y, start, iterations=2)
+    for integer in (np.int64(2), np.uint8(2), jnp.asarray(2)):
+        np.testing.assert_array_equal(
+            loop(x, y, start, iterations=integer).functional_map, two.functional_map
+        )
+    for other in (2.0, np.float64(2), "2", None):
+        with pytest.raises(TypeError, match=f"{loop.__name__} needs a whole number of iterations"):
+            loop(x, y, start, iterations=other)
+    with pytest.raises(TypeError, match="known when it is compiled"):
+        jax.jit(lambda number: loop(x, y, start, iterations=number).functional_map)(2)
+    for few in (0, np.int64(-1)):
+        with pytest.raises(ValueError, match=f"{loop.__name__} needs at least 1 iteration, not {few}"):
+            loop(x, y, start, iterations=few)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", [Softmax, NearestFew, Sinkhorn])
+def test_the_coldest_temperatures_have_derivatives(pair, kind, dtype):
+    x, y, start = (jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, s) for s in pair)
+
+    def size(temperature, stretch):
+        stretched = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * stretch)
+        options = {"recovery": kind(temperature=temperature), "iterations": 2}
+        return jnp.sum(refine_softly(x, stretched, start, **options).functional_map ** 2)
+
+    differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
+    one = jnp.asarray(1, dtype)
+    # All of them nearest neighbours: the map does not change, but with what it is multiplied by.
+    value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
+    for temperature in (1e-12, 1e-30, 1e-37):
+        found, (in_temperature, in_stretch) = differentiate(jnp.asarray(temperature), one)
+        assert float(in_temperature) == 0
+        np.testing.assert_allclose(found, value, rtol=1e-5)
+        np.testing.assert_allclose(in_stretch, expected, rtol=1e-4)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
-from typing import Any
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
+
+Function = TypeVar("Function", bound=Callable)
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
@@ -49,3 +53,31 @@ def check_between(
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {limits}, not {host}")
+
+
+def counts_iterations(function: Function) -> Function:
+    """Let a compiled function take any integer as its `iterations`, and nothing else.
+
+    Outside of `equinox.filter_jit`, which would trace a NumPy integer.
+
+    **Raises:** (by the function returned) `TypeError` for what is no integer, or has no value yet as it is
+    traced; `ValueError` for fewer than one.
+    """
+
+    @functools.wraps(function, updated=())
+    def checked(*arguments: Any, **options: Any) -> Any:
+        if "iterations" in options:
+            given = options["iterations"]
+            try:
+                iterations = operator.index(given)
+            except TypeError:
+                raise TypeError(
+                    f"{function.__name__} needs a whole number of iterations that is known when it is "
+                    f"compiled, such as 3, not {given!r}"
+                ) from None
+            if iterations < 1:
+                raise ValueError(f"{function.__name__} needs at least 1 iteration, not {iterations}")
+            options["iterations"] = iterations
+        return function(*arguments, **options)
+
+    return checked  # type: ignore[return-value]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import all_finite, check_choice
+from jaxsmw.core.checks import all_finite, check_choice, counts_iterations
 from jaxsmw.core.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
@@ -233,6 +233,7 @@ class WaveletPreservation(Refiner):
         )
 
 
+@counts_iterations
 @eqx.filter_jit
 def refine(
     spectrum_x: Spectrum,
@@ -259,7 +260,7 @@ def refine(
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
     - `pointwise_map`: the initial T, one vertex of Y per vertex of X.
     - `refiner`: the method.
-    - `iterations`: how many functional maps, each followed by its pointwise map; at least 1.
+    - `iterations`: how many functional maps, each followed by its pointwise map; an integer, at least 1.
     - `samples_x`, `samples_y`: vertices of X and of Y to iterate on, both or neither; more of them than
       there are eigenvectors, evenly spread.
     - `stop_when_unchanged`: skip the remaining iterations once no match changes. (Under `vmap` all pairs
@@ -269,10 +270,8 @@ def refine(
     **Returns:** A `Refinement`. Nothing is raised for bad numbers: check its `result`.
 
     **Raises:** `ValueError` for fewer than one iteration, samples on one side only, an initial map that is
-    not one vertex per vertex of X, or spectra of two float types.
+    not one vertex per vertex of X, or spectra of two float types; `TypeError` if `iterations` is no integer.
     """
-    if iterations < 1:
-        raise ValueError(f"refine needs at least 1 iteration, not {iterations}")
     if (samples_x is None) != (samples_y is None):
         raise ValueError("samples are needed on both shapes or on neither")
     if pointwise_map.shape != spectrum_x.mask.shape:

@@ -282,7 +282,9 @@ def sinkhorn(
       gives and takes nothing, and changes nothing for others.
     - `temperature`: positive, in units of the area-weighted mean squared distance from queries to their
       nearest database rows; if that is less than `sqrt(eps)` times the mean square of the queries about
-      their mean, eps being the float type's, in units of this. The lower, the sharper, the more iterations.
+      their mean, eps being the float type's, in units of this. The lower, the sharper, the more iterations;
+      below the rounding errors of squared distances, eps times that mean square, nothing becomes sharper: it
+      is as if it were so much, and has no derivative but zero.
     - `iterations`: at most so many; those after convergence are skipped (not under `vmap`, where they do
       nothing).
     - `tolerance`: on `SoftMap.residual`.
@@ -365,7 +367,8 @@ def _prepared(
 
     Points about their centre, so that squares of coordinates do not drown distances; areas of sum 1; and the
     temperature in the points' squared unit, from one in units of the mean squared nearest distance. NaN if it
-    is not positive, as steps of training may make it: then so is what follows.
+    is not positive, as steps of training may make it: then so is what follows. Not below what squared
+    distances are rounded by: exponents would be nothing but rounding errors, and derivatives overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
@@ -373,7 +376,9 @@ def _prepared(
     found = nearest_neighbor(*lax.stop_gradient((queries, database)), database_mask=b > 0)
     spread = jnp.sum(a * jnp.sum((queries - product(a[None, :], queries)) ** 2, axis=1))
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
-    unit = jnp.maximum(unit, jnp.finfo(queries.dtype).eps ** 0.5 * spread)
+    eps = jnp.finfo(queries.dtype).eps
+    unit = jnp.maximum(unit, eps**0.5 * spread)
     unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
     relative = temperature.astype(queries.dtype)
-    return queries, database, a, b, jnp.where(relative > 0, relative, jnp.nan) * unit
+    absolute = jnp.maximum(relative * unit, eps * spread)
+    return queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import check_choice, counts_iterations
 from jaxsmw.core.refinement import WaveletPreservation, check_same_precision, checked, diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
@@ -39,6 +39,7 @@ class SoftRefinement(eqx.Module):
     change: Float[Array, ""]
 
 
+@counts_iterations
 @eqx.filter_jit
 def refine_softly(
     spectrum_x: Spectrum,
@@ -63,7 +64,8 @@ def refine_softly(
     - `refiner`: how functional maps follow from maps; its `search` is not used.
     - `recovery`: how soft maps follow from functional ones. Low temperatures are nearer to `jaxsmw.refine`,
       with larger and less telling derivatives.
-    - `iterations`: how many functional maps are made after the first; with `"implicit"` at most so many.
+    - `iterations`: how many functional maps are made after the first, at least 1; with `"implicit"` at most
+      so many.
     - `differentiation`: how derivatives are had.
         - `"unrolled"`: back through all iterations, as automatic differentiation does.
         - `"checkpointed"`: the same derivatives; what they need within an iteration is computed anew.
@@ -78,18 +80,15 @@ def refine_softly(
 
     **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, another
     `differentiation`, a start of another size, or spectra of two float types; `TypeError` for what is no
-    refiner or recovery. With `"implicit"`, derivatives (not the outcome) raise equinox's runtime error where
-    the outcome is a failure, or GMRES does not come to its tolerance.
+    refiner or recovery, or iterations that are no integer. With `"implicit"`, derivatives (not the outcome)
+    raise equinox's runtime error where the outcome is a failure, or GMRES does not come to its tolerance.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     for name, value, kind in (("refiner", refiner, WaveletPreservation), ("recovery", recovery, Recovery)):
         if not isinstance(value, kind):
             raise TypeError(f"the {name} is {value!r}, but a {kind.__name__} is needed")
-    if not isinstance(iterations, int) or iterations < 1 or not tolerance > 0:
-        raise ValueError(
-            f"refine_softly needs at least 1 iteration and a positive tolerance, not {iterations} and "
-            f"{tolerance}"
-        )
+    if not tolerance > 0:
+        raise ValueError(f"refine_softly needs a positive tolerance, not {tolerance}")
     m, n = spectrum_x.mask.shape[0], spectrum_y.mask.shape[0]
     matches: Array | None = None
     if isinstance(pointwise_map, SoftMap):
