@@ -205,7 +205,8 @@ def test_unused_vertices_on_either_side(pair):
     assert result[5] == result[10]
 
 
-def test_stages_are_logged(pair, caplog):
+def test_stages_are_logged(pair, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", True)  # which the command line ends
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
     assert caplog.messages == ["eigenbases", "initial map", "samples", "refinement"]
