@@ -47,7 +47,7 @@ nb_execution_timeout = 180
 
 # What docstrings and pages name of this library has to exist.
 nitpicky = True
-nitpick_ignore_regex = [(".*", r"(?!jaxsmw\b).*")]
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*")]
 default_role = "code"
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
@@ -81,14 +81,14 @@ class LinkCode(SphinxTransform):
             found = re.fullmatch(r"(jaxsmw\.)?((?:\w+\.)*\w+)(?:\(.*\))?", literal.astext(), re.DOTALL)
             if found is None or any(isinstance(parent, nodes.reference) for parent in _parents(literal)):
                 continue
-            full, dotted = bool(found[1]), found[2]
+            dotted = found[2]
             target = _PUBLIC.get(dotted.partition(".")[0])
-            if full and not _exists(dotted):
-                logger.warning("jaxsmw.%s names nothing", dotted, location=literal)
-            if target is None and full:
-                target = f"jaxsmw.{dotted}"
+            if found[1] and (target is None or not _exists(dotted)):
+                target = f"jaxsmw.{dotted}"  # looked for as it is, and missed if it is not there
             if target is not None:
-                link = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=target, refdoc=self.env.docname)
+                link = addnodes.pending_xref(
+                    "", refdomain="py", reftype="obj", reftarget=target, refdoc=self.env.docname
+                )
                 literal.replace_self(link)
                 link += literal
 

@@ -136,8 +136,9 @@ def draw_case(case: Case) -> str:
         expected = result.expected_error()
         cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
         if settings is case.failing:
-            errors = np.full(len(case.source.vertices), np.nan)
-            errors[error.source_vertices] = error.errors
+            # A vertex of which no truth is known takes the error of the nearest one.
+            known = KDTree(case.source.vertices[error.source_vertices])
+            errors = error.errors[known.query(case.source.vertices)[1]]
             panels = {"Error": errors, "Expected error": expected}
             figure = draw_correspondence(
                 case.source, case.target, result.pointwise_map, errors=panels, error_limit=0.25, up=case.up
@@ -181,7 +182,9 @@ def draw_tutorial() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="tutorial, or names of cases")
     options = parser.parse_args()

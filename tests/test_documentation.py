@@ -22,20 +22,31 @@ PAGES = sorted(
     for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
 )
 # How many refinements a page shows, at least.
-REFINEMENTS = {"README.md": 2, "docs/frames.md": 2, "docs/gradients.md": 1, "docs/how_to/comparing_frames.md": 1}
+REFINEMENTS = {
+    "README.md": 2,
+    "docs/frames.md": 2,
+    "docs/gradients.md": 1,
+    "docs/how_to/comparing_frames.md": 1,
+}
 
 
 def code_blocks(page: str, language: str = "python") -> list[str]:
     text = (ROOT / page).read_text("utf-8")
     fences = re.findall(r"^( *)```(.*)\n((?:.*\n)*?)\1```$", text, flags=re.MULTILINE)
-    return [re.sub(rf"^{indent}", "", block, flags=re.MULTILINE) for indent, kind, block in fences if kind == language]
+    return [
+        re.sub(rf"^{indent}", "", block, flags=re.MULTILINE)
+        for indent, kind, block in fences
+        if kind == language
+    ]
 
 
 def commands(page: str) -> list[str]:
     """What stands in lines of their own and begins with `jaxsmw` or `python`."""
     lines = "\n".join(code_blocks(page, "")) + "\n"
     lines += "\n".join(re.findall(r"^    (.+)$", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE))
-    return [re.sub(r"\s+#.*", "", line) for line in lines.splitlines() if line.startswith(("jaxsmw ", "python "))]
+    return [
+        re.sub(r"\s+#.*", "", line) for line in lines.splitlines() if line.startswith(("jaxsmw ", "python "))
+    ]
 
 
 def mentioned_commands(page: str) -> list[str]:
@@ -103,7 +114,9 @@ def test_mentioned_options_exist(page):
     for command in mentioned_commands(page):
         _, name, *arguments = shlex.split(command)
         for option in (argument.partition("=")[0] for argument in arguments if argument.startswith("--")):
-            assert option in subcommands[name]._option_string_actions, f"{page}: jaxsmw {name} has no {option}"
+            assert option in subcommands[name]._option_string_actions, (
+                f"{page}: jaxsmw {name} has no {option}"
+            )
 
 
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", *PAGES])
