@@ -140,9 +140,20 @@ def resolve_origin(
 def shorten_signature(
     app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str | None, returns: str | None
 ) -> tuple[str | None, str | None]:
-    """`Float[Array, 'n k']`, wherever jaxlib keeps its arrays."""
-    short = (text and text.replace("jaxlib._jax.Array", "Array") for text in (signature, returns))
+    """Defaults and names that Sphinx can take apart."""
+    short = (
+        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text.replace("<factory>", "..."))
+        for text in (signature, returns)
+    )
     return next(short), next(short)
+
+
+def shorten_arrays(app: Sphinx, domain: str, kind: str, content: addnodes.desc_content) -> None:
+    """`Float[Array, 'n k']`, wherever jaxlib keeps its arrays."""
+    for signature in content.parent.findall(addnodes.desc_signature):
+        for text in list(signature.findall(nodes.Text)):
+            if "jaxlib._jax." in text:
+                text.parent.replace(text, nodes.Text(text.replace("jaxlib._jax.", "")))
 
 
 def describe_results(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
@@ -185,5 +196,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("missing-reference", resolve_origin)
     app.connect("autodoc-process-signature", shorten_signature)
     app.connect("autodoc-process-docstring", describe_results)
+    app.connect("object-description-transform", shorten_arrays)
     app.connect("env-check-consistency", check_complete)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
