@@ -206,7 +206,7 @@ def refine_in_stages(
     best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
     least = np.inf
     for start in chain([pointwise_map], other_starts) if doubtful else ():
-        refinements, flawed, suspicious = through(doubtful, start)
+        refinements, flawed = through(doubtful, start)
         last = refinements[-1]
         if last.result != RESULTS.successful:
             if start is pointwise_map:
@@ -216,7 +216,7 @@ def refine_in_stages(
             best, least = (refinements, start), doubt(last, flawed)
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
-            if not suspicious:
+            if flawed < _SUSPICIOUS:
                 break
             logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
     refinements, start = best
@@ -242,21 +242,21 @@ def _through(
     meshes: tuple[Mesh, Mesh] | None,
     partial: bool,
     history: bool,
-) -> tuple[list[Refinement], float, bool]:
-    """The outcomes of stages, up to the first that fails; and what `_mended` says of the last that mends."""
+) -> tuple[list[Refinement], float]:
+    """The outcomes of stages, up to the first that fails; and the flaw of that of the last that mends."""
     refinements: list[Refinement] = []
-    flawed, suspicious = np.inf, True
+    flawed = np.inf
     for (spectrum_x, spectrum_y), stage in steps:
         run = partial_function(run_stage, spectrum_y=spectrum_y, samples=samples, history=history)
         refinement = run(stage, spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
             mend = partial_function(run, stage.mending)
-            refinement, flawed, suspicious = _mended(refinement, spectrum_x, mend, meshes, partial)
+            refinement, flawed = _mended(refinement, spectrum_x, mend, meshes, partial)
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
         pointwise_map = refinement.pointwise_map
-    return refinements, flawed, suspicious
+    return refinements, flawed
 
 
 def run_stage(
@@ -284,11 +284,10 @@ def _mended(
     mend: Callable[[Spectrum, Int[Array, " m"]], Refinement],
     meshes: tuple[Mesh, Mesh],
     partial: bool,
-) -> tuple[Refinement, float, bool]:
+) -> tuple[Refinement, float]:
     """The least flawed of a refinement and of others, each begun without what was faulty in the last.
 
-    And its flaw, and whether limbs may be swapped still. A small flaw that stays, whatever is left out, is
-    how bodies differ. Where nothing looks faulty, all have their say, as long as that helps.
+    And its flaw. Where nothing looks faulty, all have their say, as long as that helps.
     """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
@@ -304,21 +303,20 @@ def _mended(
         flaws.append(flaw(*meshes, found, eigenvectors, partial=partial))
         if flaws[-1] < least:
             best, least = refinement, flaws[-1]
-        stays = done == _ROUNDS and least > _HARDLY * flaws[0] and flaws[0] < _SMALL
-        if least < _SUSPICIOUS or stays:
-            return best, least, False
+        if least < _SUSPICIOUS:
+            break
         faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
         shares = [areas[:m][fault].sum() / areas.sum() for fault in faults]
         some = [fault for fault, share in zip(faults, shares, strict=True) if _NEGLIGIBLE < share < _TOO_MUCH]
-        helps = done == 0 or flaws[-1] < _HARDLY * flaws[-2]
+        helps = done == 0 or flaws[-1] < _LOWER * flaws[-2]
         if done == _ROUNDS or not (some or helps):
-            return best, least, bool(max(shares) > _NEGLIGIBLE)
+            break
         faulty = some[0] if some else np.zeros(m, bool)
         sound = jax.device_put(np.where(np.pad(faulty, (0, len(areas) - m)), 0, areas))
         refinement = mend(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
         if refinement.result != RESULTS.successful:
             break
-    return best, least, True
+    return best, least
 
 
 _ROUNDS = 4
@@ -326,9 +324,9 @@ _ROUNDS = 4
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# What is less flawed than this looks right (right maps with 50 eigenvectors have up to 3); with less than the
-# other it does if it stays so, but for a tenth.
-_SUSPICIOUS, _SMALL, _HARDLY = 2.5, 3.5, 0.9
+# What is less flawed than this looks right; right maps between bodies of different kinds have up to 3. What
+# does not lower a flaw to this share of it does not help.
+_SUSPICIOUS, _LOWER = 2.5, 0.9
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

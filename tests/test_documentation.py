@@ -1,7 +1,12 @@
-"""The code blocks of README and docs, run as a reader would, from top to bottom."""
+"""README and docs: code blocks run as a reader would, from top to bottom; commands are ones that exist.
 
+The notebooks run when the site is built (`.ci/run`), which also checks names and links within it.
+"""
+
+import argparse
 import ast
 import re
+import shlex
 from pathlib import Path
 
 import jax
@@ -9,19 +14,50 @@ import numpy as np
 import pytest
 
 from jaxsmw import RESULTS, GroundTruth, creature_pair, geodesic_error, write_mesh
+from jaxsmw.cli import _parser
 
 ROOT = Path(__file__).parents[1]
-
-
-def code_blocks(path: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
-
-
-@pytest.mark.parametrize(
-    ("page", "least"),
-    [("README.md", 2), ("docs/frames.md", 2), ("docs/gradients.md", 1), ("docs/exchange.md", 1)],
+# What people wrote, not what scripts did.
+PAGES = sorted(
+    path.relative_to(ROOT).as_posix()
+    for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
 )
-def test_code_blocks_run(page, least, tmp_path, monkeypatch):
+# How many refinements a page shows, at least.
+REFINEMENTS = {
+    "README.md": 2,
+    "docs/frames.md": 2,
+    "docs/exchange.md": 1,
+    "docs/gradients.md": 1,
+    "docs/how_to/comparing_frames.md": 1,
+}
+
+
+def code_blocks(page: str, language: str = "python") -> list[str]:
+    text = (ROOT / page).read_text("utf-8")
+    fences = re.findall(r"^( *)```(.*)\n((?:.*\n)*?)\1```$", text, flags=re.MULTILINE)
+    return [
+        re.sub(rf"^{indent}", "", block, flags=re.MULTILINE)
+        for indent, kind, block in fences
+        if kind == language
+    ]
+
+
+def commands(page: str) -> list[str]:
+    """What stands in lines of their own and begins with `jaxsmw` or `python`."""
+    lines = "\n".join(code_blocks(page, "")) + "\n"
+    lines += "\n".join(re.findall(r"^    (.+)$", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE))
+    return [
+        re.sub(r"\s+#.*", "", line) for line in lines.splitlines() if line.startswith(("jaxsmw ", "python "))
+    ]
+
+
+def mentioned_commands(page: str) -> list[str]:
+    """What is named in the text with some of its options, without all that it works on."""
+    return re.findall(r"`(jaxsmw [a-z]+ [^`]+)`", (ROOT / page).read_text("utf-8"))
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if code_blocks(page)])
+def test_code_blocks_run(page, tmp_path, monkeypatch):
     pair = creature_pair(vertices=700)
     write_mesh(tmp_path / "source.off", pair.source)
     write_mesh(tmp_path / "target.ply", pair.target)
@@ -29,15 +65,13 @@ def test_code_blocks_run(page, least, tmp_path, monkeypatch):
     # Readers use JAX as it comes, without the strictness of these tests.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"), jax.enable_x64(False):
         namespace: dict[str, object] = {}
-        blocks = code_blocks(ROOT / page)
-        assert len(blocks) >= 2
         outcomes = []
-        for block in blocks:
+        for block in code_blocks(page):
             for statement in ast.parse(block).body:
                 exec(compile(ast.Module([statement], []), page, "exec"), namespace)
                 outcomes.append(namespace.get("refinement"))
     refinements = {id(outcome): outcome for outcome in outcomes if outcome is not None}
-    assert len(refinements) >= least
+    assert len(refinements) >= REFINEMENTS.get(page, 0)
     for refinement in refinements.values():
         assert refinement.result == RESULTS.successful
     if page == "docs/gradients.md":
@@ -52,3 +86,51 @@ def test_code_blocks_run(page, least, tmp_path, monkeypatch):
         assert error.mean < 0.1
     if page == "docs/frames.md":
         assert namespace["result"] == RESULTS.successful
+    if page == "docs/tutorial.md":
+        assert namespace["error"].mean < 0.05 < namespace["start"].mean
+    if page == "docs/evaluation.md":
+        assert namespace["perfect"].mean < namespace["nearest"].mean < 0.05
+    if page == "docs/how_to/many_pairs.md":
+        assert set(namespace["maps"]) == set(namespace["pairs"])
+
+
+def test_every_page_with_code_is_found():
+    assert {"README.md", "docs/index.md", "docs/tutorial.md", "docs/how_to/cluster.md"} <= set(PAGES)
+    assert sum(len(code_blocks(page)) for page in PAGES) > 30
+    assert sum(len(commands(page)) for page in PAGES) > 25
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
+def test_commands_are_understood(page, monkeypatch):
+    def refuse(parser: argparse.ArgumentParser, message: str) -> None:
+        raise ValueError(f"{page}: {parser.prog}: {message}")
+
+    monkeypatch.setattr("jaxsmw.cli._Parser.error", refuse)
+    for command in commands(page):
+        program, *arguments = shlex.split(command)
+        if program == "jaxsmw":
+            _parser().parse_args(arguments)
+        elif arguments[0].startswith("scripts/"):
+            source = (ROOT / arguments[0]).read_text("utf-8")
+            for option in re.findall(r"--[\w-]+", command):
+                assert f'"{option}"' in source, f"{page}: {arguments[0]} has no {option}"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if mentioned_commands(page)])
+def test_mentioned_options_exist(page):
+    (subcommands,) = (a.choices for a in _parser()._actions if isinstance(a, argparse._SubParsersAction))
+    for command in mentioned_commands(page):
+        _, name, *arguments = shlex.split(command)
+        for option in (argument.partition("=")[0] for argument in arguments if argument.startswith("--")):
+            assert option in subcommands[name]._option_string_actions, (
+                f"{page}: jaxsmw {name} has no {option}"
+            )
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", *PAGES])
+def test_links_lead_to_files(page):
+    text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        path = target.partition("#")[0]
+        if path and not re.match(r"\w+:", path):
+            assert ((ROOT / page).parent / path).exists(), f"{page} leads to {target}, which is not there"

@@ -5,10 +5,11 @@ import pytest
 from scipy.spatial import KDTree
 from synthetic import body_with_arms, bumpy_mesh
 
-from jaxsmw.geometry import faults
+from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.faults import expected_error, flaw, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.sampling import spread_edges
 
 
 @pytest.fixture(scope="module")
@@ -78,15 +79,15 @@ def test_dense_meshes_are_no_rougher_than_others(body, monkeypatch):
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
     near = stretch(mesh, mesh, rough)
-    faults._neighbors.cache_clear()
-    monkeypatch.setattr(faults, "_DENSE", 1000)
-    monkeypatch.setattr(faults, "_SPREAD", 500)
+    spread_edges.cache_clear()
+    monkeypatch.setattr(sampling, "_DENSE", 1000)
+    monkeypatch.setattr(sampling, "_SPREAD", 500)
     far = stretch(mesh, mesh, rough)
     assert near > 2 and far - 1 < (near - 1) / 2
     assert stretch(mesh, mesh, swapped) > 2
     off = torn_off(mesh, mesh, swapped)
     assert off[arms].mean() > 0.8 and off[~arms].mean() < 0.1
-    faults._neighbors.cache_clear()
+    spread_edges.cache_clear()
 
 
 def test_of_a_perfect_map_no_error_is_expected(body, spectrum):

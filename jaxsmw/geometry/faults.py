@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, connected_pieces, units_of_length
-from jaxsmw.geometry.sampling import spread_samples
+from jaxsmw.geometry.sampling import spread_edges
 
 # Neighbours whose matches are farther apart than this, in square roots of the area, and than so many times
 # their own distance, are torn apart. Matches of neighbours are 0.03 apart on bodies of 5000 vertices.
@@ -17,9 +15,6 @@ _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
 _WEIGHT_OF_REVERSED = 4
-# Meshes of more vertices are looked at on so many evenly spread ones: between neighbours that are much nearer
-# to each other than maps are accurate, every map is rough.
-_DENSE, _SPREAD = 15_000, 5000
 # What `expected_error` thinks of a piece that is misplaced as a whole, in square roots of the piece's area.
 _MISPLACED = 0.5
 # The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
@@ -34,7 +29,7 @@ def stretch(
     In Euclidean distance, on surfaces scaled to area 1, or if `partial` by one factor. About 1 for the true
     map between poses of one body; maps that tear or scatter have more.
     """
-    edges, _ = _neighbors(mesh_x)
+    edges, _ = spread_edges(mesh_x)
     before, after = _lengths(edges, mesh_x, mesh_y, pointwise_map, partial)
     return float(np.sum(after**2) / np.sum(before**2))
 
@@ -64,7 +59,7 @@ def torn_off(
 
     Limbs that are swapped as a whole come off so.
     """
-    edges, nearest = _neighbors(mesh_x)
+    edges, nearest = spread_edges(mesh_x)
     before, after = _lengths(edges, mesh_x, mesh_y, pointwise_map, partial)
     kept = edges[after < np.maximum(_TORN, _STRETCHED * before)]
     _, piece = connected_pieces(kept, len(mesh_x.vertices))
@@ -142,16 +137,6 @@ def expected_error(
     number, piece = connected_pieces(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(piece, areas, number))[piece]
     return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced * sizes
-
-
-@lru_cache(maxsize=1)
-def _neighbors(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
-    """Pairs of neighbours not too near to each other; and which vertex of these each is nearest to."""
-    n = len(mesh.vertices)
-    if n <= _DENSE:
-        return mesh.edges, np.arange(n)
-    samples = spread_samples(mesh, _SPREAD)
-    return samples.vertices[samples.neighbors(mesh)], samples.vertices[samples.nearest]
 
 
 def _lengths(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +56,6 @@ class Samples(NamedTuple):
     vertices: Int64[np.ndarray, " s"]
     nearest: Int64[np.ndarray, " n"]
 
-    def neighbors(self, mesh: Mesh) -> Int64[np.ndarray, "p 2"]:
-        """Pairs of samples, positions in `vertices`, whose surroundings an edge joins."""
-        pairs = np.unique(np.sort(self.nearest[mesh.edges], axis=1), axis=0)
-        return pairs[pairs[:, 0] != pairs[:, 1]]
-
 
 def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     """About so many vertices, spread evenly over the area however dense the mesh is where.
@@ -88,6 +84,24 @@ def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     vertices = candidates[independent_vertices(near, 1)]
     _, nearest = KDTree(positions[vertices]).query(positions)
     return Samples(vertices, nearest)
+
+
+@lru_cache(maxsize=2)
+def spread_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
+    """Pairs of neighbours not too near to each other; and which vertex of these each is nearest to.
+
+    The edges of the mesh, or if it has more than 15 000 vertices those between 5000 evenly spread ones.
+    """
+    n = len(mesh.vertices)
+    if n <= _DENSE:
+        return mesh.edges, np.arange(n)
+    samples = spread_samples(mesh, _SPREAD)
+    pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
+    return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
+
+
+# Between neighbours that are much nearer to each other than maps are accurate, every map is rough.
+_DENSE, _SPREAD = 15_000, 5000
 
 
 def independent_vertices(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:

@@ -1,0 +1,201 @@
+"""The documentation site. Built by `sphinx-build -W --keep-going -b html docs build/site`.
+
+Formulas become MathML here, which browsers draw themselves: no script, no fonts, nothing from the network.
+"""
+
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.transforms import SphinxTransform
+from sphinx.util import logging
+from sphinx.writers.html5 import HTML5Translator
+
+import jaxsmw
+
+logger = logging.getLogger(__name__)
+
+project = "jaxsmw"
+author = "The jaxsmw authors"
+release = version = jaxsmw.__version__
+html_title = f"jaxsmw {release}"
+html_theme = "furo"
+html_static_path = ["style.css"]
+html_css_files = ["style.css"]
+html_copy_source = False
+html_show_copyright = False
+html_show_sphinx = False
+exclude_patterns = ["**/.ipynb_checkpoints"]
+
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+# So links to headings lead where they do on GitHub.
+myst_heading_anchors = 3
+html_math_renderer = "mathml"
+
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 180
+
+# What docstrings and pages name of this library has to exist.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*")]
+default_role = "code"
+autodoc_class_signature = "mixed"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {"ArrayLike": "ArrayLike"}
+add_module_names = False
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88
+toc_object_entries_show_parents = "hide"
+
+# Where each public name comes from, and the name under which it is documented.
+_PUBLIC = {name: f"jaxsmw.{name}" for name in jaxsmw.__all__}
+_ORIGINS = {
+    f"{value.__module__}.{value.__qualname__}": public
+    for public, value in ((public, getattr(jaxsmw, name)) for name, public in _PUBLIC.items())
+    if hasattr(value, "__qualname__")
+}
+
+
+class LinkCode(SphinxTransform):
+    """Inline code that is a public name, such as `Meyer` or `Meyer(8)`, leads to its place in the reference.
+
+    What begins with `jaxsmw.` has to name something.
+    """
+
+    default_priority = 600
+
+    def apply(self, **_: Any) -> None:
+        for literal in list(self.document.findall(nodes.literal)):
+            found = re.fullmatch(r"(jaxsmw\.)?((?:\w+\.)*\w+)(?:\(.*\))?", literal.astext(), re.DOTALL)
+            if found is None or any(isinstance(parent, nodes.reference) for parent in _parents(literal)):
+                continue
+            dotted = found[2]
+            target = _PUBLIC.get(dotted.partition(".")[0])
+            if found[1] and (target is None or not _exists(dotted)):
+                target = f"jaxsmw.{dotted}"  # looked for as it is, and missed if it is not there
+            if target is not None:
+                link = addnodes.pending_xref(
+                    "", refdomain="py", reftype="obj", reftarget=target, refdoc=self.env.docname
+                )
+                literal.replace_self(link)
+                link += literal
+
+
+def _parents(node: nodes.Node) -> Iterator[nodes.Node]:
+    while node.parent is not None:
+        node = node.parent
+        yield node
+
+
+def _exists(dotted: str) -> bool:
+    """Whether `jaxsmw.dotted` is a module, or something in one, to any depth."""
+    value: Any = jaxsmw
+    path = "jaxsmw"
+    for name in dotted.split("."):
+        path += f".{name}"
+        if hasattr(value, name):
+            value = getattr(value, name)
+        elif isinstance(value, ModuleType) and find_spec(path):
+            value = import_module(path)
+        else:
+            return name in getattr(value, "__dataclass_fields__", ())
+    return True
+
+
+def name_tables(app: Sphinx, document: str, content: list[str]) -> None:
+    """Tables of several runs on one data set bear its name: here each bears its run's, too."""
+    if re.fullmatch(r"results/.*/summary", document):
+        run = document.removeprefix("results/").removesuffix("/summary")
+        content[0] = content[0].replace(content[0].partition("\n")[0], f"# {run}", 1)
+
+
+def resolve_origin(
+    app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Element
+) -> nodes.Node | None:
+    """What an annotation names by the module it is defined in is documented under its public name."""
+    if node.get("refdomain") != "py":
+        return None
+    target = node["reftarget"]
+    public = _ORIGINS.get(target)
+    if public is None:
+        # A module or a private helper that a page mentions: it exists, and has no place of its own.
+        named = node.get("reftype") == "obj" and target.startswith("jaxsmw.")
+        return content if named and _exists(target.removeprefix("jaxsmw.")) else None
+    domain = env.domains.python_domain
+    return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+
+
+def shorten_signature(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Defaults and names that Sphinx can take apart."""
+    short = (
+        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text.replace("<factory>", "..."))
+        for text in (signature, returns)
+    )
+    return next(short), next(short)
+
+
+def shorten_arrays(app: Sphinx, domain: str, kind: str, content: addnodes.desc_content) -> None:
+    """`Float[Array, 'n k']`, wherever jaxlib keeps its arrays."""
+    for signature in content.parent.findall(addnodes.desc_signature):
+        for text in list(signature.findall(nodes.Text)):
+            if "jaxlib._jax." in text:
+                text.parent.replace(text, nodes.Text(text.replace("jaxlib._jax.", "")))
+
+
+def describe_results(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """The members of `RESULTS` are values, whose meaning is their sentence."""
+    if name == "jaxsmw.RESULTS":
+        members = (member for member in vars(value) if not member.startswith("_"))
+        lines += [f"- ``{member}``: {value[getattr(value, member)]}" for member in members] + [""]
+
+
+def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
+    """Every public name has to stand in the reference."""
+    missing = sorted(set(_PUBLIC.values()) - set(env.domains.python_domain.objects))
+    if missing:
+        logger.warning("the reference lacks %s: add them to a page in docs/api", ", ".join(missing))
+
+
+def to_mathml(node: nodes.math | nodes.math_block, display: str) -> str:
+    mathml = convert(node.astext(), display=display)
+    # What the converter does not know comes out as it is.
+    if re.search(r"<m[ion][^>]*>(\\|&<|&amp;|&#x0002A;)", mathml):
+        logger.warning("latex2mathml does not know all of this formula: %s", node.astext(), location=node)
+    return mathml
+
+
+def visit_math(translator: HTML5Translator, node: nodes.math) -> None:
+    translator.body.append(to_mathml(node, "inline"))
+    raise nodes.SkipNode
+
+
+def visit_displayed_math(translator: HTML5Translator, node: nodes.math_block) -> None:
+    translator.body.append(translator.starttag(node, "div", CLASS="math"))
+    translator.body.append(to_mathml(node, "block") + "</div>\n")
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_displayed_math, None))
+    app.add_transform(LinkCode)
+    app.connect("source-read", name_tables)
+    app.connect("missing-reference", resolve_origin)
+    app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("autodoc-process-docstring", describe_results)
+    app.connect("object-description-transform", shorten_arrays)
+    app.connect("env-check-consistency", check_complete)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

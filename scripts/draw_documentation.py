@@ -1,0 +1,202 @@
+"""Draw the pictures of docs/tutorial.md and docs/failures.md, and print the figures of the latter.
+
+    pip install -e ".[report]"
+    python scripts/draw_documentation.py [DATA_DIRECTORY]
+
+The tutorial's pictures are what its own code draws. The failure cases are procedural; where DATA_DIRECTORY
+is given, as scripts/compare_frames.py takes it, two more are real: SHREC'16 topology and TOSCA's pairs of
+different classes. Takes some minutes.
+"""
+
+import argparse
+import io
+import os
+import re
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import igl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial.transform import Rotation
+
+import jaxsmw
+from jaxsmw.files import atomic_write
+from jaxsmw.report.figures import draw_correspondence
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PICTURES = DOCS / "pictures"
+# With dithering enough for bodies in smooth colours, in a third of the space.
+COLORS = 256
+
+
+class Case(NamedTuple):
+    """A pair, how it is matched so that it fails, and how it should have been matched."""
+
+    name: str
+    source: jaxsmw.Mesh
+    target: jaxsmw.Mesh
+    truth: jaxsmw.GroundTruth
+    failing: dict[str, Any]
+    cure: dict[str, Any] | None
+    up: str | None = "y"
+
+
+def procedural_cases() -> Iterator[Case]:
+    """Whoever has the library has these."""
+    pair = jaxsmw.creature_pair("quadruped", vertices=3000)
+    truth = jaxsmw.GroundTruth.of_all_vertices(pair.truth)
+    yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
+
+    (source, at_source), (target, at_target) = star(3000, 0), star(2900, 1)
+    truth = jaxsmw.GroundTruth.of_all_vertices(KDTree(at_target).query(at_source)[1].astype(np.int64))
+    yield Case("symmetric", source, target, truth, {}, {"init": landmarks_on_arms(at_source, at_target)}, "z")
+
+    part, truth = front_of(pair)
+    yield Case("part", part, pair.target, truth, {}, {"partial": True})
+
+    fine = jaxsmw.creature_pair("quadruped", vertices=4000)
+    coarse, truth = coarser(fine, 1000)
+    yield Case("coarse", fine.source, coarse, truth, {}, {"preset": "accurate"})
+
+
+def real_cases(data: Path) -> Iterator[Case]:
+    """Two pairs that have no procedural likeness."""
+    for name, directory, names, cure in (
+        ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
+        ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
+    ):
+        (pair,) = (pair for pair in jaxsmw.open_data_set(data / directory).pairs if pair.names == names)
+        source, target = jaxsmw.read_mesh(pair.source_file), jaxsmw.read_mesh(pair.target_file)
+        yield Case(name, source, target, pair.ground_truth(source, target), {}, cure, None)
+
+
+def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
+    """A body with five equal arms that hang down, and where on a sphere its vertices come from."""
+    index = np.arange(vertices) + 0.5
+    polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
+    sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    random = np.random.default_rng(seed)
+    sphere = random.permutation(Rotation.from_quat(random.normal(size=4)).apply(sphere))
+    angles = 2 * np.pi * np.arange(5) / 5
+    arms = np.stack([np.cos(angles), np.sin(angles), np.zeros(5)], axis=1)
+    positions = sphere * (0.4 + 1.2 * np.exp(12 * (sphere @ arms.T - 1)).sum(axis=1, keepdims=True))
+    positions[:, 2] -= 0.3 * (positions[:, :2] ** 2).sum(axis=1)
+    faces = ConvexHull(sphere).simplices.astype(np.int64)
+    inside_out = np.linalg.det(sphere[faces]) < 0
+    faces[inside_out] = faces[inside_out][:, ::-1]
+    return jaxsmw.make_mesh(positions, faces, name="star"), sphere
+
+
+def landmarks_on_arms(
+    at_source: Float[np.ndarray, "m 3"], at_target: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "2 2"]:
+    """The tips of two arms next to each other."""
+    tips = np.array([[1, 0, 0], [np.cos(2 * np.pi / 5), np.sin(2 * np.pi / 5), 0]])
+    return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
+
+
+def front_of(pair: jaxsmw.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.GroundTruth]:
+    """The front half of the source, without the vertices of the rest."""
+    whole, ahead = pair.source, pair.source.vertices[:, 2]
+    faces = whole.faces[(ahead[whole.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
+    used, numbers = np.unique(faces, return_inverse=True)
+    truth = jaxsmw.SurfacePoints(pair.truth.faces[used], pair.truth.weights[used])
+    part = jaxsmw.make_mesh(whole.vertices[used], numbers.reshape(-1, 3), name=f"front of {whole.name}")
+    return part, jaxsmw.GroundTruth.of_all_vertices(truth)
+
+
+def coarser(pair: jaxsmw.CreaturePair, vertices: int) -> tuple[jaxsmw.Mesh, jaxsmw.GroundTruth]:
+    """The target with few vertices, and for each vertex of the source the nearest of them."""
+    positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
+    coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
+    nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
+    return coarse, jaxsmw.GroundTruth.of_all_vertices(nearest.astype(np.int64))
+
+
+def draw_case(case: Case) -> str:
+    """Write a case's picture; a row of the table."""
+    cells = []
+    for settings in (case.failing, case.cure):
+        if settings is None:
+            cells += ["", ""]
+            continue
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            result = jaxsmw.match(case.source, case.target, **{"preset": "paper"} | settings)
+        for warning in told:
+            print(f"{case.name}, {settings}: {warning.message}")
+        error = jaxsmw.geodesic_error(case.target, result.pointwise_map, case.truth)
+        expected = result.expected_error()
+        cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
+        if settings is case.failing:
+            # A vertex of which no truth is known takes the error of the nearest one.
+            known = KDTree(case.source.vertices[error.source_vertices])
+            errors = error.errors[known.query(case.source.vertices)[1]]
+            panels = {"Error": errors, "Expected error": expected}
+            figure = draw_correspondence(
+                case.source, case.target, result.pointwise_map, errors=panels, error_limit=0.25, up=case.up
+            )
+            save_small(PICTURES / f"failure_{case.name}.png", figure)
+    return f"| {case.name} | {' | '.join(cells)} |"
+
+
+def save_small(path: Path, figure: Figure | Path) -> None:
+    """Write a picture, from a figure or a larger file, at most 1200 pixels wide and of few colours."""
+    if isinstance(figure, Path):
+        image = Image.open(figure)
+    else:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=200)
+        image = Image.open(buffer)
+    image = image.convert("RGB")
+    if image.width > 1200:
+        image = image.resize((1200, round(image.height * 1200 / image.width)), Image.Resampling.LANCZOS)
+    few = image.quantize(palette=image.quantize(COLORS), dither=Image.Dither.FLOYDSTEINBERG)
+    palette = np.array(few.getpalette()).reshape(-1, 3)
+    palette[(palette >= 248).all(axis=1)] = 255  # the background is white, not nearly so
+    few.putpalette(palette.ravel().tolist())
+    with atomic_write(path) as temporary:
+        few.save(temporary, format="png", optimize=True)
+
+
+def draw_tutorial() -> None:
+    """Run the tutorial's code, and keep the pictures that it shows."""
+    page = (DOCS / "tutorial.md").read_text("utf-8")
+    code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL))
+    began = Path.cwd()
+    with tempfile.TemporaryDirectory() as directory:
+        os.chdir(directory)
+        try:
+            exec(compile(code, "docs/tutorial.md", "exec"), {})
+        finally:
+            os.chdir(began)
+        for name in re.findall(r"\]\(pictures/(\w+\.png)\)", page):
+            save_small(PICTURES / name, Path(directory) / name)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="tutorial, or names of cases")
+    options = parser.parse_args()
+    PICTURES.mkdir(exist_ok=True)
+    if not options.only or "tutorial" in options.only:
+        draw_tutorial()
+    cases = [*procedural_cases(), *(real_cases(options.data) if options.data else ())]
+    print("| case | error | expected | error, cured | expected, cured |\n| --- | --- | --- | --- | --- |")
+    for case in cases:
+        if not options.only or case.name in options.only:
+            print(draw_case(case), flush=True)
+
+
+if __name__ == "__main__":
+    main()
