@@ -216,7 +216,7 @@ def refine_in_stages(
             best, least = (refinements, start), doubt(last, flawed)
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
-            if flawed < _SUSPICIOUS:
+            if flawed < _DOUBTFUL:
                 break
             logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
     refinements, start = best
@@ -324,9 +324,10 @@ _ROUNDS = 4
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# What is less flawed than this looks right; right maps between bodies of different kinds have up to 3. What
-# does not lower a flaw to this share of it does not help.
-_SUSPICIOUS, _LOWER = 2.5, 0.9
+# What is more flawed than the first is mended, and than the second begun elsewhere: right maps between poses
+# of one body have up to 2, between bodies of different kinds up to 2.9. What leaves more than this share of a
+# flaw does not help.
+_SUSPICIOUS, _DOUBTFUL, _LOWER = 2.5, 2.9, 0.9
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import permutations
 from typing import NamedTuple
 
@@ -13,9 +14,9 @@ from scipy.sparse.csgraph import dijkstra
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import spread_edges, spread_samples
 
-# Ends are looked for among so many evenly spread points; no two are nearer to each other than this, in square
+# So many evenly spread points stand for the surface; no two ends are nearer to each other than this, in square
 # roots of the area; and there are too many ways to pair more than so many.
-_CANDIDATES, _APART, _MOST = 200, 0.35, 6
+_SPREAD, _APART, _MOST = 200, 0.35, 6
 
 
 class Extremities(NamedTuple):
@@ -40,17 +41,25 @@ def extremities(mesh: Mesh) -> Extremities:
     2001. Distances are those along edges, some per cent too long everywhere.
     """
     edges, nearest = spread_edges(mesh)
-    nodes, ends_of_edges = np.unique(edges, return_inverse=True)
-    samples = np.intersect1d(nodes, nearest[spread_samples(mesh, _CANDIDATES).vertices])
+    nodes, tails_and_heads = np.unique(edges, return_inverse=True)
+    tails, heads = tails_and_heads.reshape(edges.shape).T
     lengths = np.linalg.norm(np.diff(mesh.vertices[edges], axis=1)[:, 0], axis=1) / mesh.area**0.5
-    graph = sp.csr_array((lengths, ends_of_edges.reshape(edges.shape).T), (len(nodes), len(nodes)))
-    rows = np.searchsorted(nodes, samples)
-    distances = dijkstra(graph, directed=False, indices=rows)[:, rows]
-    remoteness = np.sqrt(np.mean(np.where(np.isfinite(distances), distances, 0) ** 2, axis=1))
-    ends = np.flatnonzero(remoteness >= np.where(distances < _APART, remoteness, 0).max(axis=1))
+    graph = sp.csr_array((lengths, (tails, heads)), (len(nodes), len(nodes)))
+    search = partial(dijkstra, graph, directed=False)
+
+    samples = np.intersect1d(nodes, nearest[spread_samples(mesh, _SPREAD).vertices])
+    distances = search(indices=np.searchsorted(nodes, samples))
+    remoteness = np.sqrt(np.mean(np.where(np.isfinite(distances), distances, 0) ** 2, axis=0))
+    highest = np.ones(len(nodes), bool)
+    highest[tails[remoteness[tails] < remoteness[heads]]] = False
+    highest[heads[remoteness[heads] < remoteness[tails]]] = False
+    candidates = np.flatnonzero(highest)
+    around = search(indices=candidates, limit=_APART)
+    ends = candidates[remoteness[candidates] >= np.where(around < np.inf, remoteness, 0).max(axis=1)]
     ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST]
+    distances = search(indices=ends)[:, ends]
     unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
-    return Extremities(samples[ends], distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
+    return Extremities(nodes[ends], distances / unit, remoteness[ends] / unit)
 
 
 def likely_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
