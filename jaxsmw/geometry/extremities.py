@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import dijkstra
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import spread_edges, spread_samples
 
-# So many evenly spread points stand for the surface; no two ends are nearer to each other than this, in square
-# roots of the area; and there are too many ways to pair more than so many.
+# So many evenly spread points stand for the surface; no two ends are nearer to each other than this, in
+# square roots of the area; and there are too many ways to pair more than so many.
 _SPREAD, _APART, _MOST = 200, 0.35, 6
 
 
