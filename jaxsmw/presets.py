@@ -120,13 +120,12 @@ def _regression(levels: tuple[int, ...], mending: Stage | None = None) -> Stage:
 
 
 Preset = Literal["fast", "paper", "accurate"]
-_PAPER = (Stage(),)
 _COARSE_TO_FINE = (20, 20, 26, 26, 35, 35, 50, 50)
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (Stage(number_of_samples=500),),
-    "paper": _PAPER,
+    "paper": (Stage(),),
     "accurate": (
-        *_PAPER,
+        Stage(iterations=2),
         _regression(_COARSE_TO_FINE, mending=_regression((10, 10, 14, 14, *_COARSE_TO_FINE))),
         _regression((100, 141, 200)),
     ),
