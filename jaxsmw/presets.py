@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int, Int64
 
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression, Regression
@@ -38,8 +38,9 @@ class Stage:
     - `iterations`: how many; at least 1.
     - `number_of_samples`: take turns on so many samples of each shape, and search all vertices at the end.
     - `stop_when_unchanged`: see `jaxsmw.refine`.
-    - `mending`: what is done, up to four times, where the outcome looks as if limbs were swapped, each time
-      without their matches: see `refine_in_stages`. Of the same eigenvectors and descriptors.
+    - `mending`: what is done at last where the outcome looks as if limbs were swapped, and this stage done
+      again without their matches does not help: see `refine_in_stages`. Of the same eigenvectors and
+      descriptors.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -183,9 +184,10 @@ def refine_in_stages(
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. A stage that is to mend this looks for both
-    (`jaxsmw.geometry.faults`), by turns, and mends from a functional map that the faulty part had no say in.
-    The least flawed map it came by is its outcome. Where that does not help, the stages so far are gone
-    through from other starts, too. Maps that look right are let be.
+    (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
+    faulty part had no say in, and at last through those of its `mending`. The least flawed map it came by is
+    its outcome. Where that does not help, the stages so far are gone through from other starts, too. Maps
+    that look right are let be.
 
     **Arguments:**
 
@@ -205,7 +207,7 @@ def refine_in_stages(
     best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
     least = np.inf
     for start in chain([pointwise_map], other_starts) if doubtful else ():
-        refinements, flawed = through(doubtful, start)
+        refinements, flawed, suspicious = through(doubtful, start)
         last = refinements[-1]
         if last.result != RESULTS.successful:
             if start is pointwise_map:
@@ -215,7 +217,7 @@ def refine_in_stages(
             best, least = (refinements, start), doubt(last, flawed)
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
-            if flawed < _DOUBTFUL:
+            if not suspicious:
                 break
             logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
     refinements, start = best
@@ -241,21 +243,20 @@ def _through(
     meshes: tuple[Mesh, Mesh] | None,
     partial: bool,
     history: bool,
-) -> tuple[list[Refinement], float]:
-    """The outcomes of stages, up to the first that fails; and the flaw of that of the last that mends."""
+) -> tuple[list[Refinement], float, bool]:
+    """The outcomes of stages, up to the first that fails; and what `_mended` says of the last that mends."""
     refinements: list[Refinement] = []
-    flawed = np.inf
+    flawed, doubtful = np.inf, True
     for (spectrum_x, spectrum_y), stage in steps:
         run = partial_function(run_stage, spectrum_y=spectrum_y, samples=samples, history=history)
         refinement = run(stage, spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            mend = partial_function(run, stage.mending)
-            refinement, flawed = _mended(refinement, spectrum_x, mend, meshes, partial)
+            refinement, flawed, doubtful = _mended(refinement, spectrum_x, stage, run, meshes, partial)
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
         pointwise_map = refinement.pointwise_map
-    return refinements, flawed
+    return refinements, flawed, doubtful
 
 
 def run_stage(
@@ -280,42 +281,52 @@ def run_stage(
 def _mended(
     refinement: Refinement,
     spectrum_x: Spectrum,
-    mend: Callable[[Spectrum, Int[Array, " m"]], Refinement],
+    stage: Stage,
+    run: Callable[[Stage, Spectrum, Int[Array, " m"]], Refinement],
     meshes: tuple[Mesh, Mesh],
     partial: bool,
-) -> tuple[Refinement, float]:
+) -> tuple[Refinement, float, bool]:
     """The least flawed of a refinement and of others, each begun without what was faulty in the last.
 
-    And its flaw. Where nothing looks faulty, all have their say, as long as that helps.
+    And its flaw, and whether limbs may be swapped still. At last, where that was not enough, the least flawed
+    one is mended with all.
     """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
+
+    def matches(refinement: Refinement) -> Int64[np.ndarray, " m"]:
+        return np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
+
+    def faults(refinement: Refinement) -> list[Bool[np.ndarray, " m"]]:
+        found = matches(refinement)
+        reversed_ = reversed_orientation(*meshes, found, eigenvectors, partial=partial)
+        both = reversed_, torn_off(*meshes, found, partial=partial)
+        return [fault for fault in both if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH]
+
     best, least = refinement, np.inf
-    flaws: list[float] = []
-    criteria = (
-        lambda found: reversed_orientation(*meshes, found, eigenvectors, partial=partial),
-        lambda found: torn_off(*meshes, found, partial=partial),
-    )
     for done in range(_ROUNDS + 1):
-        found = np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
-        flaws.append(flaw(*meshes, found, eigenvectors, partial=partial))
-        if flaws[-1] < least:
-            best, least = refinement, flaws[-1]
+        flawed = flaw(*meshes, matches(refinement), eigenvectors, partial=partial)
+        if flawed < least:
+            best, least = refinement, flawed
         if least < _SUSPICIOUS:
+            return best, least, False
+        some = faults(refinement)
+        if done == _ROUNDS or not some:
             break
-        faults = [criterion(found) for criterion in criteria[done % 2 :] + criteria[: done % 2]]
-        shares = [areas[:m][fault].sum() / areas.sum() for fault in faults]
-        some = [fault for fault, share in zip(faults, shares, strict=True) if _NEGLIGIBLE < share < _TOO_MUCH]
-        helps = done == 0 or flaws[-1] < _LOWER * flaws[-2]
-        if done == _ROUNDS or not (some or helps):
-            break
-        faulty = some[0] if some else np.zeros(m, bool)
-        sound = jax.device_put(np.where(np.pad(faulty, (0, len(areas) - m)), 0, areas))
-        refinement = mend(replace(spectrum_x, vertex_areas=sound), refinement.pointwise_map)
+        # By turns, what is reversed and what is torn off.
+        sound = np.where(np.pad(some[done % len(some)], (0, len(areas) - m)), 0, areas)
+        begun_without = replace(spectrum_x, vertex_areas=jax.device_put(sound))
+        refinement = run(stage, begun_without, refinement.pointwise_map)
         if refinement.result != RESULTS.successful:
             break
-    return best, least
+    assert stage.mending is not None
+    refinement = run(stage.mending, spectrum_x, best.pointwise_map)
+    if refinement.result == RESULTS.successful:
+        flawed = flaw(*meshes, matches(refinement), eigenvectors, partial=partial)
+        if flawed < least:
+            best, least = refinement, flawed
+    return best, least, bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(best)))
 
 
 _ROUNDS = 4
@@ -323,10 +334,10 @@ _ROUNDS = 4
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# What is more flawed than the first is mended, and than the second begun elsewhere: right maps between poses
-# of one body have up to 2, between bodies of different kinds up to 2.9. What leaves more than this share of a
-# flaw does not help.
-_SUSPICIOUS, _DOUBTFUL, _LOWER = 2.5, 2.9, 0.9
+# What is more flawed than the first is mended. If something of it looks faulty even then, or it is more
+# flawed than the second, it is begun elsewhere: right maps between poses of one body have up to 2, between
+# bodies of different kinds up to 2.9.
+_SUSPICIOUS, _DOUBTFUL = 2.5, 2.9
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0
