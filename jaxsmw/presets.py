@@ -126,7 +126,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (Stage(number_of_samples=500),),
     "paper": (Stage(),),
     "accurate": (
-        Stage(iterations=2),
+        Stage(),
         _regression(_COARSE_TO_FINE, mending=_regression((10, 10, 14, 14, *_COARSE_TO_FINE))),
         _regression((100, 141, 200)),
     ),
