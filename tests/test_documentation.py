@@ -111,7 +111,11 @@ def test_commands_are_understood(page, monkeypatch):
         if program == "jaxsmw":
             _parser().parse_args(arguments)
         elif arguments[0].startswith("scripts/"):
-            source = (ROOT / arguments[0]).read_text("utf-8")
+            script = ROOT / arguments[0]
+            source = script.read_text("utf-8")
+            for module in re.findall(r"^from (\w+) import", source, flags=re.MULTILINE):  # scripts share some
+                if (shared := script.with_name(f"{module}.py")).exists():
+                    source += shared.read_text("utf-8")
             for option in re.findall(r"--[\w-]+", command):
                 assert f'"{option}"' in source, f"{page}: {arguments[0]} has no {option}"
 
