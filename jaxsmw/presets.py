@@ -213,8 +213,9 @@ def refine_in_stages(
             if start is pointwise_map:
                 return refinements, start
             continue
-        if not best[0] or doubt(last, flawed) < least:
-            best, least = (refinements, start), doubt(last, flawed)
+        doubted = doubt(last, flawed)
+        if not best[0] or doubted < least:
+            best, least = (refinements, start), doubted
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
             if not suspicious:
