@@ -55,6 +55,7 @@ from .core.solutions import (
 )
 from .core.spectrum import Spectrum
 from .core.triangles import nearest_point_on_triangles
+from .descriptors import describe
 from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
@@ -74,8 +75,9 @@ from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.mesh_files import read_mesh, write_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
-from .matching import Correspondence, describe, initial_map, match, paired_spectra
+from .matching import Correspondence, match, paired_spectra
 from .presets import PRESETS, Stage
+from .starts import initial_map
 
 __version__: str
 __all__ = [

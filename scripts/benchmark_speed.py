@@ -64,11 +64,12 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import initial_map, match, paired_spectra
+from jaxsmw.matching import match, paired_spectra
 from jaxsmw.presets import Stage
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
+from jaxsmw.starts import initial_map
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)

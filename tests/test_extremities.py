@@ -42,7 +42,7 @@ def test_the_true_pairing_is_among_the_likeliest(creature):
     reach = geodesic_distances(pair.target, points)[:, y.vertices]
     true = np.sort(reach, axis=1)[:, 0] < 0.1 * pair.target.area**0.5
     assert true.sum() >= 3  # ends that are ends on both
-    best = dict(zip(x.vertices[true], y.vertices[reach.argmin(axis=1)[true]], strict=True))
+    best = dict(zip(np.flatnonzero(true), reach.argmin(axis=1)[true], strict=True))
     pairings = likely_pairings(x, y, 72)  # of 720
     assert any(all(dict(pairing).get(a) == b for a, b in best.items()) for pairing in pairings)
 
@@ -63,7 +63,7 @@ def test_pairings_are_one_to_one_and_turn_round(creature):
     assert len(there) == 5
     for pairing in there:
         assert len(set(pairing[:, 0])) == len(set(pairing[:, 1])) == min(len(x.vertices), len(y.vertices))
-        assert set(pairing[:, 0]) <= set(x.vertices) and set(pairing[:, 1]) <= set(y.vertices)
+        assert (pairing >= 0).all() and (pairing < [len(x.vertices), len(y.vertices)]).all()
     for one, other in zip(there, back, strict=True):
         assert set(map(tuple, one)) == set(map(tuple, other[:, ::-1]))
 

@@ -13,18 +13,20 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
-from jaxsmw import matching
+from jaxsmw import descriptors
 from jaxsmw.core import refinement
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
+from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import describe, initial_map, match, other_starts, paired_spectra
+from jaxsmw.matching import match, paired_spectra
 from jaxsmw.presets import Stage, chosen_stages
+from jaxsmw.starts import initial_map, other_starts
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
 OPTIONS = {"preset": STAGE}
@@ -68,8 +70,8 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(mesh_x, mesh_y, 30)
-    monkeypatch.setattr(matching, "_COMPARED", 1200)
-    monkeypatch.setattr(matching, "_COMPARED_FROM", 1000)
+    monkeypatch.setattr(descriptors, "_COMPARED", 1200)
+    monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     start = initial_map(mesh_x, mesh_y, *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1500
@@ -269,8 +271,8 @@ def test_other_starts_differ_and_are_better_here(pair, thinned, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(mesh_x, mesh_y, 30)
     if thinned:
-        monkeypatch.setattr(matching, "_COMPARED", 1200)
-        monkeypatch.setattr(matching, "_COMPARED_FROM", 1000)
+        monkeypatch.setattr(descriptors, "_COMPARED", 1200)
+        monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(other_starts(mesh_x, mesh_y, *spectra))
     assert len(starts) == 3
     # With descriptors there are more, by the ends of limbs; of this body there is but one way to pair them.
@@ -290,7 +292,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(mesh_x, mesh_y, 30)
     described = describe(mesh_x, mesh_y, *spectra, 60)
-    monkeypatch.setattr(matching, "_FINE", 10**6)
+    monkeypatch.setattr(descriptors, "_FINE", 10**6)
     coarse = describe(mesh_x, mesh_y, *spectra, 60)
     assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
     for x, y in (described, coarse):  # of mean square 1, and the same on both shapes

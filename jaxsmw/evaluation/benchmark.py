@@ -27,6 +27,7 @@ from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs
 from jaxsmw.evaluation.ground_truth import GroundTruth
@@ -49,8 +50,9 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching import Start, describe, initial_map, other_starts, paired_spectra
+from jaxsmw.matching import paired_spectra
 from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
+from jaxsmw.starts import Start, initial_map, other_starts
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
 """Where correspondence quality curves are kept, in square roots of the area."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal, get_args
 
 import jax
@@ -14,7 +13,6 @@ import scipy.sparse as sp
 from jaxtyping import Float64
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
-from threadpoolctl import threadpool_limits
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -22,6 +20,7 @@ from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.coarsening import coarsen
 from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.threads import one_blas_thread
 
 # On a surface of area 1, where the first non-zero eigenvalue of a body lies between 1 and 30.
 _SHIFT = -1e-2
@@ -111,7 +110,7 @@ def eigenpairs(
             local = stiffness, areas
         else:
             local = stiffness[used][:, used], areas[used]
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
         # Without further copies: of a large mesh they would fill the memory.
         for column in vectors.T:
@@ -250,87 +249,106 @@ def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.
 def _lanczos(
     stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int, *, tolerance: float = 1e-10
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The Lanczos method on (W - shift A)^-1 A, from one vector until all k have settled, without restarts.
+    """The block Lanczos method on (W - shift A)^-1 A until all k have settled, without restarts.
 
-    With a shift amid them, wanted eigenvalues are at both ends of the inverse's spectrum, and 1.6 k products
-    suffice; keeping every vector A-orthogonal to all before it costs less than ARPACK's restarts. What one
-    starting vector cannot reach are copies of a multiple eigenvalue. So eigenvalues are counted, and while
-    some are missing another start follows, orthogonal to everything before. Settled is an eigenvector whose
+    With a shift amid them, wanted eigenvalues are at both ends of the inverse's spectrum, and two products
+    for each suffice; keeping every vector A-orthogonal to all before it costs less than ARPACK's restarts.
+    Of the copies of a multiple eigenvalue no more are reached than a block has vectors. So eigenvalues are
+    counted, and if some are missing it is done again with larger blocks. Settled is an eigenvector whose
     relative residual of the inverse is below the tolerance.
 
     **Raises:** `RuntimeError` if they do not settle.
     """
-    n = stiffness.shape[0]
-    most = min(n - 1, 10 * k + 100)  # five copies of every eigenvalue, as an icosahedron has
-    generator = np.random.default_rng(0)
     shift, inverse = _factorized_midway(stiffness, mass, k)
-    vectors = np.empty((2 * k + 100, n))
+    for size in (_BLOCK, 2 * _BLOCK):
+        eigenvalues, eigenvectors = _settled(inverse, shift, mass, k, size, tolerance)
+        if not _misses_some(stiffness, mass, eigenvalues):
+            return eigenvalues, eigenvectors
+    raise RuntimeError("not all copies of a multiple eigenvalue were found")
+
+
+# Vectors of a block: a few, since two threads that solve wait for each other, as SuperLU takes Python's lock
+# for its memory. More take more products until all have settled.
+_BLOCK = 4
+
+
+def _settled(
+    inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first k eigenpairs, as far as blocks of `size` vectors reach them."""
+    n = mass.shape[0]
+    diagonal = mass.diagonal() if mass.nnz == n else None
+
+    def weighted(vectors: np.ndarray) -> np.ndarray:
+        return vectors * diagonal if diagonal is not None else (mass @ vectors.T).T
+
+    def images(vectors: np.ndarray) -> np.ndarray:
+        return inverse.solve(weighted(vectors).T).T
+
+    most = min(n - 1, 10 * k + 100)
+    vectors = np.empty((2 * k + 100 + size, n))
     # The first eigenvector, which is known.
     vectors[0] = 1 / np.sqrt(mass.sum())
+    # Smoothed, as no eigenvector is rough: rounding errors in the weight of something rough would show in
+    # derivatives of the eigenvectors.
+    block = np.random.default_rng(0).standard_normal((size, n))
+    for _ in range(2):
+        block = images(block)
+        _remove(vectors[:1], block, weighted)
+        block, _ = _orthonormal(block, weighted)
     projected = np.zeros((most + 1, most + 1))
-    # What comes next: of which vector it is the image, and what of that is orthogonal to all before.
-    pending = deque([(0, _another(generator, inverse, mass, vectors[:1]))])
-    last, look = 0, k + k // 3
-    while last < most and pending:
-        _, following = pending.popleft()
-        if last >= 1 and len(pending):  # then others have come in between
-            following -= (vectors[: last + 1] @ (mass @ following)) @ vectors[: last + 1]
-        length = np.sqrt(following @ (mass @ following))
-        if length <= np.finfo(float).eps * np.abs(projected[1, 1]):
-            continue
-        last += 1
-        if last == len(vectors):
+    end, look = 1, k + k // 2
+    while end + size <= most:
+        if end + size > len(vectors):
             vectors = np.concatenate([vectors, np.empty_like(vectors)])
-        vectors[last] = following / length
-        known, near = vectors[: last + 1], slice(max(0, last - 1 - len(pending)), last + 1)
-        following = inverse.solve(mass @ vectors[last])
-        # First what is large, that of the last vectors, then what is left: in one go it would swamp that.
-        large = vectors[near] @ (mass @ following)
-        following -= large @ vectors[near]
-        overlaps = known @ (mass @ following)
-        following -= overlaps @ known
-        overlaps[near] += large
-        projected[: last + 1, last] = projected[last, : last + 1] = overlaps
-        pending.append((last, following))
-        if last < look and last < most:
+        before, start, end = max(0, end - size), end, end + size
+        vectors[start:end] = block
+        block = images(block)
+        # First what is large, that of the last blocks, then what is left: in one go it would swamp that.
+        large = _remove(vectors[before:end], block, weighted)
+        overlaps = _remove(vectors[:end], block, weighted)
+        overlaps[:, before:] += large
+        projected[start:end, :end], projected[:end, start:end] = overlaps, overlaps.T
+        block, left = _orthonormal(block, weighted)
+        if end < look:
             continue
-        look += max(5, k // 20)
-        inverted, combinations = scipy.linalg.eigh(projected[1 : last + 1, 1 : last + 1])
+        look = end + max(5, k // 20)
+        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's keeps Python's lock
         eigenvalues = shift + 1 / inverted
         # Below zero are images of what is beyond all wanted.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
-        inverted, combinations = inverted[wanted], combinations[:, wanted]
-        residuals = sum(
-            np.sqrt(left @ (mass @ left)) * np.abs(combinations[image - 1])
-            for image, left in pending
-            if image
-        )
-        if (residuals <= tolerance * np.abs(inverted)).all():
-            eigenvalues = np.append(0.0, eigenvalues[wanted])
-            if not _misses_some(stiffness, mass, eigenvalues):
-                eigenvectors = np.empty((n, k))
-                eigenvectors[:, :1] = vectors[:1].T
-                eigenvectors[:, 1:] = vectors[1 : last + 1].T @ combinations
-                return eigenvalues, eigenvectors
-            pending.append((0, _another(generator, inverse, mass, known)))
-            look = last + k // 2
+        residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
+        if (residuals <= tolerance * np.abs(inverted[wanted])).all():
+            eigenvectors = np.empty((k, n))
+            eigenvectors[0] = vectors[0]
+            np.matmul(combinations[:, wanted].T, vectors[1:end], out=eigenvectors[1:])
+            return np.append(0.0, eigenvalues[wanted]), eigenvectors.T
     raise RuntimeError("the Lanczos vectors have not settled")
 
 
-def _another(
-    generator: np.random.Generator, inverse: SuperLU, mass: sp.csc_matrix, known: Float64[np.ndarray, "j n"]
-) -> Float64[np.ndarray, " n"]:
-    """A random vector of length 1, A-orthogonal to those known.
+def _remove(
+    known: Float64[np.ndarray, "j n"],
+    vectors: Float64[np.ndarray, "b n"],
+    weighted: Callable[[np.ndarray], np.ndarray],
+) -> Float64[np.ndarray, "b j"]:
+    """Make vectors A-orthogonal to known ones, in place; how much of each they had."""
+    overlaps = weighted(vectors) @ known.T
+    vectors -= overlaps @ known
+    return overlaps
 
-    Smoothed, as no eigenvector is rough: rounding errors in the weight of something rough would show in
-    derivatives of the eigenvectors.
+
+def _orthonormal(
+    vectors: Float64[np.ndarray, "b n"], weighted: Callable[[np.ndarray], np.ndarray]
+) -> tuple[Float64[np.ndarray, "b n"], Float64[np.ndarray, "b b"]]:
+    """Vectors Q, A-orthonormal, and a triangular L, with L Q those given.
+
+    **Raises:** `LinAlgError` if they depend on each other.
     """
-    vector = generator.standard_normal(known.shape[1])
-    for _ in range(2):
-        vector = inverse.solve(mass @ vector)
-        vector -= (known @ (mass @ vector)) @ known
-        vector /= np.sqrt(vector @ (mass @ vector))
-    return vector - (known @ (mass @ vector)) @ known
+    lower = np.eye(len(vectors))
+    for _ in range(2):  # the second time for the rounding errors of the first
+        factor = np.linalg.cholesky(weighted(vectors) @ vectors.T)
+        vectors, lower = np.linalg.inv(factor) @ vectors, lower @ factor
+    return vectors, lower
 
 
 def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:

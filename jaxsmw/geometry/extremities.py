@@ -63,7 +63,7 @@ def extremities(mesh: Mesh) -> Extremities:
 
 
 def likely_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
-    """Ways to pair the ends of two bodies, the likeliest first: a vertex of X and one of Y in each row.
+    """Ways to pair the ends of two bodies, the likeliest first: which of X's and which of Y's in each row.
 
     All ends of the body with fewer of them have a partner. The smaller the squared differences of distances
     between ends, and of their remoteness, the likelier. Distances do not tell left from right.
@@ -80,5 +80,5 @@ def likely_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[n
     cost = np.sum(between**2, axis=(1, 2)) / 2
     cost += np.sum((more.remoteness[partners] - fewer.remoteness) ** 2, axis=1)
     best = partners[np.argsort(cost, kind="stable")[:number]]
-    pairings = [np.stack([fewer.vertices, more.vertices[partner]], axis=1) for partner in best]
+    pairings = [np.stack([np.arange(len(partner)), partner], axis=1) for partner in best]
     return pairings if fewer is x else [pairing[:, ::-1] for pairing in pairings]

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 
@@ -257,6 +258,17 @@ def units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, f
     """In what lengths on two shapes compare: the square root of each area, of a partial pair the larger's."""
     areas = mesh_x.area, mesh_y.area
     return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
+
+
+def extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
+    """Give vertices that no face uses the match of the nearest one that a face does use."""
+    used = mesh_x.used_vertices
+    if used.all():
+        return matches
+    _, nearest = KDTree(mesh_x.vertices[used]).query(mesh_x.vertices[~used])
+    extended = matches.copy()
+    extended[~used] = matches[used][nearest]
+    return extended
 
 
 def count_of(number: int, noun: str) -> str:
