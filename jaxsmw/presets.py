@@ -199,7 +199,11 @@ def refine_in_stages(
       features that predict each other (`FeatureRegression`) count as well.
     - `history`: see `jaxsmw.refine`.
     """
-    through = partial_function(_through, samples=samples, meshes=meshes, partial=partial, history=history)
+    # Flaws show best in as many eigenvectors as there are.
+    finest = max((of_x for of_x, _ in spectra), key=lambda of_x: of_x.eigenvalues.shape[0])
+    through = partial_function(
+        _through, samples=samples, meshes=meshes, finest=finest, partial=partial, history=history
+    )
     steps = list(zip(spectra, stages, strict=True))
     # What comes after the last stage that mends is done for the best start alone.
     mending = [index + 1 for index, stage in enumerate(stages) if stage.mending and meshes is not None]
@@ -242,6 +246,7 @@ def _through(
     *,
     samples: Samples | None,
     meshes: tuple[Mesh, Mesh] | None,
+    finest: Spectrum,
     partial: bool,
     history: bool,
 ) -> tuple[list[Refinement], float, bool]:
@@ -252,7 +257,9 @@ def _through(
         run = partial_function(run_stage, spectrum_y=spectrum_y, samples=samples, history=history)
         refinement = run(stage, spectrum_x, pointwise_map)
         if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            refinement, flawed, doubtful = _mended(refinement, spectrum_x, stage, run, meshes, partial)
+            refinement, flawed, doubtful = _mended(
+                refinement, spectrum_x, stage, run, meshes, finest, partial
+            )
         refinements.append(refinement)
         if refinement.result != RESULTS.successful:
             break
@@ -285,6 +292,7 @@ def _mended(
     stage: Stage,
     run: Callable[[Stage, Spectrum, Int[Array, " m"]], Refinement],
     meshes: tuple[Mesh, Mesh],
+    finest: Spectrum,
     partial: bool,
 ) -> tuple[Refinement, float, bool]:
     """The least flawed of a refinement and of others, each begun without what was faulty in the last.
@@ -307,7 +315,7 @@ def _mended(
 
     best, least = refinement, np.inf
     for done in range(_ROUNDS + 1):
-        flawed = flaw(*meshes, matches(refinement), eigenvectors, partial=partial)
+        flawed = flaw(*meshes, matches(refinement), finest, partial=partial)
         if flawed < least:
             best, least = refinement, flawed
         if least < _SUSPICIOUS:
@@ -324,7 +332,7 @@ def _mended(
     assert stage.mending is not None
     refinement = run(stage.mending, spectrum_x, best.pointwise_map)
     if refinement.result == RESULTS.successful:
-        flawed = flaw(*meshes, matches(refinement), eigenvectors, partial=partial)
+        flawed = flaw(*meshes, matches(refinement), finest, partial=partial)
         if flawed < least:
             best, least = refinement, flawed
     return best, least, bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(best)))
@@ -336,9 +344,8 @@ _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
 # What is more flawed than the first is mended. If something of it looks faulty even then, or it is more
-# flawed than the second, it is begun elsewhere: right maps between poses of one body have up to 2, between
-# bodies of different kinds up to 2.9.
-_SUSPICIOUS, _DOUBTFUL = 2.5, 2.9
+# flawed than the second, it is begun elsewhere.
+_SUSPICIOUS, _DOUBTFUL = 1.15, 1.25
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -124,12 +124,16 @@ def other_starts(
         start = compiled(_both_ways)(*jax.device_put((there, back, share)), *spectra)
         yield extend_to_unused(mesh_x, np.asarray(start).astype(np.int64))
     if not partial and spectrum_x.descriptors is not None:
-        yield from _starts_from_extremities(x, y, shot[SHOT_RADIUS])
+        yield from _starts_from_extremities(x, y, shot[SHOT_RADIUS], spectrum_x)
 
 
 def _starts_from_extremities(
-    x: Compared, y: Compared, shot: tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
+    x: Compared,
+    y: Compared,
+    shot: tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]],
+    everything: Spectrum,
 ) -> Iterator[Int64[np.ndarray, " m"]]:
+    """From `shot` of what is compared; judged by the spectrum of all of X."""
     fewest = min(int(side.mesh.used_vertices.sum()) for side in (x, y))
     stage = fitting(_ROUGHLY, fewest)
     spectrum_x, spectrum_y = stage.view(x.spectrum, y.spectrum)
@@ -137,7 +141,6 @@ def _starts_from_extremities(
         jax.device_put(side.rows(farthest_point_samples(side.mesh, stage.number_of_samples or fewest)))
         for side in (x, y)
     )
-    eigenvectors = np.asarray(x.spectrum.eigenvectors)[x.rows(np.arange(len(x.mesh.vertices))), :_JUDGES]
     outcomes = []
     ends = side_by_side(lambda side: extremities(side.mesh), x, y)
     units = units_of_length(x.mesh, y.mesh, False)
@@ -155,15 +158,15 @@ def _starts_from_extremities(
         )
         if refinement.result == RESULTS.successful:
             found = _everywhere(np.asarray(refinement.pointwise_map).astype(np.int64), x, y)
-            outcomes.append((doubt(refinement, flaw(x.mesh, y.mesh, found, eigenvectors)), found))
+            outcomes.append((doubt(refinement, flaw(x.mesh, y.mesh, found, everything)), found))
     outcomes.sort(key=lambda outcome: outcome[0])
     for _, found in outcomes[:_LEAST_DOUBTFUL]:
         yield extend_to_unused(x.mesh, found)
 
 
-# Enough to find the place of limbs; judged by as many eigenvectors as what `refine_in_stages` mends.
+# Enough to find the place of limbs.
 _ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8, 1000)
-_PAIRINGS, _LEAST_DOUBTFUL, _JUDGES = 16, 2, 50
+_PAIRINGS, _LEAST_DOUBTFUL = 16, 2
 
 
 # Radii, and how much the way back counts. Wide neighbourhoods see more of the body, in less detail.

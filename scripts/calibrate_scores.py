@@ -74,9 +74,9 @@ def looks(found: Correspondence) -> dict[str, float]:
     meshes, pointwise_map = (found.mesh_x, found.mesh_y), found.pointwise_map
     updated = found.refinement.updated
     return {
-        "stretch": stretch(*meshes, pointwise_map),
+        "stretch": stretch(*meshes, pointwise_map, found.spectrum_x),
         "uncertainty of the regression": float(updated.uncertainty),
-        "flaw": flaw(*meshes, pointwise_map, np.asarray(found.spectrum_x.eigenvectors)),
+        "flaw": flaw(*meshes, pointwise_map, found.spectrum_x),
     }
 
 

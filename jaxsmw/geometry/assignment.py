@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.optimize import linear_sum_assignment
 
 from jaxsmw.errors import InputError
 
@@ -63,6 +62,8 @@ def one_to_one_map(
     # |x - y|² = |x|² + |y|² - 2 x·y, of which the first is the same whatever the match.
     costs = x @ (-2 * y.T)
     costs += np.sum(y**2, axis=1)
+    from scipy.optimize import linear_sum_assignment  # takes long to import, and few need it
+
     matched, found = linear_sum_assignment(costs)
     pointwise_map = np.full(len(embedding_x), -1)
     pointwise_map[rows[matched]] = columns[found]

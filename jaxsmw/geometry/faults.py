@@ -14,7 +14,8 @@ from jaxsmw.geometry.sampling import spread_edges
 _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
-_WEIGHT_OF_REVERSED = 4
+# Of which the flaw counts what shows in so many eigenvectors, by this weight.
+_EIGENVECTORS, _WEIGHT_OF_REVERSED = 50, 4
 # What `expected_error` thinks of a piece that is misplaced as a whole, in square roots of the piece's area.
 _MISPLACED = 0.5
 # The time for which heat flows that evens out single vertices' signs: it spreads over a disk of radius 0.06.
@@ -22,34 +23,56 @@ _HEAT_TIME = 1e-3
 
 
 def stretch(
-    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int64[np.ndarray, " m"], *, partial: bool = False
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    pointwise_map: Int64[np.ndarray, " m"],
+    spectrum_x: Spectrum,
+    *,
+    partial: bool = False,
 ) -> float:
-    """The squared distances of neighbours' matches, over those of the neighbours: a Dirichlet energy.
+    """The Dirichlet energy of matches' positions over that of X's own, in the span of X's eigenvectors.
 
-    In Euclidean distance, on surfaces scaled to area 1, or if `partial` by one factor. About 1 for the true
-    map between poses of one body; maps that tear or scatter have more.
+    About 1 for the true map between poses of one body, whatever their triangulations; up to 1.1 between
+    bodies of different kinds; maps that tear have more. What single vertices scatter, which is the more the
+    denser the mesh, lies beyond the span.
+
+    **Arguments:**
+
+    - `spectrum_x`: of X, some hundred eigenvectors; what is beyond X's vertices is padding.
+    - `partial`: whether one mesh is a part of the other, in the same unit of length.
     """
-    edges, _ = spread_edges(mesh_x)
-    before, after = _lengths(edges, mesh_x, mesh_y, pointwise_map, partial)
-    return float(np.sum(after**2) / np.sum(before**2))
+    m = len(mesh_x.vertices)
+    eigenvalues, eigenvectors, areas = (
+        np.asarray(part, np.float64)
+        for part in (spectrum_x.eigenvalues, spectrum_x.eigenvectors[:m], spectrum_x.vertex_areas[:m])
+    )
+
+    def energy(positions: Float[np.ndarray, "m 3"]) -> float:
+        return float(np.sum(eigenvalues * ((areas * positions.T) @ eigenvectors) ** 2))
+
+    unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
+    return energy(mesh_y.vertices[pointwise_map] / unit_y) / energy(mesh_x.vertices / unit_x)
 
 
 def flaw(
     mesh_x: Mesh,
     mesh_y: Mesh,
     pointwise_map: Int64[np.ndarray, " m"],
-    eigenvectors_x: Float[np.ndarray, "m k"],
+    spectrum_x: Spectrum,
     *,
     partial: bool = False,
 ) -> float:
     """How bad a map looks: its `stretch`, the more so the more of X has `reversed_orientation`.
 
     Stretch alone would have a body mapped to its mirror image rather than one leg to the other. Good maps
-    between bodies of one kind have 1.3 to 2, those that swap limbs more.
+    have 0.9 to 1.15, those that swap limbs 1.3 and more.
     """
-    reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors_x, partial=partial)
+    eigenvectors = np.asarray(spectrum_x.eigenvectors)[: len(mesh_x.vertices), :_EIGENVECTORS]
+    reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
     share = mesh_x.vertex_areas[reversed_].sum() / mesh_x.area
-    return stretch(mesh_x, mesh_y, pointwise_map, partial=partial) * (1 + _WEIGHT_OF_REVERSED * share)
+    return stretch(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial) * (
+        1 + _WEIGHT_OF_REVERSED * share
+    )
 
 
 def torn_off(
