@@ -345,7 +345,7 @@ _NEGLIGIBLE = 0.002
 _TOO_MUCH = 0.5
 # What is more flawed than the first is mended. If something of it looks faulty even then, or it is more
 # flawed than the second, it is begun elsewhere.
-_SUSPICIOUS, _DOUBTFUL = 1.15, 1.25
+_SUSPICIOUS, _DOUBTFUL = 1.1, 1.15
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0
