@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_writable, make_directory
+from jaxsmw.files import atomic_write, check_directory, check_writable, make_directory
 
 if TYPE_CHECKING:
     from jaxsmw.core.filters import FilterBank
@@ -63,7 +63,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def _leave_at_once() -> NoReturn:
     """End the process without waiting, as `sys.exit` would, for computations still under way."""
     print("jaxsmw: interrupted; files are written whole or not at all.", file=sys.stderr, flush=True)
-    os._exit(1)
+    if threading.current_thread() is threading.main_thread():
+        # A shell's loop ends only if what it runs dies of the signal.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
+    os._exit(128 + signal.SIGINT)
 
 
 def _make_interruptible() -> None:
@@ -452,7 +456,12 @@ def _benchmark(options: argparse.Namespace) -> None:
     from jaxsmw.report.figures import check_drawable
 
     check_drawable()
-    from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+    try:
+        from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"benchmarks need {error.name}, which is not installed: pip install 'jaxsmw[benchmark]'"
+        ) from error
     from jaxsmw.evaluation.datasets import open_data_set
     from jaxsmw.evaluation.opponents import find_methods, suited_methods
     from jaxsmw.evaluation.workers import open_executor
@@ -520,9 +529,11 @@ def _match(options: argparse.Namespace) -> None:
     truth = None
     if options.ground_truth:
         truth = _read_truth(options, mesh_x, mesh_y)
+    for path in filter(None, (options.report, options.texture)):
+        check_directory(path)
+    correspondence = _run_match(options, mesh_x, mesh_y)
     directory = make_directory(options.report) if options.report else None
     textured = make_directory(options.texture) if options.texture else None
-    correspondence = _run_match(options, mesh_x, mesh_y)
     write_pointwise_map(options.output, correspondence.pointwise_map)
     others: dict[str, Any] = {}
     if options.one_to_one:

@@ -72,6 +72,19 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             )
 
 
+def check_directory(path: str | os.PathLike[str]) -> None:
+    """Tell now what would make `make_directory` fail later; nothing is left behind.
+
+    **Raises:**
+
+    `InputError` if it cannot be made or written to.
+    """
+    missing = [place for place in (Path(path), *Path(path).parents) if not place.exists()]
+    make_directory(path)
+    for place in missing:
+        place.rmdir()
+
+
 def make_directory(path: str | os.PathLike[str]) -> Path:
     """The directory, made if it is not there yet."""
     try:

@@ -54,6 +54,12 @@ class Stage:
     mending: Stage | None = None
 
     def __post_init__(self) -> None:
+        for name in ("number_of_eigenvectors", "number_of_descriptors", "iterations", "number_of_samples"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | np.integer) or (value is None and name == "number_of_samples")):
+                raise InputError(f"{name} is {value!r}; give a whole number.")
+        if self.number_of_eigenvectors < 1:
+            raise InputError(f"{self.number_of_eigenvectors} eigenvectors were asked for; give at least 1.")
         if not isinstance(self.refiner, Refiner):
             raise InputError(
                 f"refiner is {self.refiner!r}; give a Refiner such as WaveletPreservation(bank=Meyer(8))."
@@ -149,7 +155,7 @@ def chosen_stages(
         if preset not in PRESETS:
             raise InputError(f"{preset!r} is no preset: choose from {', '.join(PRESETS)}, or give stages.")
         return tuple(fitting(stage, vertices, partial) for stage in PRESETS[preset])
-    stages = (preset,) if isinstance(preset, Stage) else tuple(preset)
+    stages = tuple(preset) if isinstance(preset, Iterable) else (preset,)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(f"preset is {preset!r}; give one of {', '.join(PRESETS)}, or stages.")
     return stages
@@ -209,7 +215,7 @@ def refine_in_stages(
     mending = [index + 1 for index, stage in enumerate(stages) if stage.mending and meshes is not None]
     doubtful, certain = (steps[: mending[-1]], steps[mending[-1] :]) if mending else ([], steps)
     best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
-    least = np.inf
+    least, tried, told = np.inf, 0, ""
     for start in chain([pointwise_map], other_starts) if doubtful else ():
         refinements, flawed, suspicious = through(doubtful, start)
         last = refinements[-1]
@@ -217,14 +223,17 @@ def refine_in_stages(
             if start is pointwise_map:
                 return refinements, start
             continue
-        doubted = doubt(last, flawed)
+        doubted, tried = doubt(last, flawed), tried + 1
         if not best[0] or doubted < least:
             best, least = (refinements, start), doubted
+            told = f"has flaw {flawed:.2f}" + ("; limbs may still be swapped" if suspicious else "")
         # Of several that look right one may be better: once in doubt, all are tried.
         if start is pointwise_map:
             if not suspicious:
                 break
-            logger.info("limbs may be swapped (flaw %.2f): other starts", flawed)
+            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.1): other starts", flawed)
+    if tried > 1:
+        logger.info("the best of %d starts %s", tried, told)
     refinements, start = best
     so_far = refinements[-1].pointwise_map if refinements else start
     return refinements + through(certain, so_far)[0], start

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
-from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
+from synthetic import body_with_arms, bumpy_mesh, grid_mesh, sphere_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
@@ -15,6 +15,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh
+from jaxsmw.geometry.threads import side_by_side
 
 
 @pytest.fixture(autouse=True)
@@ -140,6 +141,17 @@ def test_tiny_mesh():
 def test_impossible_numbers_of_eigenvectors(k):
     with pytest.raises(InputError, match="162 used vertices"):
         compute_spectrum(make_mesh(*sphere_mesh(2)), k)
+
+
+def test_two_threads_find_what_one_does():
+    """And one of them may be done with all before the other starts."""
+    meshes = make_mesh(*sphere_mesh(3)), body_with_arms()
+    for mesh, (values, vectors, _) in zip(
+        meshes, side_by_side(lambda mesh: eigenpairs(mesh, 40), *meshes), strict=True
+    ):
+        alone = eigenpairs(mesh, 40)
+        np.testing.assert_array_equal(values, alone[0])
+        np.testing.assert_array_equal(vectors, alone[1])
 
 
 def test_nonmanifold_meshes_go_to_the_robust_laplacian():

@@ -60,6 +60,17 @@ class TestReading:
         assert read_ground_truth(str(path), X, Y, index_base=1).targets.tolist() == [7, 0, 0, 1]
         assert read_ground_truth([path], X, Y).targets.tolist() == [8, 1, 1, 2]
 
+    def test_vertices_that_no_face_uses_are_left_out(self, write):
+        """As where a part keeps the vertices of the whole."""
+        part = make_mesh(X.vertices, X.faces[:1], name="part")
+        path = write("truth.txt", "8\n1\n2\n3\n")
+        with pytest.warns(UserWarning, match=r"truth.txt: 1 of 4 points are vertices that no face of part"):
+            truth = read_ground_truth(path, part, Y)
+        assert truth.source_vertices.tolist() == sorted(X.faces[0]) and len(truth.targets) == 3
+        (left_out,) = set(range(4)) - set(X.faces[0].tolist())
+        with pytest.raises(InputError, match="no face of part uses: give the truth of this mesh"):
+            read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
+
     def test_two_columns(self, write):
         path = write("kid01_ref.txt", "\ufeff     1      9 \n     4      1 \n")
         truth = read_ground_truth(path, X, Y)

@@ -217,7 +217,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "fault"),
     [
-        ({"preset": replace(STAGE, number_of_eigenvectors=0)}, "eigenvectors were asked for"),
+        ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
         ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
         ({"preset": replace(STAGE, number_of_samples=10**6)}, "samples were asked for"),
         ({"preset": ()}, "give one of fast, paper, accurate, or stages"),
@@ -362,6 +362,22 @@ def test_presets_fit_small_meshes(monkeypatch):
 def test_an_unknown_preset_is_refused():
     with pytest.raises(InputError, match="'exact' is no preset: choose from fast, paper, accurate"):
         chosen_stages("exact", 1000)
+    with pytest.raises(InputError, match="preset is 3; give one of"):
+        chosen_stages(3, 1000)
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        ({"iterations": "3"}, "iterations is '3'; give a whole number"),
+        ({"number_of_eigenvectors": 10.5}, "number_of_eigenvectors is 10.5"),
+        ({"number_of_eigenvectors": -3}, "-3 eigenvectors were asked for"),
+        ({"number_of_samples": 500.0}, "number_of_samples is 500.0"),
+    ],
+)
+def test_stages_that_cannot_be_are_refused(settings, fault):
+    with pytest.raises((InputError, TypeCheckError), match=fault):
+        Stage(**settings)
 
 
 def test_a_soup_of_triangles_is_named(pair):

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_writable
+from jaxsmw.files import atomic_write, check_directory, check_writable
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, diagnose, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 
@@ -1019,3 +1019,13 @@ def test_check_writable_tells_before_the_work_what_atomic_write_would_tell_after
     for path in (tmp_path, tmp_path / "no" / "such.txt"):
         with pytest.raises(InputError, match="cannot be written"):
             check_writable(path)
+
+
+def test_check_directory_tells_before_the_work_and_leaves_nothing(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "kept").mkdir()
+    check_directory(tmp_path / "new" / "one")
+    check_directory(tmp_path / "kept")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "kept"]
+    with pytest.raises(InputError, match="cannot be made a directory"):
+        check_directory(tmp_path / "file" / "one")

@@ -381,6 +381,13 @@ def test_a_map_of_nothing_is_named(pair):
     )
 
 
+@pytest.mark.parametrize("kind", [float, bool])
+def test_a_start_that_holds_no_vertices_is_refused(pair, kind):
+    x, y, _, start = pair
+    with pytest.raises(TypeError, match=r"must be integer vertex indices|pointwise_map"):
+        refine(x, y, jnp.asarray(start).astype(kind), refiner=WaveletPreservation(), iterations=1)
+
+
 def test_two_float_types_are_refused(pair):
     x, y, start, _ = pair
     single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, x)

@@ -270,7 +270,8 @@ def refine(
     **Returns:** A `Refinement`. Nothing is raised for bad numbers: check its `result`.
 
     **Raises:** `ValueError` for fewer than one iteration, samples on one side only, an initial map that is
-    not one vertex per vertex of X, or spectra of two float types; `TypeError` if `iterations` is no integer.
+    not one vertex per vertex of X, or spectra of two float types; `TypeError` if `iterations` or what the
+    initial map holds is no integer.
     """
     if (samples_x is None) != (samples_y is None):
         raise ValueError("samples are needed on both shapes or on neither")
@@ -278,6 +279,8 @@ def refine(
         raise ValueError(
             f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"
         )
+    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
+        raise TypeError(f"the initial map has type {pointwise_map.dtype}; it must be integer vertex indices")
 
     check_same_precision(spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,11 +96,29 @@ def read_ground_truth(
     - `mesh_x`, `mesh_y`: source X and target Y.
     - `index_base`: what the files' indices count from, where it is not what the list says.
 
-    **Returns:** A `GroundTruth`.
+    **Returns:** A `GroundTruth`, without what the files say of vertices of X that no face uses; a warning
+    counts them.
 
     **Raises:** `InputError` that names the file, the line and the fault.
     """
     files = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(path) for path in paths]
+    truth = _read_all(files, mesh_x, mesh_y, index_base)
+    used = mesh_x.used_vertices[truth.source_vertices]
+    if used.all():
+        return truth
+    if not used.any():
+        raise InputError(
+            f"{files[0]}: is about vertices that no face of {mesh_x.name} uses: give the truth of this mesh."
+        )
+    warnings.warn(
+        f"{files[0]}: {(~used).sum()} of {len(used)} points are vertices that no face of {mesh_x.name} uses; "
+        "they are left out",
+        stacklevel=2,
+    )
+    return GroundTruth(truth.source_vertices[used], truth.targets[used])
+
+
+def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None) -> GroundTruth:
     if len(files) not in (1, 2):
         raise InputError(f"ground truth: {len(files)} files were given: give one, or the two of a pair.")
 

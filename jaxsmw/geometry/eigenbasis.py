@@ -91,6 +91,10 @@ def eigenpairs(
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
     """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors, vertex areas, for total area 1."""
     used = np.flatnonzero(mesh.used_vertices)
+    if not isinstance(number_of_eigenvectors, int | np.integer):
+        raise InputError(
+            f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}; give an integer."
+        )
     if not 1 <= number_of_eigenvectors < len(used):
         raise InputError(
             f"{mesh.name}: {number_of_eigenvectors} eigenvectors were asked for, but a mesh with {len(used)} "
