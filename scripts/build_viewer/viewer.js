@@ -29,6 +29,8 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const FIELD_OF_VIEW = 25;
+// The caption lies over the top of the canvas; so much of the upper half is left for the body.
+const BELOW_CAPTION = 0.85;
 const KEY_TURN = Math.PI / 18;
 const KEY_ZOOM = 1.15;
 const CLICK_TOLERANCE = 5; // pixels that the pointer may move between press and release
@@ -183,7 +185,8 @@ class Body {
     let distance = 0;
     for (let i = 0; i < this.positions.length; i += 3) {
       const [x, y, z] = axes.map((axis) => point.fromArray(this.positions, i).dot(axis));
-      distance = Math.max(distance, z + Math.abs(y) / half, z + Math.abs(x) / (half * this.camera.aspect));
+      const height = Math.max(-y, y / BELOW_CAPTION);
+      distance = Math.max(distance, z + height / half, z + Math.abs(x) / (half * this.camera.aspect));
     }
     return 1.08 * distance;
   }
