@@ -191,8 +191,8 @@ def refine_in_stages(
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. A stage that is to mend this looks for both
     (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
-    faulty part had no say in, and at last through those of its `mending`. The least flawed map it came by is
-    its outcome. Where that does not help, the stages so far are gone through from other starts, too. Maps
+    faulty part had no say in, and at last through those of its `mending`. The least doubtful map it came by
+    is its outcome. Where that does not help, the stages so far are gone through from other starts, too. Maps
     that look right are let be.
 
     **Arguments:**
@@ -304,10 +304,10 @@ def _mended(
     finest: Spectrum,
     partial: bool,
 ) -> tuple[Refinement, float, bool]:
-    """The least flawed of a refinement and of others, each begun without what was faulty in the last.
+    """The least doubtful of a refinement and of others, each begun without what was faulty in the last.
 
-    And its flaw, and whether limbs may be swapped still. At last, where that was not enough, the least flawed
-    one is mended with all.
+    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all. A
+    refinement that looks right is let be.
     """
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
@@ -322,29 +322,31 @@ def _mended(
         both = reversed_, torn_off(*meshes, found, partial=partial)
         return [fault for fault in both if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH]
 
-    best, least = refinement, np.inf
-    for done in range(_ROUNDS + 1):
+    def judged(refinement: Refinement) -> tuple[float, float, Refinement]:
         flawed = flaw(*meshes, matches(refinement), finest, partial=partial)
-        if flawed < least:
-            best, least = refinement, flawed
-        if least < _SUSPICIOUS:
-            return best, least, False
-        some = faults(refinement)
-        if done == _ROUNDS or not some:
+        return doubt(refinement, flawed), flawed, refinement
+
+    best = last = judged(refinement)
+    if best[1] < _SUSPICIOUS:
+        return refinement, best[1], False
+    for done in range(_ROUNDS):
+        some = faults(last[-1])
+        if best[1] < _SUSPICIOUS or not some:
             break
         # By turns, what is reversed and what is torn off.
         sound = np.where(np.pad(some[done % len(some)], (0, len(areas) - m)), 0, areas)
         begun_without = replace(spectrum_x, vertex_areas=jax.device_put(sound))
-        refinement = run(stage, begun_without, refinement.pointwise_map)
+        refinement = run(stage, begun_without, last[-1].pointwise_map)
         if refinement.result != RESULTS.successful:
             break
+        last = judged(refinement)
+        best = min(best, last, key=lambda outcome: outcome[0])
     assert stage.mending is not None
-    refinement = run(stage.mending, spectrum_x, best.pointwise_map)
+    refinement = run(stage.mending, spectrum_x, best[-1].pointwise_map)
     if refinement.result == RESULTS.successful:
-        flawed = flaw(*meshes, matches(refinement), finest, partial=partial)
-        if flawed < least:
-            best, least = refinement, flawed
-    return best, least, bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(best)))
+        best = min(best, judged(refinement), key=lambda outcome: outcome[0])
+    _, least, refinement = best
+    return refinement, least, bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(refinement)))
 
 
 _ROUNDS = 4

@@ -218,7 +218,6 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     ("options", "fault"),
     [
         ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
-        ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
         ({"preset": replace(STAGE, number_of_samples=10**6)}, "samples were asked for"),
         ({"preset": ()}, "give one of fast, paper, accurate, or stages"),
         ({"init": "shoot"}, "choose shot"),
