@@ -43,12 +43,14 @@ def stretch(
     """
     m = len(mesh_x.vertices)
     eigenvalues, eigenvectors, areas = (
-        np.asarray(part, np.float64)
-        for part in (spectrum_x.eigenvalues, spectrum_x.eigenvectors[:m], spectrum_x.vertex_areas[:m])
+        np.asarray(part)
+        for part in (spectrum_x.eigenvalues, spectrum_x.eigenvectors, spectrum_x.vertex_areas)
     )
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
-        return float(np.sum(eigenvalues * ((areas * positions.T) @ eigenvectors) ** 2))
+        # In the type of the eigenvectors, of which a large mesh has no room for a copy.
+        weighted = (areas[:m] * positions.T).astype(eigenvectors.dtype)
+        return float(np.sum(eigenvalues * (weighted @ eigenvectors[:m]) ** 2))
 
     unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
     return energy(mesh_y.vertices[pointwise_map] / unit_y) / energy(mesh_x.vertices / unit_x)
