@@ -30,6 +30,7 @@ from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
+from .core.registration import Registration
 from .core.results import RESULTS
 from .core.search import approximate_nearest_neighbor, nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -119,6 +120,7 @@ __all__ = [
     "Recovery",
     "Refinement",
     "Refiner",
+    "Registration",
     "Regular",
     "RegularizedLeastSquares",
     "Simoncelli",

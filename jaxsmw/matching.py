@@ -325,6 +325,7 @@ def _outlines(
             jnp.zeros(v),
             jnp.zeros(v, bool),
             jnp.zeros((v, d)) if d else None,
+            *(jnp.zeros((v, 3)),) * 2,
         )
         for v in (m, n)
     )

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int, Int64
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression, Regression
 from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreservation, refine
+from jaxsmw.core.registration import Registration
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -38,9 +39,9 @@ class Stage:
     - `iterations`: how many; at least 1.
     - `number_of_samples`: take turns on so many samples of each shape, and search all vertices at the end.
     - `stop_when_unchanged`: see `jaxsmw.refine`.
-    - `mending`: what is done at last where the outcome looks as if limbs were swapped, and this stage done
-      again without their matches does not help: see `refine_in_stages`. Of the same eigenvectors and
-      descriptors.
+    - `mending`: what is done at last where the outcome of this stage and those after it looks as if limbs
+      were swapped, and they done again without the matches of these do not help: see `refine_in_stages`. Of
+      the same eigenvectors and descriptors.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -121,20 +122,24 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
     return cut[0], cut[1]
 
 
-def _regression(levels: tuple[int, ...], mending: Stage | None = None) -> Stage:
+def _regression(*levels: int, mending: Stage | None = None) -> Stage:
     """Feature regression, once per level."""
     return Stage(FeatureRegression(levels), max(levels), 60, len(levels), 1000, mending=mending)
 
 
+def _registration(*levels: int) -> Stage:
+    """Registration, once per level."""
+    return Stage(Registration(levels), max(levels), 0, len(levels), 1000)
+
+
 Preset = Literal["fast", "paper", "accurate"]
-_COARSE_TO_FINE = (20, 20, 26, 26, 35, 35, 50, 50)
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (Stage(number_of_samples=500),),
     "paper": (Stage(),),
     "accurate": (
         Stage(),
-        _regression(_COARSE_TO_FINE, mending=_regression((10, 10, 14, 14, *_COARSE_TO_FINE))),
-        _regression((100, 141, 200)),
+        _regression(20, 20, 26, 35, mending=_regression(10, 10, 14, 14, 20, 20, 26, 35)),
+        _registration(35, 60, 100, 200),
     ),
 }
 """The MWP authors' fast variant, the paper's setting, and what docs/accuracy.md arrives at."""
@@ -164,7 +169,7 @@ def chosen_stages(
 def fitting(stage: Stage, vertices: int, partial: bool = False) -> Stage:
     """A stage with what few vertices can give: eigenvectors up to their half, samples if there are more."""
     samples, refiner = stage.number_of_samples, stage.refiner
-    if isinstance(refiner, FeatureRegression):
+    if isinstance(refiner, FeatureRegression | Registration):
         refiner = replace(refiner, partial=partial)
     return replace(
         stage,
@@ -189,91 +194,107 @@ def refine_in_stages(
     """Refine by one stage after the other, as long as they go well: the outcome of each, and the start.
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
-    left and right, and for where it joins the body. A stage that is to mend this looks for both
-    (`jaxsmw.geometry.faults`), by turns, and goes through its iterations again from a functional map that the
-    faulty part had no say in, and at last through those of its `mending`. The least doubtful map it came by
-    is its outcome. Where that does not help, the stages so far are gone through from other starts, too. Maps
-    that look right are let be.
+    left and right, and for where it joins the body. From a stage that is to mend this on, the outcome is
+    looked at for both (`jaxsmw.geometry.faults`), by turns, and these stages are gone through again from a
+    functional map that the faulty part had no say in, and at last with `mending` in place of the first of
+    them. The least doubtful map they came by is the outcome. Where that does not help, all stages are gone
+    through from other starts, too. Maps that look right are let be.
 
     **Arguments:**
 
     - `spectra`: of X and Y as each stage sees them (`Stage.view`).
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
-    - `meshes`: X and Y, for stages that mend; if they have fewer vertices than the spectra, those are padded.
+    - `meshes`: X and Y, for a stage that mends; with fewer vertices than spectra that are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken if a stage that is to mend could not; the least flawed outcome is returned, where
-      features that predict each other (`FeatureRegression`) count as well.
+    - `other_starts`: taken if a stage that is to mend could not; the least doubtful outcome is returned, by
+      its flaw and, of `FeatureRegression`, how badly features predict each other.
     - `history`: see `jaxsmw.refine`.
     """
-    # Flaws show best in as many eigenvectors as there are.
-    finest = max((of_x for of_x, _ in spectra), key=lambda of_x: of_x.eigenvalues.shape[0])
-    through = partial_function(
-        _through, samples=samples, meshes=meshes, finest=finest, partial=partial, history=history
-    )
     steps = list(zip(spectra, stages, strict=True))
-    # What comes after the last stage that mends is done for the best start alone.
-    mending = [index + 1 for index, stage in enumerate(stages) if stage.mending and meshes is not None]
-    doubtful, certain = (steps[: mending[-1]], steps[mending[-1] :]) if mending else ([], steps)
+    through = partial_function(
+        _through, steps, samples=samples, meshes=meshes, partial=partial, history=history
+    )
     best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
     least, tried, told = np.inf, 0, ""
-    for start in chain([pointwise_map], other_starts) if doubtful else ():
-        refinements, flawed, suspicious = through(doubtful, start)
-        last = refinements[-1]
-        if last.result != RESULTS.successful:
-            if start is pointwise_map:
+    for start in chain([pointwise_map], other_starts):
+        refinements, flawed, suspicious = through(start)
+        first = start is pointwise_map
+        if refinements[-1].result != RESULTS.successful:
+            if first:
                 return refinements, start
             continue
-        doubted, tried = doubt(last, flawed), tried + 1
-        if not best[0] or doubted < least:
+        doubted, tried = doubt(refinements, flawed), tried + 1
+        if first or doubted < least:
             best, least = (refinements, start), doubted
             told = f"has flaw {flawed:.2f}" + ("; limbs may still be swapped" if suspicious else "")
         # Of several that look right one may be better: once in doubt, all are tried.
-        if start is pointwise_map:
+        if first:
             if not suspicious:
                 break
-            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.1): other starts", flawed)
+            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.12): other starts", flawed)
     if tried > 1:
         logger.info("the best of %d starts %s", tried, told)
-    refinements, start = best
-    so_far = refinements[-1].pointwise_map if refinements else start
-    return refinements + through(certain, so_far)[0], start
+    return best
 
 
-def doubt(refinement: Refinement, flawed: float) -> float:
-    """How doubtful a map is beside others of the same two shapes: the less, the better.
+def doubt(refinements: Sequence[Refinement], flawed: float) -> float:
+    """How doubtful the outcome of some stages is beside others of the same two shapes: the less, the better.
 
-    The logarithm of its `jaxsmw.geometry.faults.flaw`, and if it comes of `FeatureRegression` the uncertainty
-    of that.
+    The logarithm of its `jaxsmw.geometry.faults.flaw`, and the uncertainty of `FeatureRegression`, if that
+    was among the stages.
     """
-    uncertainty = refinement.updated.uncertainty if isinstance(refinement.updated, Regression) else 0
+    regressions = [found.updated for found in refinements if isinstance(found.updated, Regression)]
+    uncertainty = regressions[-1].uncertainty if regressions else 0
     return float(np.log(flawed) + _UNCERTAINTY * uncertainty)
 
 
+_Step = tuple[tuple[Spectrum, Spectrum], Stage]
+
+
 def _through(
-    steps: Sequence[tuple[tuple[Spectrum, Spectrum], Stage]],
+    steps: Sequence[_Step],
     pointwise_map: Int[Array, " m"],
     *,
     samples: Samples | None,
     meshes: tuple[Mesh, Mesh] | None,
-    finest: Spectrum,
     partial: bool,
     history: bool,
 ) -> tuple[list[Refinement], float, bool]:
-    """The outcomes of stages, up to the first that fails; and what `_mended` says of the last that mends."""
-    refinements: list[Refinement] = []
-    flawed, doubtful = np.inf, True
-    for (spectrum_x, spectrum_y), stage in steps:
-        run = partial_function(run_stage, spectrum_y=spectrum_y, samples=samples, history=history)
-        refinement = run(stage, spectrum_x, pointwise_map)
-        if stage.mending and meshes is not None and refinement.result == RESULTS.successful:
-            refinement, flawed, doubtful = _mended(
-                refinement, spectrum_x, stage, run, meshes, finest, partial
+    """The outcomes of stages, up to the first that fails; the flaw of the last, and whether it is suspicious.
+
+    Without a stage that mends nobody asks for a flaw.
+    """
+
+    def run(steps: Sequence[_Step], pointwise_map: Int[Array, " m"]) -> list[Refinement]:
+        refinements: list[Refinement] = []
+        for (spectrum_x, spectrum_y), stage in steps:
+            refinements.append(
+                run_stage(
+                    stage,
+                    spectrum_x,
+                    pointwise_map,
+                    spectrum_y=spectrum_y,
+                    samples=samples,
+                    history=history,
+                )
             )
-        refinements.append(refinement)
-        if refinement.result != RESULTS.successful:
-            break
-        pointwise_map = refinement.pointwise_map
-    return refinements, flawed, doubtful
+            if refinements[-1].result != RESULTS.successful:
+                break
+            pointwise_map = refinements[-1].pointwise_map
+        return refinements
+
+    mending = [position for position, (_, stage) in enumerate(steps) if stage.mending is not None]
+    if not mending or meshes is None:
+        return run(steps, pointwise_map), 1.0, False
+    before = run(steps[: mending[0]], pointwise_map)
+    if before:
+        if before[-1].result != RESULTS.successful:
+            return before, np.inf, True
+        pointwise_map = before[-1].pointwise_map
+    # Flaws show best in as many eigenvectors as there are.
+    finest = max((of_x for (of_x, _), _ in steps), key=lambda of_x: of_x.eigenvalues.shape[0])
+    mended, flawed, suspicious = _mended(steps[mending[0] :], pointwise_map, run, meshes, finest, partial)
+    return before + mended, flawed, suspicious
 
 
 def run_stage(
@@ -296,67 +317,69 @@ def run_stage(
 
 
 def _mended(
-    refinement: Refinement,
-    spectrum_x: Spectrum,
-    stage: Stage,
-    run: Callable[[Stage, Spectrum, Int[Array, " m"]], Refinement],
+    steps: Sequence[_Step],
+    pointwise_map: Int[Array, " m"],
+    run: Callable[[Sequence[_Step], Int[Array, " m"]], list[Refinement]],
     meshes: tuple[Mesh, Mesh],
     finest: Spectrum,
     partial: bool,
-) -> tuple[Refinement, float, bool]:
-    """The least doubtful of a refinement and of others, each begun without what was faulty in the last.
+) -> tuple[list[Refinement], float, bool]:
+    """The least doubtful outcome of stages and of others, each begun without what was faulty in the last.
 
-    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all. A
-    refinement that looks right is let be.
+    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all.
+    An outcome that looks right is let be.
     """
+    ((spectrum_x, spectrum_y), stage), *others = steps
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
-    eigenvectors = np.asarray(spectrum_x.eigenvectors)[:m]
+    eigenvectors = np.asarray(finest.eigenvectors)[:m, :_EIGENVECTORS]
 
-    def matches(refinement: Refinement) -> Int64[np.ndarray, " m"]:
-        return np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
+    def matches(refinements: list[Refinement]) -> Int64[np.ndarray, " m"]:
+        return np.asarray(refinements[-1].pointwise_map)[:m].astype(np.int64)
 
-    def faults(refinement: Refinement) -> list[Bool[np.ndarray, " m"]]:
-        found = matches(refinement)
+    def faults(refinements: list[Refinement]) -> list[Bool[np.ndarray, " m"]]:
+        found = matches(refinements)
         reversed_ = reversed_orientation(*meshes, found, eigenvectors, partial=partial)
         both = reversed_, torn_off(*meshes, found, partial=partial)
         return [fault for fault in both if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH]
 
-    def judged(refinement: Refinement) -> tuple[float, float, Refinement]:
-        flawed = flaw(*meshes, matches(refinement), finest, partial=partial)
-        return doubt(refinement, flawed), flawed, refinement
+    def judged(refinements: list[Refinement]) -> tuple[float, float, list[Refinement]]:
+        if refinements[-1].result != RESULTS.successful:
+            return np.inf, np.inf, refinements
+        flawed = flaw(*meshes, matches(refinements), finest, partial=partial)
+        return doubt(refinements, flawed), flawed, refinements
 
-    best = last = judged(refinement)
+    best = last = judged(run(steps, pointwise_map))
     if best[1] < _SUSPICIOUS:
-        return refinement, best[1], False
+        return best[-1], best[1], False
     for done in range(_ROUNDS):
-        some = faults(last[-1])
-        if best[1] < _SUSPICIOUS or not some:
+        if last[1] == np.inf or best[1] < _SUSPICIOUS:
+            break
+        if not (some := faults(last[-1])):
             break
         # By turns, what is reversed and what is torn off.
         sound = np.where(np.pad(some[done % len(some)], (0, len(areas) - m)), 0, areas)
         begun_without = replace(spectrum_x, vertex_areas=jax.device_put(sound))
-        refinement = run(stage, begun_without, last[-1].pointwise_map)
-        if refinement.result != RESULTS.successful:
-            break
-        last = judged(refinement)
+        again = [((begun_without, spectrum_y), stage), *others]
+        last = judged(run(again, last[-1][-1].pointwise_map))
         best = min(best, last, key=lambda outcome: outcome[0])
-    assert stage.mending is not None
-    refinement = run(stage.mending, spectrum_x, best[-1].pointwise_map)
-    if refinement.result == RESULTS.successful:
-        best = min(best, judged(refinement), key=lambda outcome: outcome[0])
-    _, least, refinement = best
-    return refinement, least, bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(refinement)))
+    if best[1] < np.inf and stage.mending is not None:
+        again = [((spectrum_x, spectrum_y), stage.mending), *others]
+        last = judged(run(again, best[-1][-1].pointwise_map))
+        best = min(best, last, key=lambda outcome: outcome[0])
+    _, least, refinements = best
+    suspicious = bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(refinements)))
+    return refinements, least, suspicious
 
 
-_ROUNDS = 4
+_ROUNDS, _EIGENVECTORS = 4, 50
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
 # What is more flawed than the first is mended. If something of it looks faulty even then, or it is more
 # flawed than the second, it is begun elsewhere.
-_SUSPICIOUS, _DOUBTFUL = 1.1, 1.15
+_SUSPICIOUS, _DOUBTFUL = 1.12, 1.15
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -158,7 +158,7 @@ def _starts_from_extremities(
         )
         if refinement.result == RESULTS.successful:
             found = _everywhere(np.asarray(refinement.pointwise_map).astype(np.int64), x, y)
-            outcomes.append((doubt(refinement, flaw(x.mesh, y.mesh, found, everything)), found))
+            outcomes.append((doubt([refinement], flaw(x.mesh, y.mesh, found, everything)), found))
     outcomes.sort(key=lambda outcome: outcome[0])
     for _, found in outcomes[:_LEAST_DOUBTFUL]:
         yield extend_to_unused(x.mesh, found)

@@ -91,16 +91,12 @@ class FeatureRegression(Refiner):
             back = _Moments.along(all_x.values[way_back], y.values, weights_y)
             moments = _Moments(*((a + b) / 2 for a, b in zip(forth, back, strict=True)))
         sizes = problem.spectrum_x.eigenvalues.shape[0], problem.spectrum_y.eigenvalues.shape[0]
-        counts_x, counts_y = (self._counts(iteration, size, max(sizes)) for size in sizes)
+        counts_x, counts_y = (
+            counting_eigenvectors(self.levels, iteration, size, max(sizes)) for size in sizes
+        )
         functional_map, forward = _regress(moments, counts_x, counts_y)
         _, backward = _regress(moments.turned, counts_y, counts_x)
         return Regression(functional_map, forward, backward, iteration), RESULTS.successful  # type: ignore[return-value]
-
-    def _counts(self, iteration: Int32[Array, ""], size: int, largest: int) -> Bool[Array, " k"]:
-        """Which of a shape's eigenvectors count in an iteration."""
-        levels = [-(-min(level, largest) * size // largest) for level in (*self.levels, largest)]
-        level = jnp.asarray(np.array(levels, np.int32))[jnp.minimum(iteration, len(self.levels))]
-        return jnp.arange(size, dtype=jnp.int32) < level
 
     def recover(self, problem: Problem, updated: Any) -> Int32[Array, " m"]:
         """The most likely vertices."""
@@ -128,6 +124,15 @@ class FeatureRegression(Refiner):
     def is_settled(self, updated: Any) -> Bool[Array, ""]:
         """Whether all levels have been gone through."""
         return updated.iteration >= len(self.levels)
+
+
+def counting_eigenvectors(
+    levels: tuple[int, ...], iteration: Int32[Array, ""], size: int, largest: int
+) -> Bool[Array, " k"]:
+    """Which of a shape's eigenvectors count in an iteration, if so many do of the shape with most of them."""
+    counts = [-(-min(level, largest) * size // largest) for level in (*levels, largest)]
+    level = jnp.asarray(np.array(counts, np.int32))[jnp.minimum(iteration, len(levels))]
+    return jnp.arange(size, dtype=jnp.int32) < level
 
 
 class _Features(NamedTuple):

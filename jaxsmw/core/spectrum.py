@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +28,8 @@ class Spectrum(eqx.Module):
     - `mask`: (n,), True for vertices of the surface.
     - `descriptors`: (n, d), what else is known of each vertex, or None. Comparable between shapes; zero where
       masked. Only methods that say so look at them.
+    - `positions`, `normals`: (n, 3) each, or None: where the vertices are, in units of length, and unit
+      vectors that point outwards; zero where masked. Only methods that say so look at them.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -34,6 +37,8 @@ class Spectrum(eqx.Module):
     vertex_areas: Float[Array, " n"]
     mask: Bool[Array, " n"]
     descriptors: Float[Array, "n d"] | None = None
+    positions: Float[Array, "n 3"] | None = None
+    normals: Float[Array, "n 3"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
         """The same shape with its first eigenpairs only."""
@@ -50,11 +55,16 @@ class Spectrum(eqx.Module):
             eigenvalues=self.eigenvalues / factor,
             eigenvectors=self.eigenvectors / factor**0.5,
             vertex_areas=self.vertex_areas * factor,
+            positions=None if self.positions is None else self.positions * factor**0.5,
         )
 
     def describe(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
         """The same shape with other descriptors, or none."""
         return dataclasses.replace(self, descriptors=descriptors)
+
+    def place(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
+        """The same shape with these positions, in its own unit of length, and unit normals."""
+        return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
         """The same shape with masked vertices up to a given number.
@@ -64,13 +74,7 @@ class Spectrum(eqx.Module):
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
             raise ValueError(f"a shape of {self.mask.shape[0]} vertices does not fit {number_of_vertices}")
-        return Spectrum(
-            self.eigenvalues,
-            jnp.pad(self.eigenvectors, ((0, rows), (0, 0))),
-            jnp.pad(self.vertex_areas, (0, rows)),
-            jnp.pad(self.mask, (0, rows)),
-            None if self.descriptors is None else jnp.pad(self.descriptors, ((0, rows), (0, 0))),
-        )
+        return self._at_vertices(lambda field: jnp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1))))
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
         """The shape seen at some evenly spread vertices only, each standing for the same share of the area.
@@ -79,10 +83,11 @@ class Spectrum(eqx.Module):
         sense of them.
         """
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
-        return Spectrum(
-            self.eigenvalues,
-            self.eigenvectors[vertices],
-            jnp.full(vertices.shape, share),
-            self.mask[vertices],
-            None if self.descriptors is None else self.descriptors[vertices],
-        )
+        sampled = self._at_vertices(lambda field: field[vertices])
+        return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
+
+    def _at_vertices(self, change: Callable[[Array], Array]) -> Spectrum:
+        """The same shape with everything that it has of each vertex changed."""
+        names = [field.name for field in dataclasses.fields(self) if field.name != "eigenvalues"]
+        of_vertices = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **{name: change(field) for name, field in of_vertices.items()})

@@ -77,9 +77,13 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """The `eigenpairs` of a mesh for JAX, in its default float type."""
-    arrays = eigenvalues, eigenvectors, vertex_areas, mesh.used_vertices
-    return Spectrum(*map(jax.device_put, arrays))  # `jnp.asarray` would compile something for every size
+    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions and normals."""
+    used = mesh.used_vertices
+    positions = np.where(used[:, None], mesh.vertices / np.sqrt(mesh.area), 0)
+    normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
+    # `jnp.asarray` would compile something for every size.
+    arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))
+    return Spectrum(*arrays).place(*map(jax.device_put, (positions, normals)))
 
 
 def eigenpairs(

@@ -1,0 +1,304 @@
+"""Refinement by registration: each surface bent onto the other, low frequencies first."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Int32
+
+from jaxsmw.core.checks import check_choice
+from jaxsmw.core.feature_regression import counting_eigenvectors
+from jaxsmw.core.functional_map import dual_eigenvectors
+from jaxsmw.core.pointwise_map import chosen_patches
+from jaxsmw.core.products import product
+from jaxsmw.core.refinement import Problem, Refiner, Samples
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
+from jaxsmw.core.spectrum import Spectrum
+
+# What counts beside positions in units of the square root of the area: unit normals; and the first so many
+# eigenfunctions over the square root of their eigenvalue and one.
+_NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
+# The time for which heat flows that averages over a vertex's surroundings: it spreads over a disk of radius
+# 0.1. It is longer where the eigenvectors do not reach so far that the last of them fades by this exponent.
+_HEAT_TIME, _FADES = 3e-3, 4.0
+# A matrix squared so often leaves its first eigenvector.
+_SQUARINGS = 12
+
+
+class Registration(Refiner):
+    """Matches where X, bent onto Y, comes to lie next to it, and Y, bent onto X, next to that.
+
+    Low frequencies of a bent surface are those of its matches: their positions in the span of the first
+    eigenvectors, more of them in every iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020).
+    What the surface itself has beyond these, its details, is carried along by the rotation of its
+    surroundings, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007); the one that fits best is had
+    from averages by heat flow. All of this is filtering, nothing is solved. The next matches are nearest in
+    position, normal and the first eigenfunctions, on both surfaces at once.
+
+    It starts from a map that is nearly right, and ends nearer the truth than methods that know
+    eigenfunctions alone: docs/accuracy.md measures both. The spectra need positions and normals, which those
+    of `jaxsmw.compute_spectrum` have. Where one surface is the mirror image of the other, rotations are, too.
+
+    **Arguments:**
+
+    - `levels`: how many eigenvectors count in each iteration (of the shape with more of them; of the other in
+      proportion); after these all of them count.
+    - `partial`: for shapes of which one is a part of the other, in the same unit of length. Whole ones are
+      compared at area 1.
+    - `search`: how the last matches are found, among all vertices. `"exhaustive"` compares all with all;
+      `"patches"` finds the same but leaves out patches of the target that are too far away; `"auto"` does
+      that on CPUs from 15 000 vertices.
+    """
+
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    partial: bool = eqx.field(static=True, default=False)
+    search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
+
+    def __check_init__(self) -> None:
+        check_choice("search", self.search, ("auto", "exhaustive", "patches"))
+        if any(level < 1 for level in self.levels):
+            raise ValueError(f"the levels are {self.levels}, but each needs an eigenvector at least")
+
+    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
+        """Bring both surfaces to one scale.
+
+        **Raises:** `ValueError` if a spectrum has no positions and normals.
+        """
+        areas = [jnp.sum(spectrum.vertex_areas) for spectrum in (spectrum_x, spectrum_y)]
+        if self.partial:
+            areas = [jnp.maximum(*areas)] * 2
+        all_x, all_y = _Surface.of(spectrum_x, areas[0]), _Surface.of(spectrum_y, areas[1])
+        if samples is None:
+            there = chosen_patches(self.search, spectrum_x, spectrum_y)
+            back = chosen_patches(self.search, spectrum_y, spectrum_x)
+            return Problem(spectrum_x, spectrum_y, _Prepared(all_x, all_y, all_x, all_y, there, back))
+        spectrum_x, spectrum_y = spectrum_x.sample(samples[0]), spectrum_y.sample(samples[1])
+        x, y = all_x.sample(spectrum_x, samples[0]), all_y.sample(spectrum_y, samples[1])
+        return Problem(spectrum_x, spectrum_y, _Prepared(x, y, all_x, all_y, None, None))
+
+    def update(
+        self, problem: Problem, pointwise_map: Int[Array, " m"], previous: Any
+    ) -> tuple[Registered, RESULTS]:
+        """Bend X by the matches, and Y by those of the way back."""
+        x, y, all_x, all_y, _, patches = problem.prepared
+        iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
+        sizes = [spectrum.eigenvalues.shape[0] for spectrum in (problem.spectrum_x, problem.spectrum_y)]
+        counts_x, counts_y = (counting_eigenvectors(self.levels, iteration, k, max(sizes)) for k in sizes)
+        forth = _Bending.along(x, all_y, pointwise_map, counts_x)
+        if previous is None:  # The first way back is from where Y is to where X is bent to.
+            asking, answering = y.points, forth.points(all_x)
+        else:
+            answering, asking = _product_space(all_x, y, previous)
+        back = _Bending.along(y, all_x, _nearest(asking, answering, all_x.mask, patches), counts_y)
+        return Registered(forth, back, iteration), RESULTS.successful  # type: ignore[return-value]
+
+    def recover(self, problem: Problem, updated: Registered) -> Int32[Array, " m"]:
+        """The nearest vertices."""
+        _, _, _, all_y, patches, _ = problem.prepared
+        return _nearest(*self.embeddings(problem, updated), all_y.mask, patches)
+
+    def energy(
+        self, problem: Problem, updated: Registered, pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """The `objective` of the matches by which X was bent."""
+        return self.objective(problem, updated, pointwise_map)
+
+    def embeddings(
+        self, problem: Problem, updated: Registered
+    ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+        """Positions, and beside them what else counts, of X bent and as it is, and of Y as it is and bent."""
+        x, _, _, all_y, _, _ = problem.prepared
+        return _product_space(x, all_y, updated)
+
+    def functional_map(self, updated: Registered) -> Float[Array, "k_x k_y"]:
+        """That of the matches by which X was bent."""
+        return updated.forth.functional_map
+
+    def is_settled(self, updated: Registered) -> Bool[Array, ""]:
+        """Whether all levels have been gone through."""
+        return updated.iteration >= len(self.levels)
+
+
+class _Surface(NamedTuple):
+    """What is known of some vertices of a shape, in units of the square root of the area.
+
+    `points` are positions, normals and eigenfunctions, each times what it counts.
+    """
+
+    eigenvectors: Float[Array, "n k"]
+    dual: Float[Array, "n k"]
+    weights: Float[Array, " n"]
+    heat: Float[Array, " k"]
+    time: Float[Array, ""]
+    positions: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    points: Float[Array, "n d"]
+    mask: Bool[Array, " n"]
+
+    @classmethod
+    def of(cls, spectrum: Spectrum, area: Float[Array, ""]) -> _Surface:
+        """All vertices."""
+        if spectrum.positions is None or spectrum.normals is None:
+            raise ValueError(
+                "Registration needs positions and normals, which a spectrum lacks: compute_spectrum gives "
+                "them, and Spectrum.place adds them"
+            )
+        dtype = spectrum.eigenvectors.dtype
+        weights = spectrum.vertex_areas / jnp.sum(spectrum.vertex_areas)
+        center = product(weights, spectrum.positions)
+        positions = (spectrum.positions - center[None]) / jnp.sqrt(area)
+        eigenvalues, eigenvectors = spectrum.eigenvalues * area, spectrum.eigenvectors * jnp.sqrt(area)
+        first = slice(min(_NUMBER_OF_EIGENFUNCTIONS, eigenvalues.shape[0]))
+        smooth = eigenvectors[:, first] / jnp.sqrt(1 + eigenvalues[None, first])
+        points = [positions, _NORMALS * spectrum.normals, _EIGENFUNCTIONS * smooth]
+        time = jnp.maximum(_HEAT_TIME, _FADES / eigenvalues[-1])
+        return cls(
+            spectrum.eigenvectors,
+            dual_eigenvectors(spectrum, "area"),
+            weights,
+            jnp.exp(-time * eigenvalues),
+            time,
+            positions,
+            spectrum.normals,
+            jnp.concatenate(points, axis=1).astype(dtype),
+            spectrum.mask,
+        )
+
+    def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
+        """Some of them, whose spectrum is given, for all."""
+        dual = dual_eigenvectors(spectrum, "least_squares")
+        weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
+        fields = (self.positions, self.normals, self.points, self.mask)
+        positions, normals, points, mask = (field[vertices] for field in fields)
+        return _Surface(
+            spectrum.eigenvectors, dual, weights, self.heat, self.time, positions, normals, points, mask
+        )
+
+
+class _Prepared(NamedTuple):
+    """The vertices to be matched of both shapes, all of both, and patches if searches are to use them."""
+
+    x: _Surface
+    y: _Surface
+    all_x: _Surface
+    all_y: _Surface
+    patches: tuple[Patches, Patches] | None
+    patches_back: tuple[Patches, Patches] | None
+
+
+class _Bending(NamedTuple):
+    """What bends a surface onto another: coefficients of its eigenvectors.
+
+    - `own`, `matched`: of its positions and of the `points` of their matches, as far as eigenvectors count.
+    - `moments`: of averages of positions, matches' positions and products of both, and of normals' products.
+    """
+
+    functional_map: Float[Array, "k_x k_y"]
+    own: Float[Array, "k_x 3"]
+    matched: Float[Array, "k_x d"]
+    moments: Float[Array, "k_x 24"]
+
+    @classmethod
+    def along(
+        cls,
+        surface: _Surface,
+        other: _Surface,
+        matches: Int[Array, " s"],
+        counts: Bool[Array, " k_x"],
+    ) -> _Bending:
+        """By matches of vertices of a surface among all of the other."""
+
+        def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
+            return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
+
+        own, matched = surface.positions, other.positions[matches]
+        normals = products(surface.normals, other.normals[matches])
+        averaged = jnp.concatenate([own, matched, products(own, matched), normals], axis=1)
+        fields = (other.eigenvectors[matches], own, other.points[matches], averaged)
+        coefficients = product(surface.dual.T, jnp.concatenate(fields, axis=1))
+        ends = np.cumsum([field.shape[1] for field in fields])[:-1]
+        functional_map, own, matched, moments = jnp.split(coefficients, ends, axis=1)
+        own, matched = (jnp.where(counts[:, None], low, 0) for low in (own, matched))
+        return cls(functional_map, own, matched, surface.heat[:, None] * moments)
+
+    def points(self, surface: _Surface) -> Float[Array, "s d"]:
+        """Where vertices of the surface come to lie, among the other's `points`."""
+        low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
+        own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
+        rotations = _rotations(moments, surface)
+        details = surface.positions - own
+        positions, normals = (
+            jnp.sum(rotations * vectors[:, None, :], axis=2) for vectors in (details, surface.normals)
+        )
+        return jnp.concatenate([matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]], axis=1)
+
+
+class Registered(NamedTuple):
+    """What `Registration` hands on: what bends X onto Y, and Y onto X."""
+
+    forth: _Bending
+    back: _Bending
+    iteration: Int32[Array, ""]
+
+
+def _product_space(
+    x: _Surface, y: _Surface, registered: Registered
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    """Points of both surfaces, at small distances where one comes to lie on the other and vice versa."""
+    return (
+        jnp.concatenate([registered.forth.points(x), x.points], axis=1),
+        jnp.concatenate([y.points, registered.back.points(y)], axis=1),
+    )
+
+
+def _nearest(
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    mask: Bool[Array, " n"],
+    patches: tuple[Patches, Patches] | None,
+) -> Int32[Array, " m"]:
+    if patches is None:
+        return nearest_neighbor(queries, database, database_mask=mask)
+    return nearest_neighbor_in_patches(queries, database, *patches)
+
+
+def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
+    """The rotations that take surroundings of vertices best to where these are matched.
+
+    All of them with a reflection if the surface as a whole is turned inside out.
+    """
+    own, matched = moments[:, :3], moments[:, 3:6]
+    products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
+    # In the tangential plane the variance is twice the time that heat flows; of normals the square is one.
+    covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
+    hand = jnp.sign(jnp.sum(surface.weights * jnp.linalg.det(covariance)))
+    return hand * jax.vmap(_nearest_rotation)(hand * covariance)
+
+
+def _nearest_rotation(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The rotation R that makes the trace of R S greatest, from quaternions (Horn 1987)."""
+    total = jnp.trace(covariance)
+    skew = covariance - covariance.T
+    axis = jnp.stack([skew[1, 2], skew[2, 0], skew[0, 1]])
+    identity = jnp.eye(3, dtype=covariance.dtype)
+    inner = covariance + covariance.T - total * identity
+    matrix = jnp.block([[total[None, None], axis[None, :]], [axis[:, None], inner]])
+    size = jnp.sqrt(jnp.sum(matrix**2))
+    # Without negative eigenvalues the largest is what prevails in powers.
+    powers = matrix / jnp.where(size > 0, size, 1) + jnp.eye(4, dtype=matrix.dtype)
+    for _ in range(_SQUARINGS):
+        powers = jnp.sum(powers[:, :, None] * powers[None, :, :], axis=1)
+        powers = powers / jnp.trace(powers)
+    quaternion = powers[jnp.argmax(jnp.diagonal(powers))]
+    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
+    rows = (
+        (1 - 2 * (y**2 + z**2), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x**2 + z**2), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)),
+    )
+    return jnp.stack([jnp.stack(row) for row in rows])

@@ -1,0 +1,265 @@
+"""Refinement by registration of surfaces."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from synthetic import bumpy_mesh
+
+from jaxsmw.core.feature_regression import FeatureRegression
+from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.registration import Registration, _nearest_rotation
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.creature import creature_pair
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import make_mesh
+
+K = 60
+
+
+def changed(mesh, order, motion):
+    """The mesh with vertices in another order, each moved."""
+    place = np.argsort(order)
+    return make_mesh(motion(mesh.vertices[order]), place[mesh.faces])
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A body; the same turned, moved and renumbered; the true map and a start that is nearly right."""
+    mesh = bumpy_mesh(3)
+    generator = np.random.default_rng(0)
+    order = generator.permutation(len(mesh.vertices))
+    turn = Rotation.from_rotvec([0.3, 2.2, -1.0]).as_matrix()
+    moved = changed(mesh, order, lambda vertices: 7 * vertices @ turn.T + [100, -50, 3])
+    truth = np.argsort(order)
+    disturbed = mesh.vertices + 0.15 * generator.normal(size=mesh.vertices.shape)
+    start = truth[KDTree(mesh.vertices).query(disturbed)[1]]
+    return compute_spectrum(mesh, K), compute_spectrum(moved, K), jnp.asarray(start, jnp.int32), truth, mesh
+
+
+def defined(x: Spectrum, y: Spectrum, t, levels):
+    """Two turns, from definitions: vertex by vertex, with singular value decompositions and all distances."""
+
+    def own(s):
+        a, lam = np.asarray(s.vertex_areas), np.asarray(s.eigenvalues)
+        positions = np.asarray(s.positions) - a @ np.asarray(s.positions)
+        smooth = 0.2 * np.asarray(s.eigenvectors)[:, :50] / np.sqrt(1 + lam[:50])
+        points = np.hstack([positions, 0.02 * np.asarray(s.normals), smooth])
+        return positions, np.asarray(s.normals), points
+
+    def bent(s, o, matches, level):
+        phi, a, lam = (np.asarray(f) for f in (s.eigenvectors, s.vertex_areas, s.eigenvalues))
+        (positions, normals, _), (_, others, points) = own(s), own(o)
+        matched, turned = points[matches], others[matches]
+        time = max(3e-3, 4 / lam[-1])
+        heat = phi @ (np.exp(-time * lam)[:, None] * phi.T) * a
+        low = phi[:, :level] @ phi[:, :level].T * a
+        mean_x, mean_y = heat @ positions, heat @ matched[:, :3]
+        rotations = []
+        for i, row in enumerate(heat):
+            second = np.einsum("j,ja,jb->ab", row, positions, matched[:, :3])
+            spread = second - np.outer(mean_x[i], mean_y[i])
+            u, _, vt = np.linalg.svd(spread / (2 * time) + np.einsum("j,ja,jb->ab", row, normals, turned))
+            rotations.append((u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T)
+        rotations = np.array(rotations)
+        details = np.einsum("iab,ib->ia", rotations, positions - low @ positions)
+        place = low @ matched
+        place[:, :3] += details
+        place[:, 3:6] = 0.02 * np.einsum("iab,ib->ia", rotations, normals)
+        return place
+
+    back = None
+    for level in levels:
+        forth = bent(x, y, t, level)
+        of_x, of_y = own(x)[2], own(y)[2]
+        asked, asking = (forth, of_y) if back is None else (queries, database)
+        back = KDTree(asked).query(asking)[1]
+        queries, database = np.hstack([forth, of_x]), np.hstack([of_y, bent(y, x, back, level)])
+        t = KDTree(database).query(queries)[1]
+    return t, queries, database
+
+
+def test_is_what_its_definition_says(pair):
+    x, y, start, *_ = pair
+    refiner = Registration((20,))
+    found = refine(x, y, start, refiner=refiner, iterations=2, history=True)
+    t, queries, database = defined(x, y, np.asarray(start), (20, K))
+    np.testing.assert_array_equal(found.pointwise_map, t)
+    for points, expected in zip(
+        refiner.embeddings(refiner.prepare(x, y), found.updated), (queries, database), strict=True
+    ):
+        np.testing.assert_allclose(points, expected, atol=1e-8)
+    distances = np.sum((queries - database[t]) ** 2, axis=1)
+    np.testing.assert_allclose(found.history.objective[1], np.asarray(x.vertex_areas) @ distances, rtol=1e-6)
+
+
+def test_rotations_are_the_best_there_are():
+    """Of any matrices, also where the best orthogonal one is a reflection, and for turns by 180 degrees."""
+    generator = np.random.default_rng(0)
+    turns = Rotation.random(40, rng=generator).as_matrix()
+    covariances = np.concatenate(
+        [generator.normal(size=(200, 3, 3)), turns * [1, 2, 3], np.diag([1.0, -1, -1])[None], np.eye(3)[None]]
+    )
+    assert (np.linalg.det(covariances) < 0).sum() > 50
+    u, _, vt = np.linalg.svd(covariances)
+    hand = np.linalg.det(u @ vt)
+    expected = np.einsum("nia,na,naj->nji", u, np.stack([hand**0, hand**0, hand], axis=1), vt)
+    found = np.asarray(jax.vmap(_nearest_rotation)(jnp.asarray(covariances)))
+    np.testing.assert_allclose(
+        found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), found.shape), atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-9)
+    gain, best = (np.einsum("nij,nji->n", r, covariances) for r in (found, expected))
+    np.testing.assert_allclose(gain, best, rtol=1e-3)
+    clear = np.abs(gain - best) < 1e-9
+    assert clear.mean() > 0.9
+    np.testing.assert_allclose(found[clear], expected[clear], atol=1e-4)
+    assert np.isfinite(_nearest_rotation(jnp.zeros((3, 3)))).all()
+
+
+def test_a_body_that_only_moved_is_found_again(pair):
+    x, y, start, truth, _ = pair
+    assert np.mean(np.asarray(start) == truth) < 0.3
+    found = refine(x, y, start, refiner=Registration((20, 40)), iterations=4)
+    assert found.result == RESULTS.successful
+    np.testing.assert_array_equal(found.pointwise_map, truth)
+    # Each lies where the other does.
+    queries, database = Registration().embeddings(Registration().prepare(x, y), found.updated)
+    np.testing.assert_allclose(queries, np.asarray(database)[truth], atol=1e-6)
+
+
+def test_the_mirror_image_is_found_as_well(pair):
+    x, _, start, truth, mesh = pair
+    order = np.argsort(truth)
+    mirrored = changed(mesh, order, lambda vertices: vertices * [-1, 1, 1])
+    mirrored = make_mesh(mirrored.vertices, mirrored.faces[:, ::-1])
+    found = refine(x, compute_spectrum(mirrored, K), start, refiner=Registration((20, 40)), iterations=4)
+    np.testing.assert_array_equal(found.pointwise_map, truth)
+
+
+def test_which_way_faces_run_does_not_matter(pair):
+    x, y, start, _, mesh = pair
+    turned = compute_spectrum(make_mesh(mesh.vertices, mesh.faces[:, ::-1]), K)
+    np.testing.assert_allclose(turned.normals, x.normals, atol=1e-12)
+    np.testing.assert_array_equal(
+        *(refine(one, y, start, refiner=Registration()).pointwise_map for one in (turned, x))
+    )
+
+
+def test_ends_nearer_the_truth_than_eigenfunctions_alone():
+    """Another pose, other triangles."""
+    pair = creature_pair(vertices=1200, seed=3)
+    x, y = (compute_spectrum(mesh, 100) for mesh in (pair.source, pair.target))
+    target, place = pair.target.vertices, pair.truth.positions(pair.target)
+    unit = pair.target.area**0.5
+    disturbed = place + 0.05 * unit * np.random.default_rng(0).normal(size=place.shape)
+    start = jnp.asarray(KDTree(target).query(disturbed)[1], jnp.int32)
+
+    def error(refiner):
+        found = refine(x, y, start, refiner=refiner, iterations=4).pointwise_map
+        return np.linalg.norm(target[np.asarray(found)] - place, axis=1).mean() / unit
+
+    best = error(Registration((30, 50, 70)))
+    for other in (WaveletPreservation(), FeatureRegression((30, 50, 70))):
+        assert best < 0.9 * error(other)
+
+
+def test_signs_and_padding_and_vmap(pair):
+    x, y, start, *_ = pair
+    refiner = Registration((20, 40))
+    plain = refine(x, y, start, refiner=refiner, history=True)
+    generator = np.random.default_rng(4)
+    flipped = [
+        eqx.tree_at(lambda s: s.eigenvectors, s, s.eigenvectors * generator.choice([-1.0, 1.0], (1, K)))
+        for s in (x, y)
+    ]
+    np.testing.assert_array_equal(refine(*flipped, start, refiner=refiner).pointwise_map, plain.pointwise_map)
+    m = len(start)
+    wide = refine(x.pad(m + 30), y.pad(m + 30), jnp.pad(start, (0, 30)), refiner=refiner, history=True)
+    np.testing.assert_array_equal(wide.pointwise_map[:m], plain.pointwise_map)
+    np.testing.assert_allclose(wide.history.energy, plain.history.energy, rtol=1e-9, atol=1e-12)
+    way_back = jnp.asarray(KDTree(np.asarray(y.positions)).query(np.asarray(x.positions))[1], jnp.int32)
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *sides) for sides in ((x, y), (y, x))]
+    both = eqx.filter_vmap(lambda *arguments: refine(*arguments, refiner=refiner))(
+        *stacked, jnp.stack([start, way_back])
+    )
+    np.testing.assert_array_equal(both.pointwise_map[0], plain.pointwise_map)
+    np.testing.assert_array_equal(
+        both.pointwise_map[1], refine(y, x, way_back, refiner=refiner).pointwise_map
+    )
+
+
+def test_patches_find_the_same(pair):
+    x, y, start, *_ = pair
+    maps = [
+        refine(x, y, start, refiner=Registration(search=search)).pointwise_map
+        for search in ("exhaustive", "patches")
+    ]
+    np.testing.assert_array_equal(*maps)
+
+
+def test_samples_ask_and_all_vertices_answer(pair):
+    x, y, start, truth, _ = pair
+    generator = np.random.default_rng(1)
+    samples = [jnp.asarray(generator.choice(len(truth), 300, replace=False)) for _ in "xy"]
+    found = refine(x, y, start, refiner=Registration((20,)), samples_x=samples[0], samples_y=samples[1])
+    assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
+
+
+def test_a_part_keeps_its_size(pair):
+    """In the unit of the whole; bodies that are whole are compared at area 1."""
+    x, *_, mesh = pair
+    kept = mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0.3
+    used, faces = np.unique(mesh.faces[kept], return_inverse=True)
+    part = make_mesh(mesh.vertices[used], faces.reshape(-1, 3))
+    y = compute_spectrum(part, 10).scale(part.area / mesh.area)
+    spread = []
+    for refiner in (Registration(partial=True), Registration()):
+        prepared = refiner.prepare(x, y).prepared
+        positions = np.asarray(prepared.all_x.points)[used, :3], np.asarray(prepared.all_y.points)[:, :3]
+        spread.append([np.linalg.norm(points[1:] - points[:-1], axis=1) for points in positions])
+    np.testing.assert_allclose(spread[0][1], spread[0][0], rtol=1e-9)
+    np.testing.assert_allclose(spread[1][1], spread[1][0] * (mesh.area / part.area) ** 0.5, rtol=1e-9)
+
+
+def test_float32_stays_float32_and_agrees(pair):
+    x, y, start, truth, _ = pair
+    single = [
+        jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, s) for s in (x, y)
+    ]
+    found = refine(*single, start, refiner=Registration((20, 40)), iterations=4)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found.updated)} == {
+        np.dtype(np.float32),
+        np.dtype(np.int32),
+    }
+    np.testing.assert_array_equal(found.pointwise_map, truth)
+
+
+def test_does_not_stop_before_the_last_level(pair):
+    x, y, start, *_ = pair
+    refiner = Registration((20,) * 8)
+    found = refine(x, y, start, refiner=refiner, iterations=40, stop_when_unchanged=True)
+    assert 9 < found.iterations < 40
+
+
+def test_what_cannot_work_is_refused(pair):
+    x, y, start, *_ = pair
+    bare = Spectrum(y.eigenvalues, y.eigenvectors, y.vertex_areas, y.mask)
+    with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.place"):
+        refine(x, bare, start, refiner=Registration())
+    placed = refine(x, bare.place(y.positions, y.normals), start, refiner=Registration())
+    np.testing.assert_array_equal(
+        placed.pointwise_map, refine(x, y, start, refiner=Registration()).pointwise_map
+    )
+    with pytest.raises(ValueError, match="needs an eigenvector"):
+        Registration((20, 0))
+    with pytest.raises((ValueError, TypeCheckError), match="search"):
+        Registration(search="quick")
+    broken = x.place(x.positions.at[3, 1].set(jnp.nan), x.normals)
+    found = refine(broken, y, start, refiner=Registration())
+    assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()
