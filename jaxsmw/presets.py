@@ -197,8 +197,8 @@ def refine_in_stages(
     left and right, and for where it joins the body. From a stage that is to mend this on, the outcome is
     looked at for both (`jaxsmw.geometry.faults`), by turns, and these stages are gone through again from a
     functional map that the faulty part had no say in, and at last with `mending` in place of the first of
-    them. The least doubtful map they came by is the outcome. Where that does not help, all stages are gone
-    through from other starts, too. Maps that look right are let be.
+    them. That is the outcome if it looks right, otherwise the least doubtful map so far; and all stages are
+    gone through from other starts, too. Maps that look right at once are let be.
 
     **Arguments:**
 
@@ -231,7 +231,7 @@ def refine_in_stages(
         if first:
             if not suspicious:
                 break
-            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.12): other starts", flawed)
+            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.2): other starts", flawed)
     if tried > 1:
         logger.info("the best of %d starts %s", tried, told)
     return best
@@ -324,10 +324,10 @@ def _mended(
     finest: Spectrum,
     partial: bool,
 ) -> tuple[list[Refinement], float, bool]:
-    """The least doubtful outcome of stages and of others, each begun without what was faulty in the last.
+    """The outcome of stages, or of others, each begun without what was faulty in the last.
 
-    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all.
-    An outcome that looks right is let be.
+    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all,
+    and that taken if it looks right, otherwise the least doubtful. What looks right at once is let be.
     """
     ((spectrum_x, spectrum_y), stage), *others = steps
     m = len(meshes[0].vertices)
@@ -366,10 +366,9 @@ def _mended(
     if best[1] < np.inf and stage.mending is not None:
         again = [((spectrum_x, spectrum_y), stage.mending), *others]
         last = judged(run(again, best[-1][-1].pointwise_map))
-        best = min(best, last, key=lambda outcome: outcome[0])
-    _, least, refinements = best
-    suspicious = bool(least > _DOUBTFUL or (least > _SUSPICIOUS and faults(refinements)))
-    return refinements, least, suspicious
+        # It knows least of what misled the others: it is preferred where it looks right at all.
+        best = last if last[1] < _DOUBTFUL else min(best, last, key=lambda outcome: outcome[0])
+    return best[-1], best[1], best[1] > _DOUBTFUL
 
 
 _ROUNDS, _EIGENVECTORS = 4, 50
@@ -377,9 +376,9 @@ _ROUNDS, _EIGENVECTORS = 4, 50
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
-# What is more flawed than the first is mended. If something of it looks faulty even then, or it is more
-# flawed than the second, it is begun elsewhere.
-_SUSPICIOUS, _DOUBTFUL = 1.12, 1.15
+# What is more flawed than the first is mended: right maps between poses of one body are less. What is more
+# flawed than the second even then is begun elsewhere: right maps between bodies of different kinds are less.
+_SUSPICIOUS, _DOUBTFUL = 1.12, 1.2
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

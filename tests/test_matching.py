@@ -335,7 +335,7 @@ def test_presets_find_the_copy(pair):
     accurate, paper = match(mesh_x, mesh_y), match(mesh_x, mesh_y, preset="paper")
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (accurate, paper)]
     assert max(errors) < 0.002  # of a copy
-    assert accurate.iterations == 3 + 8 + 3 and accurate.functional_map.shape == (200, 200)
+    assert accurate.iterations == 3 + 4 + 4 and accurate.functional_map.shape == (200, 200)
     assert list(accurate.seconds) == ["eigenbases", "initial map", "descriptors", "samples", "refinement"]
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()

@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_choice
@@ -219,12 +218,16 @@ class _Bending(NamedTuple):
         own, matched = surface.positions, other.positions[matches]
         normals = products(surface.normals, other.normals[matches])
         averaged = jnp.concatenate([own, matched, products(own, matched), normals], axis=1)
-        fields = (other.eigenvectors[matches], own, other.points[matches], averaged)
-        coefficients = product(surface.dual.T, jnp.concatenate(fields, axis=1))
-        ends = np.cumsum([field.shape[1] for field in fields])[:-1]
-        functional_map, own, matched, moments = jnp.split(coefficients, ends, axis=1)
-        own, matched = (jnp.where(counts[:, None], low, 0) for low in (own, matched))
-        return cls(functional_map, own, matched, surface.heat[:, None] * moments)
+
+        def coefficients(values: Float[Array, "s d"]) -> Float[Array, "k_x d"]:
+            return product(surface.dual.T, values)
+
+        return cls(
+            coefficients(other.eigenvectors[matches]),
+            jnp.where(counts[:, None], coefficients(own), 0),
+            jnp.where(counts[:, None], coefficients(other.points[matches]), 0),
+            surface.heat[:, None] * coefficients(averaged),
+        )
 
     def points(self, surface: _Surface) -> Float[Array, "s d"]:
         """Where vertices of the surface come to lie, among the other's `points`."""
@@ -276,7 +279,8 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
     # In the tangential plane the variance is twice the time that heat flows; of normals the square is one.
     covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
-    hand = jnp.sign(jnp.sum(surface.weights * jnp.linalg.det(covariance)))
+    turned = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
+    hand = jnp.where(turned, -1, 1).astype(covariance.dtype)
     return hand * jax.vmap(_nearest_rotation)(hand * covariance)
 
 
