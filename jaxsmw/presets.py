@@ -368,7 +368,7 @@ def _mended(
         last = judged(run(again, best[-1][-1].pointwise_map))
         # It knows least of what misled the others: it is preferred where it looks right at all.
         best = last if last[1] < _DOUBTFUL else min(best, last, key=lambda outcome: outcome[0])
-    return best[-1], best[1], best[1] > _DOUBTFUL
+    return best[-1], best[1], bool(best[1] > _DOUBTFUL)
 
 
 _ROUNDS, _EIGENVECTORS = 4, 50
