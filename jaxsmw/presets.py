@@ -349,6 +349,10 @@ def _mended(
         flawed = flaw(*meshes, matches(refinements), finest, partial=partial)
         return doubt(refinements, flawed), flawed, refinements
 
+    def looks_right(outcome: tuple[float, float, list[Refinement]]) -> bool:
+        _, flawed, refinements = outcome
+        return flawed < _SUSPICIOUS or (flawed < _DOUBTFUL and not faults(refinements))
+
     best = last = judged(run(steps, pointwise_map))
     if best[1] < _SUSPICIOUS:
         return best[-1], best[1], False
@@ -366,9 +370,11 @@ def _mended(
     if best[1] < np.inf and stage.mending is not None:
         again = [((spectrum_x, spectrum_y), stage.mending), *others]
         last = judged(run(again, best[-1][-1].pointwise_map))
-        # It knows least of what misled the others: it is preferred where it looks right at all.
-        best = last if last[1] < _DOUBTFUL else min(best, last, key=lambda outcome: outcome[0])
-    return best[-1], best[1], bool(best[1] > _DOUBTFUL)
+        # It knows least of what misled the others, and is preferred if it looks right and is hardly more
+        # doubtful: those upside down are far more.
+        preferred = looks_right(last) and last[0] < best[0] + _HARDLY
+        best = last if preferred else min(best, last, key=lambda outcome: outcome[0])
+    return best[-1], best[1], not looks_right(best)
 
 
 _ROUNDS, _EIGENVECTORS = 4, 50
@@ -377,8 +383,11 @@ _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
 # What is more flawed than the first is mended: right maps between poses of one body are less. What is more
-# flawed than the second even then is begun elsewhere: right maps between bodies of different kinds are less.
+# flawed than the second even then, or something of it looks faulty, is begun elsewhere: right maps between
+# bodies of different kinds are less flawed.
 _SUSPICIOUS, _DOUBTFUL = 1.12, 1.2
+# In `doubt`: the best of right maps differ by less, and those upside down by more.
+_HARDLY = 0.35
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -86,7 +86,7 @@ class FeatureRegression(Refiner):
             if self.partial:
                 residuals_x = previous.forward.residuals(x, all_y, pointwise_map)
                 residuals_y = previous.backward.residuals(y, all_x, way_back)
-                weights_x, weights_y = _doubted(weights_x, residuals_x, weights_y, residuals_y)
+                weights_x, weights_y = doubted(weights_x, residuals_x, weights_y, residuals_y)
             forth = _Moments.along(x.values, all_y.values[pointwise_map], weights_x)
             back = _Moments.along(all_x.values[way_back], y.values, weights_y)
             moments = _Moments(*((a + b) / 2 for a, b in zip(forth, back, strict=True)))
@@ -223,7 +223,7 @@ class _Moments(NamedTuple):
         return _Moments(self.yy, self.xy.T, self.xx)
 
 
-def _doubted(
+def doubted(
     weights_x: Float[Array, " m"],
     residuals_x: Float[Array, " m"],
     weights_y: Float[Array, " n"],
@@ -233,7 +233,7 @@ def _doubted(
     mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
 
     def doubt(weights: Array, residuals: Array, mean: Array, other: Array) -> Array:
-        falling = weights / (1 + (residuals / other) ** 2)
+        falling = weights / (1 + (residuals / jnp.maximum(other, jnp.finfo(other.dtype).tiny)) ** 2)
         return jnp.where(mean > other, falling / jnp.sum(falling), weights)
 
     return doubt(weights_x, residuals_x, mean_x, mean_y), doubt(weights_y, residuals_y, mean_y, mean_x)

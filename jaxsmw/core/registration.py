@@ -7,10 +7,11 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.feature_regression import counting_eigenvectors
+from jaxsmw.core.feature_regression import counting_eigenvectors, doubted
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
@@ -25,6 +26,8 @@ _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
 # The time for which heat flows that averages over a vertex's surroundings: it spreads over a disk of radius
 # 0.1. It is longer where the eigenvectors do not reach so far that the last of them fades by this exponent.
 _HEAT_TIME, _FADES = 3e-3, 4.0
+# Beside the mean square of eigenvectors, where some vertices hardly count.
+_RIDGE = 1e-3
 # A matrix squared so often leaves its first eigenvector.
 _SQUARINGS = 12
 
@@ -47,8 +50,9 @@ class Registration(Refiner):
 
     - `levels`: how many eigenvectors count in each iteration (of the shape with more of them; of the other in
       proportion); after these all of them count.
-    - `partial`: for shapes of which one is a part of the other, in the same unit of length. Whole ones are
-      compared at area 1.
+    - `partial`: for shapes of which one is a part of the other, in the same unit of length; whole ones are
+      compared at area 1. Many vertices of the whole have no match on the part: the worse one's match fits,
+      beside the part's on average, the less it counts.
     - `search`: how the last matches are found, among all vertices. `"exhaustive"` compares all with all;
       `"patches"` finds the same but leaves out patches of the target that are too far away; `"auto"` does
       that on CPUs from 15 000 vertices.
@@ -88,12 +92,20 @@ class Registration(Refiner):
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
         sizes = [spectrum.eigenvalues.shape[0] for spectrum in (problem.spectrum_x, problem.spectrum_y)]
         counts_x, counts_y = (counting_eigenvectors(self.levels, iteration, k, max(sizes)) for k in sizes)
-        forth = _Bending.along(x, all_y, pointwise_map, counts_x)
         if previous is None:  # The first way back is from where Y is to where X is bent to.
-            asking, answering = y.points, forth.points(all_x)
+            forth = _Bending.along(x, all_y, pointwise_map, counts_x)
+            way_back = _nearest(y.points, forth.points(all_x), all_x.mask, patches)
         else:
             answering, asking = _product_space(all_x, y, previous)
-        back = _Bending.along(y, all_x, _nearest(asking, answering, all_x.mask, patches), counts_y)
+            way_back = _nearest(asking, answering, all_x.mask, patches)
+            if self.partial:
+                residuals_y = jnp.sum((asking - answering[way_back]) ** 2, axis=1)
+                asking, answering = _product_space(x, all_y, previous)
+                residuals_x = jnp.sum((asking - answering[pointwise_map]) ** 2, axis=1)
+                weights = doubted(x.weights, residuals_x, y.weights, residuals_y)
+                x, y = (side.weigh(each) for side, each in zip((x, y), weights, strict=True))
+            forth = _Bending.along(x, all_y, pointwise_map, counts_x)
+        back = _Bending.along(y, all_x, way_back, counts_y)
         return Registered(forth, back, iteration), RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, problem: Problem, updated: Registered) -> Int32[Array, " m"]:
@@ -177,6 +189,13 @@ class _Surface(NamedTuple):
         return _Surface(
             spectrum.eigenvectors, dual, weights, self.heat, self.time, positions, normals, points, mask
         )
+
+    def weigh(self, weights: Float[Array, " s"]) -> _Surface:
+        """The same where some vertices count less in what eigenvectors are fitted to."""
+        weighted = self.eigenvectors * weights[:, None]
+        gram = product(self.eigenvectors.T, weighted)
+        ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
+        return self._replace(dual=jsp.linalg.solve(gram + ridge, weighted.T, assume_a="pos").T)
 
 
 class _Prepared(NamedTuple):
