@@ -231,7 +231,7 @@ def refine_in_stages(
         if first:
             if not suspicious:
                 break
-            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.2): other starts", flawed)
+            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.15): other starts", flawed)
     if tried > 1:
         logger.info("the best of %d starts %s", tried, told)
     return best
@@ -383,11 +383,11 @@ _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
 _TOO_MUCH = 0.5
 # What is more flawed than the first is mended: right maps between poses of one body are less. What is more
-# flawed than the second even then, or something of it looks faulty, is begun elsewhere: right maps between
-# bodies of different kinds are less flawed.
-_SUSPICIOUS, _DOUBTFUL = 1.12, 1.2
-# In `doubt`: the best of right maps differ by less, and those upside down by more.
-_HARDLY = 0.35
+# flawed than the second even then, or something of it looks faulty, is begun elsewhere: between bodies of
+# different kinds some right maps are, too.
+_SUSPICIOUS, _DOUBTFUL = 1.12, 1.15
+# In `doubt`: right maps differ by less, mostly, and those upside down by more.
+_HARDLY = 0.25
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0
