@@ -93,7 +93,7 @@ class Registration(Refiner):
         sizes = [spectrum.eigenvalues.shape[0] for spectrum in (problem.spectrum_x, problem.spectrum_y)]
         counts_x, counts_y = (counting_eigenvectors(self.levels, iteration, k, max(sizes)) for k in sizes)
         if previous is None:  # The first way back is from where Y is to where X is bent to.
-            forth = _Bending.along(x, all_y, pointwise_map, counts_x)
+            forth = Bending.along(x, all_y, pointwise_map, counts_x)
             way_back = _nearest(y.points, forth.points(all_x), all_x.mask, patches)
         else:
             answering, asking = _product_space(all_x, y, previous)
@@ -104,8 +104,8 @@ class Registration(Refiner):
                 residuals_x = jnp.sum((asking - answering[pointwise_map]) ** 2, axis=1)
                 weights = doubted(x.weights, residuals_x, y.weights, residuals_y)
                 x, y = (side.weigh(each) for side, each in zip((x, y), weights, strict=True))
-            forth = _Bending.along(x, all_y, pointwise_map, counts_x)
-        back = _Bending.along(y, all_x, way_back, counts_y)
+            forth = Bending.along(x, all_y, pointwise_map, counts_x)
+        back = Bending.along(y, all_x, way_back, counts_y)
         return Registered(forth, back, iteration), RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, problem: Problem, updated: Registered) -> Int32[Array, " m"]:
@@ -209,7 +209,7 @@ class _Prepared(NamedTuple):
     patches_back: tuple[Patches, Patches] | None
 
 
-class _Bending(NamedTuple):
+class Bending(NamedTuple):
     """What bends a surface onto another: coefficients of its eigenvectors.
 
     - `own`, `matched`: of its positions and of the `points` of their matches, as far as eigenvectors count.
@@ -228,7 +228,7 @@ class _Bending(NamedTuple):
         other: _Surface,
         matches: Int[Array, " s"],
         counts: Bool[Array, " k_x"],
-    ) -> _Bending:
+    ) -> Bending:
         """By matches of vertices of a surface among all of the other."""
 
         def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
@@ -263,8 +263,8 @@ class _Bending(NamedTuple):
 class Registered(NamedTuple):
     """What `Registration` hands on: what bends X onto Y, and Y onto X."""
 
-    forth: _Bending
-    back: _Bending
+    forth: Bending
+    back: Bending
     iteration: Int32[Array, ""]
 
 
