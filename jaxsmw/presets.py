@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int64
 
+from jaxsmw.core.coarse_to_fine import CoarseToFine
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression, Regression
 from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreservation, refine
@@ -169,7 +170,7 @@ def chosen_stages(
 def fitting(stage: Stage, vertices: int, partial: bool = False) -> Stage:
     """A stage with what few vertices can give: eigenvectors up to their half, samples if there are more."""
     samples, refiner = stage.number_of_samples, stage.refiner
-    if isinstance(refiner, FeatureRegression | Registration):
+    if isinstance(refiner, CoarseToFine):
         refiner = replace(refiner, partial=partial)
     return replace(
         stage,

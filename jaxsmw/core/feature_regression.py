@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.coarse_to_fine import CoarseToFine, doubted
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refinement import Problem, Refiner, Samples
+from jaxsmw.core.refinement import Problem, Samples
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum
@@ -22,7 +20,7 @@ from jaxsmw.core.spectrum import Spectrum
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
-class FeatureRegression(Refiner):
+class FeatureRegression(CoarseToFine):
     """Matches along which the features of both shapes predict each other best, from coarse to fine.
 
     The features of a vertex are its eigenvectors' values and its descriptors (`Spectrum.descriptors`), if
@@ -45,15 +43,6 @@ class FeatureRegression(Refiner):
       `"patches"` leaves out patches of the target that are too far away, for which it looks at what
       eigenvectors say alone; `"auto"` does that on CPUs from 15 000 vertices.
     """
-
-    levels: tuple[int, ...] = eqx.field(static=True, default=())
-    partial: bool = eqx.field(static=True, default=False)
-    search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
-
-    def __check_init__(self) -> None:
-        check_choice("search", self.search, ("auto", "exhaustive", "patches"))
-        if any(level < 1 for level in self.levels):
-            raise ValueError(f"the levels are {self.levels}, but each needs an eigenvector at least")
 
     def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
         """Collect the features of the vertices to be matched, and of all, among which their matches are.
@@ -90,10 +79,7 @@ class FeatureRegression(Refiner):
             forth = _Moments.along(x.values, all_y.values[pointwise_map], weights_x)
             back = _Moments.along(all_x.values[way_back], y.values, weights_y)
             moments = _Moments(*((a + b) / 2 for a, b in zip(forth, back, strict=True)))
-        sizes = problem.spectrum_x.eigenvalues.shape[0], problem.spectrum_y.eigenvalues.shape[0]
-        counts_x, counts_y = (
-            counting_eigenvectors(self.levels, iteration, size, max(sizes)) for size in sizes
-        )
+        counts_x, counts_y = self.counting_eigenvectors(problem, iteration)
         functional_map, forward = _regress(moments, counts_x, counts_y)
         _, backward = _regress(moments.turned, counts_y, counts_x)
         return Regression(functional_map, forward, backward, iteration), RESULTS.successful  # type: ignore[return-value]
@@ -116,23 +102,6 @@ class FeatureRegression(Refiner):
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
         """Points at distances that are those of Mahalanobis, between features of X and what Y predicts."""
         return updated.forward.embeddings(problem.prepared.x, problem.prepared.all_y)
-
-    def functional_map(self, updated: Any) -> Float[Array, "k_x k_y"]:
-        """The functional map by least squares; zero beyond the eigenvectors that count."""
-        return updated.functional_map
-
-    def is_settled(self, updated: Any) -> Bool[Array, ""]:
-        """Whether all levels have been gone through."""
-        return updated.iteration >= len(self.levels)
-
-
-def counting_eigenvectors(
-    levels: tuple[int, ...], iteration: Int32[Array, ""], size: int, largest: int
-) -> Bool[Array, " k"]:
-    """Which of a shape's eigenvectors count in an iteration, if so many do of the shape with most of them."""
-    counts = [-(-min(level, largest) * size // largest) for level in (*levels, largest)]
-    level = jnp.asarray(np.array(counts, np.int32))[jnp.minimum(iteration, len(levels))]
-    return jnp.arange(size, dtype=jnp.int32) < level
 
 
 class _Features(NamedTuple):
@@ -221,22 +190,6 @@ class _Moments(NamedTuple):
     @property
     def turned(self) -> _Moments:
         return _Moments(self.yy, self.xy.T, self.xx)
-
-
-def doubted(
-    weights_x: Float[Array, " m"],
-    residuals_x: Float[Array, " m"],
-    weights_y: Float[Array, " n"],
-    residuals_y: Float[Array, " n"],
-) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Weights where that of the shape whose matches fit worse, the whole, falls with their residuals."""
-    mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
-
-    def doubt(weights: Array, residuals: Array, mean: Array, other: Array) -> Array:
-        falling = weights / (1 + (residuals / jnp.maximum(other, jnp.finfo(other.dtype).tiny)) ** 2)
-        return jnp.where(mean > other, falling / jnp.sum(falling), weights)
-
-    return doubt(weights_x, residuals_x, mean_x, mean_y), doubt(weights_y, residuals_y, mean_y, mean_x)
 
 
 def _regress(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import check_choice
-from jaxsmw.core.feature_regression import counting_eigenvectors, doubted
+from jaxsmw.core.coarse_to_fine import CoarseToFine, doubted
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refinement import Problem, Refiner, Samples
+from jaxsmw.core.refinement import Problem, Samples
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum
@@ -32,15 +30,16 @@ _RIDGE = 1e-3
 _SQUARINGS = 12
 
 
-class Registration(Refiner):
+class Registration(CoarseToFine):
     """Matches where X, bent onto Y, comes to lie next to it, and Y, bent onto X, next to that.
 
     Low frequencies of a bent surface are those of its matches: their positions in the span of the first
     eigenvectors, more of them in every iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020).
     What the surface itself has beyond these, its details, is carried along by the rotation of its
     surroundings, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007); the one that fits best is had
-    from averages by heat flow. All of this is filtering, nothing is solved. The next matches are nearest in
-    position, normal and the first eigenfunctions, on both surfaces at once.
+    from averages by heat flow. Of all vertices of a shape all of this is filtering, nothing is solved; where
+    eigenvectors are not orthonormal, on samples and on parts, coefficients are by least squares. The next
+    matches are nearest in position, normal and the first eigenfunctions, on both surfaces at once.
 
     It starts from a map that is nearly right, and ends nearer the truth than methods that know
     eigenfunctions alone: docs/accuracy.md measures both. The spectra need positions and normals, which those
@@ -57,15 +56,6 @@ class Registration(Refiner):
       `"patches"` finds the same but leaves out patches of the target that are too far away; `"auto"` does
       that on CPUs from 15 000 vertices.
     """
-
-    levels: tuple[int, ...] = eqx.field(static=True, default=())
-    partial: bool = eqx.field(static=True, default=False)
-    search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
-
-    def __check_init__(self) -> None:
-        check_choice("search", self.search, ("auto", "exhaustive", "patches"))
-        if any(level < 1 for level in self.levels):
-            raise ValueError(f"the levels are {self.levels}, but each needs an eigenvector at least")
 
     def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
         """Bring both surfaces to one scale.
@@ -90,8 +80,7 @@ class Registration(Refiner):
         """Bend X by the matches, and Y by those of the way back."""
         x, y, all_x, all_y, _, patches = problem.prepared
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
-        sizes = [spectrum.eigenvalues.shape[0] for spectrum in (problem.spectrum_x, problem.spectrum_y)]
-        counts_x, counts_y = (counting_eigenvectors(self.levels, iteration, k, max(sizes)) for k in sizes)
+        counts_x, counts_y = self.counting_eigenvectors(problem, iteration)
         if previous is None:  # The first way back is from where Y is to where X is bent to.
             forth = Bending.along(x, all_y, pointwise_map, counts_x)
             way_back = _nearest(y.points, forth.points(all_x), all_x.mask, patches)
@@ -125,14 +114,6 @@ class Registration(Refiner):
         """Positions, and beside them what else counts, of X bent and as it is, and of Y as it is and bent."""
         x, _, _, all_y, _, _ = problem.prepared
         return _product_space(x, all_y, updated)
-
-    def functional_map(self, updated: Registered) -> Float[Array, "k_x k_y"]:
-        """That of the matches by which X was bent."""
-        return updated.forth.functional_map
-
-    def is_settled(self, updated: Registered) -> Bool[Array, ""]:
-        """Whether all levels have been gone through."""
-        return updated.iteration >= len(self.levels)
 
 
 class _Surface(NamedTuple):
@@ -266,6 +247,11 @@ class Registered(NamedTuple):
     forth: Bending
     back: Bending
     iteration: Int32[Array, ""]
+
+    @property
+    def functional_map(self) -> Float[Array, "k_x k_y"]:
+        """That of the matches by which X was bent."""
+        return self.forth.functional_map
 
 
 def _product_space(
