@@ -57,6 +57,9 @@ class Correspondence:
     - `spectrum_x`, `spectrum_y`: the spectra that the last stage saw, for area 1.
     - `refinement`: the outcome of the last stage, with its history if asked for.
     - `iterations`: how many were done, in all stages.
+    - `flaw`: how much the map stretches X and turns it inside out, 1 for isometries
+      (`jaxsmw.geometry.faults.flaw`); None where the preset does not look.
+    - `suspicious`: whether limbs may be swapped, or the body turned round, by that.
     - `partial`: whether one shape is a part of the other.
     - `seconds`: wall time of each part. The first refinement of a size includes its compilation.
     """
@@ -71,6 +74,8 @@ class Correspondence:
     spectrum_y: Spectrum
     refinement: Refinement
     iterations: int
+    flaw: float | None = None
+    suspicious: bool = False
     partial: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -284,7 +289,7 @@ def match(
         others: Iterable[Int64[np.ndarray, " m"]] = ()
         if isinstance(init, str) and init == "shot":
             others = other_starts(mesh_x, mesh_y, spectrum_x, spectrum_y, partial=partial)
-        refinements, chosen = refine_in_stages(
+        outcome = refine_in_stages(
             spectra,
             jax.device_put(start),
             stages,
@@ -294,20 +299,29 @@ def match(
             other_starts=map(jax.device_put, others),
             history=history,
         )
-        last = jax.block_until_ready(refinements[-1])
+        last = jax.block_until_ready(outcome.refinements[-1])
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(last.result)}")
+    if outcome.suspicious:
+        warnings.warn(
+            f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round (flaw "
+            f"{outcome.flaw:.2f}; right maps have up to 1.15, between bodies of different kinds more): look "
+            "at a report, and if so give a few landmarks",
+            stacklevel=2,
+        )
     return Correspondence(
         mesh_x=mesh_x,
         mesh_y=mesh_y,
         pointwise_map=extend_to_unused(mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
-        initial_map=np.asarray(chosen).astype(np.int64),
+        initial_map=np.asarray(outcome.initial_map).astype(np.int64),
         functional_map=np.asarray(last.functional_map),
         stages=stages,
         spectrum_x=spectra[-1][0],
         spectrum_y=spectra[-1][1],
         refinement=last,
-        iterations=sum(int(refinement.iterations) for refinement in refinements),
+        iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
+        flaw=outcome.flaw,
+        suspicious=outcome.suspicious,
         partial=partial,
         seconds=seconds,
     )

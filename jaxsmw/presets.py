@@ -6,8 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
-from itertools import chain
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -181,6 +180,31 @@ def fitting(stage: Stage, vertices: int, partial: bool = False) -> Stage:
     )
 
 
+class Outcome(NamedTuple):
+    """What `refine_in_stages` arrives at.
+
+    - `refinements`: of each stage, up to the first that failed.
+    - `initial_map`: the start that led there.
+    - `flaw`: `jaxsmw.geometry.faults.flaw` of the last map; None where no stage mends.
+    - `suspicious`: whether limbs may still be swapped, by that.
+    """
+
+    refinements: list[Refinement]
+    initial_map: Int[Array, " m"]
+    flaw: float | None = None
+    suspicious: bool = False
+
+    @property
+    def successful(self) -> bool:
+        """Whether no stage failed."""
+        return all(bool(found.result == RESULTS.successful) for found in self.refinements)
+
+    @property
+    def pointwise_map(self) -> Int[Array, " m"]:
+        """The last map."""
+        return self.refinements[-1].pointwise_map if self.refinements else self.initial_map
+
+
 def refine_in_stages(
     spectra: Sequence[tuple[Spectrum, Spectrum]],
     pointwise_map: Int[Array, " m"],
@@ -191,8 +215,8 @@ def refine_in_stages(
     partial: bool = False,
     other_starts: Iterable[Int[Array, " m"]] = (),
     history: bool = False,
-) -> tuple[list[Refinement], Int[Array, " m"]]:
-    """Refine by one stage after the other, as long as they go well: the outcome of each, and the start.
+) -> Outcome:
+    """Refine by one stage after the other, as long as they go well.
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. From a stage that is to mend this on, the outcome is
@@ -215,38 +239,32 @@ def refine_in_stages(
     through = partial_function(
         _through, steps, samples=samples, meshes=meshes, partial=partial, history=history
     )
-    best: tuple[list[Refinement], Int[Array, " m"]] = [], pointwise_map
-    least, tried, told = np.inf, 0, ""
-    for start in chain([pointwise_map], other_starts):
-        refinements, flawed, suspicious = through(start)
-        first = start is pointwise_map
-        if refinements[-1].result != RESULTS.successful:
-            if first:
-                return refinements, start
-            continue
-        doubted, tried = doubt(refinements, flawed), tried + 1
-        if first or doubted < least:
-            best, least = (refinements, start), doubted
-            told = f"has flaw {flawed:.2f}" + ("; limbs may still be swapped" if suspicious else "")
-        # Of several that look right one may be better: once in doubt, all are tried.
-        if first:
-            if not suspicious:
-                break
-            logger.info("limbs may be swapped (flaw %.2f; right maps have up to 1.15): other starts", flawed)
-    if tried > 1:
-        logger.info("the best of %d starts %s", tried, told)
+    best = through(pointwise_map)
+    if not (best.successful and best.suspicious):
+        return best
+    # Of several that look right one may be better: once in doubt, all are tried.
+    logger.info(
+        "limbs may be swapped (flaw %.2f; right maps have up to %.2f): other starts", best.flaw, _DOUBTFUL
+    )
+    tried = [best, *(outcome for outcome in map(through, other_starts) if outcome.successful)]
+    best = min(tried, key=doubt)
+    if len(tried) > 1:
+        left = "; limbs may still be swapped" if best.suspicious else ""
+        logger.info("the best of %d starts has flaw %.2f%s", len(tried), best.flaw, left)
     return best
 
 
-def doubt(refinements: Sequence[Refinement], flawed: float) -> float:
-    """How doubtful the outcome of some stages is beside others of the same two shapes: the less, the better.
+def doubt(outcome: Outcome) -> float:
+    """How doubtful an outcome is beside others of the same two shapes: the less, the better.
 
     The logarithm of its `jaxsmw.geometry.faults.flaw`, and the uncertainty of `FeatureRegression`, if that
     was among the stages.
     """
-    regressions = [found.updated for found in refinements if isinstance(found.updated, Regression)]
+    if not outcome.successful:
+        return np.inf
+    regressions = [found.updated for found in outcome.refinements if isinstance(found.updated, Regression)]
     uncertainty = regressions[-1].uncertainty if regressions else 0
-    return float(np.log(flawed) + _UNCERTAINTY * uncertainty)
+    return float(np.log(outcome.flaw or 1) + _UNCERTAINTY * uncertainty)
 
 
 _Step = tuple[tuple[Spectrum, Spectrum], Stage]
@@ -260,42 +278,33 @@ def _through(
     meshes: tuple[Mesh, Mesh] | None,
     partial: bool,
     history: bool,
-) -> tuple[list[Refinement], float, bool]:
-    """The outcomes of stages, up to the first that fails; the flaw of the last, and whether it is suspicious.
+) -> Outcome:
+    """The outcome of stages from one start. Without a stage that mends nobody asks for a flaw."""
 
-    Without a stage that mends nobody asks for a flaw.
-    """
-
-    def run(steps: Sequence[_Step], pointwise_map: Int[Array, " m"]) -> list[Refinement]:
-        refinements: list[Refinement] = []
+    def run(steps: Sequence[_Step], before: Outcome) -> Outcome:
         for (spectrum_x, spectrum_y), stage in steps:
-            refinements.append(
-                run_stage(
-                    stage,
-                    spectrum_x,
-                    pointwise_map,
-                    spectrum_y=spectrum_y,
-                    samples=samples,
-                    history=history,
-                )
+            found = run_stage(
+                stage,
+                spectrum_x,
+                before.pointwise_map,
+                spectrum_y=spectrum_y,
+                samples=samples,
+                history=history,
             )
-            if refinements[-1].result != RESULTS.successful:
+            before = before._replace(refinements=[*before.refinements, found])
+            if not before.successful:
                 break
-            pointwise_map = refinements[-1].pointwise_map
-        return refinements
+        return before
 
     mending = [position for position, (_, stage) in enumerate(steps) if stage.mending is not None]
     if not mending or meshes is None:
-        return run(steps, pointwise_map), 1.0, False
-    before = run(steps[: mending[0]], pointwise_map)
-    if before:
-        if before[-1].result != RESULTS.successful:
-            return before, np.inf, True
-        pointwise_map = before[-1].pointwise_map
+        return run(steps, Outcome([], pointwise_map))
+    before = run(steps[: mending[0]], Outcome([], pointwise_map))
+    if not before.successful:
+        return before
     # Flaws show best in as many eigenvectors as there are.
     finest = max((of_x for (of_x, _), _ in steps), key=lambda of_x: of_x.eigenvalues.shape[0])
-    mended, flawed, suspicious = _mended(steps[mending[0] :], pointwise_map, run, meshes, finest, partial)
-    return before + mended, flawed, suspicious
+    return _mended(steps[mending[0] :], before, run, meshes, finest, partial)
 
 
 def run_stage(
@@ -319,63 +328,64 @@ def run_stage(
 
 def _mended(
     steps: Sequence[_Step],
-    pointwise_map: Int[Array, " m"],
-    run: Callable[[Sequence[_Step], Int[Array, " m"]], list[Refinement]],
+    before: Outcome,
+    run: Callable[[Sequence[_Step], Outcome], Outcome],
     meshes: tuple[Mesh, Mesh],
     finest: Spectrum,
     partial: bool,
-) -> tuple[list[Refinement], float, bool]:
-    """The outcome of stages, or of others, each begun without what was faulty in the last.
+) -> Outcome:
+    """The outcome of stages after others, or of rounds of them, each begun without the last one's faults.
 
-    And its flaw, and whether limbs may be swapped still. At last the least doubtful one is mended with all,
-    and that taken if it looks right, otherwise the least doubtful. What looks right at once is let be.
+    At last the least doubtful one is mended with all, and that taken if it looks right, otherwise the least
+    doubtful. What looks right at once is let be.
     """
     ((spectrum_x, spectrum_y), stage), *others = steps
     m = len(meshes[0].vertices)
     areas = np.asarray(spectrum_x.vertex_areas)
     eigenvectors = np.asarray(finest.eigenvectors)[:m, :_EIGENVECTORS]
 
-    def matches(refinements: list[Refinement]) -> Int64[np.ndarray, " m"]:
-        return np.asarray(refinements[-1].pointwise_map)[:m].astype(np.int64)
+    def matches(outcome: Outcome) -> Int64[np.ndarray, " m"]:
+        return np.asarray(outcome.pointwise_map)[:m].astype(np.int64)
 
-    def faults(refinements: list[Refinement]) -> list[Bool[np.ndarray, " m"]]:
-        found = matches(refinements)
+    def faults(outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
+        found = matches(outcome)
         reversed_ = reversed_orientation(*meshes, found, eigenvectors, partial=partial)
         both = reversed_, torn_off(*meshes, found, partial=partial)
         return [fault for fault in both if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH]
 
-    def judged(refinements: list[Refinement]) -> tuple[float, float, list[Refinement]]:
-        if refinements[-1].result != RESULTS.successful:
-            return np.inf, np.inf, refinements
-        flawed = flaw(*meshes, matches(refinements), finest, partial=partial)
-        return doubt(refinements, flawed), flawed, refinements
+    def judged(first: _Step, pointwise_map: Int[Array, " m"]) -> Outcome:
+        """What becomes of a map in these stages."""
+        found = run([first, *others], Outcome([], pointwise_map))
+        outcome = before._replace(refinements=[*before.refinements, *found.refinements])
+        if not outcome.successful:
+            return outcome._replace(flaw=np.inf, suspicious=True)
+        flawed = flaw(*meshes, matches(outcome), finest, partial=partial)
+        return outcome._replace(flaw=flawed, suspicious=flawed >= _SUSPICIOUS)
 
-    def looks_right(outcome: tuple[float, float, list[Refinement]]) -> bool:
-        _, flawed, refinements = outcome
-        return flawed < _SUSPICIOUS or (flawed < _DOUBTFUL and not faults(refinements))
+    def looks_right(outcome: Outcome) -> bool:
+        doubtful = outcome.flaw is None or outcome.flaw >= _DOUBTFUL
+        return not outcome.suspicious or not (doubtful or faults(outcome))
 
-    best = last = judged(run(steps, pointwise_map))
-    if best[1] < _SUSPICIOUS:
-        return best[-1], best[1], False
+    best = last = judged(steps[0], before.pointwise_map)
+    if not (best.successful and best.suspicious):
+        return best
     for done in range(_ROUNDS):
-        if last[1] == np.inf or best[1] < _SUSPICIOUS:
+        if not (last.successful and best.suspicious):
             break
-        if not (some := faults(last[-1])):
+        if not (some := faults(last)):
             break
         # By turns, what is reversed and what is torn off.
         sound = np.where(np.pad(some[done % len(some)], (0, len(areas) - m)), 0, areas)
         begun_without = replace(spectrum_x, vertex_areas=jax.device_put(sound))
-        again = [((begun_without, spectrum_y), stage), *others]
-        last = judged(run(again, last[-1][-1].pointwise_map))
-        best = min(best, last, key=lambda outcome: outcome[0])
-    if best[1] < np.inf and stage.mending is not None:
-        again = [((spectrum_x, spectrum_y), stage.mending), *others]
-        last = judged(run(again, best[-1][-1].pointwise_map))
+        last = judged(((begun_without, spectrum_y), stage), last.pointwise_map)
+        best = min(best, last, key=doubt)
+    if stage.mending is not None:
+        last = judged(((spectrum_x, spectrum_y), stage.mending), best.pointwise_map)
         # It knows least of what misled the others, and is preferred if it looks right and is hardly more
         # doubtful: those upside down are far more.
-        preferred = looks_right(last) and last[0] < best[0] + _HARDLY
-        best = last if preferred else min(best, last, key=lambda outcome: outcome[0])
-    return best[-1], best[1], not looks_right(best)
+        preferred = looks_right(last) and doubt(last) < doubt(best) + _HARDLY
+        best = last if preferred else min(best, last, key=doubt)
+    return best._replace(suspicious=not looks_right(best))
 
 
 _ROUNDS, _EIGENVECTORS = 4, 50

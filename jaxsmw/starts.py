@@ -30,7 +30,7 @@ from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.geometry.threads import side_by_side
-from jaxsmw.presets import Stage, doubt, fitting, run_stage
+from jaxsmw.presets import Outcome, Stage, doubt, fitting, run_stage
 
 Start = Literal["shot", "wks", "hks", "wavelet", "functional"]
 
@@ -152,13 +152,14 @@ def _starts_from_extremities(
             np.hstack([described, to_ends[:, chosen]])
             for described, to_ends, chosen in zip(shot, reach, pairing.T, strict=True)
         )
-        start = _nearest_compared(features_x, features_y, y)
+        start = jax.device_put(_nearest_compared(features_x, features_y, y))
         refinement = run_stage(
-            stage, spectrum_x, jax.device_put(start), spectrum_y=spectrum_y, samples=(samples_x, samples_y)
+            stage, spectrum_x, start, spectrum_y=spectrum_y, samples=(samples_x, samples_y)
         )
         if refinement.result == RESULTS.successful:
             found = _everywhere(np.asarray(refinement.pointwise_map).astype(np.int64), x, y)
-            outcomes.append((doubt([refinement], flaw(x.mesh, y.mesh, found, everything)), found))
+            flawed = flaw(x.mesh, y.mesh, found, everything)
+            outcomes.append((doubt(Outcome([refinement], start, flawed)), found))
     outcomes.sort(key=lambda outcome: outcome[0])
     for _, found in outcomes[:_LEAST_DOUBTFUL]:
         yield extend_to_unused(x.mesh, found)

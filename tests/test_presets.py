@@ -10,10 +10,11 @@ from synthetic import body_with_arms
 
 from jaxsmw import presets
 from jaxsmw.core.feature_regression import FeatureRegression
-from jaxsmw.core.results import RESULTS
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.faults import flaw
+from jaxsmw.matching import match
 from jaxsmw.presets import Stage, refine_in_stages
+from jaxsmw.report.summary import summarize
 
 STAGE = Stage(FeatureRegression((20, 20, 40, 40)), 40, iterations=4)
 MENDING = replace(STAGE, mending=STAGE)
@@ -32,10 +33,10 @@ def body():
 
 def outcome(body, stages, start, **options):
     mesh, spectra, _ = body
-    found, chosen = refine_in_stages([spectra] * len(stages), start, stages, meshes=(mesh, mesh), **options)
-    assert found[-1].result == RESULTS.successful
-    wrong = np.asarray(found[-1].pointwise_map) != np.arange(len(mesh.vertices))
-    return mesh.vertex_areas[wrong].sum() / mesh.area, chosen
+    found = refine_in_stages([spectra] * len(stages), start, stages, meshes=(mesh, mesh), **options)
+    assert found.successful
+    wrong = np.asarray(found.pointwise_map) != np.arange(len(mesh.vertices))
+    return mesh.vertex_areas[wrong].sum() / mesh.area, found
 
 
 def test_swapped_limbs_are_mended(body):
@@ -45,11 +46,11 @@ def test_swapped_limbs_are_mended(body):
 
 def test_padding_changes_nothing(body):
     mesh, (spectrum, _), swapped = body
-    found, _ = refine_in_stages([(spectrum, spectrum)], swapped, [MENDING], meshes=(mesh, mesh))
+    found = refine_in_stages([(spectrum, spectrum)], swapped, [MENDING], meshes=(mesh, mesh))
     n = len(mesh.vertices)
     padded = spectrum.pad(n + 20)
-    more, _ = refine_in_stages([(padded, padded)], jnp.pad(swapped, (0, 20)), [MENDING], meshes=(mesh, mesh))
-    np.testing.assert_array_equal(more[0].pointwise_map[:n], found[0].pointwise_map)
+    more = refine_in_stages([(padded, padded)], jnp.pad(swapped, (0, 20)), [MENDING], meshes=(mesh, mesh))
+    np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map)
 
 
 def test_another_start_helps_where_mending_does_not(body, monkeypatch):
@@ -61,10 +62,10 @@ def test_another_start_helps_where_mending_does_not(body, monkeypatch):
     _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     start, identity = jnp.asarray(turned, jnp.int32), jnp.arange(len(mesh.vertices), dtype=jnp.int32)
     assert flaw(mesh, mesh, turned, spectrum) > 1.3
-    wrong, chosen = outcome(body, [stage], start, other_starts=[swapped, identity])
-    assert wrong < 0.02 and chosen is not start
-    alone, _ = outcome(body, [stage], start)
-    assert alone > 0.5
+    wrong, found = outcome(body, [stage], start, other_starts=[swapped, identity])
+    assert wrong < 0.02 and found.initial_map is not start and not found.suspicious
+    wrong, alone = outcome(body, [stage], start)
+    assert wrong > 0.5 and alone.suspicious and alone.flaw > 1.3
 
 
 def test_no_other_start_is_asked_for_without_need(body):
@@ -73,7 +74,19 @@ def test_no_other_start_is_asked_for_without_need(body):
         yield
 
     identity = jnp.arange(len(body[0].vertices), dtype=jnp.int32)
-    wrong, chosen = outcome(body, [MENDING], identity, other_starts=none())
-    assert wrong < 0.02 and chosen is identity
+    wrong, found = outcome(body, [MENDING], identity, other_starts=none())
+    assert wrong < 0.02 and found.initial_map is identity
     # Nor by stages that do not mend.
     outcome(body, [STAGE], body[2], other_starts=none())
+
+
+def test_what_still_looks_wrong_is_said(body):
+    mesh, _, _ = body
+    _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    with pytest.warns(UserWarning, match="limbs may be swapped, or the body turned round"):
+        found = match(mesh, mesh, preset=MENDING, init=turned)
+    assert found.suspicious and found.flaw > 1.3
+    facts = summarize(found, {}, found.expected_error())
+    assert facts["flaw"] == f"{found.flaw:.2f}; limbs may be swapped"
+    right = match(mesh, mesh, preset=MENDING, init=np.arange(len(mesh.vertices)))
+    assert right.flaw < 1.1 and not right.suspicious

@@ -208,7 +208,7 @@ class Chosen(Method):
 
 def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESULTS]:
     spectra = [pair.seen_in(stage) for stage in stages]
-    refinements, _ = refine_in_stages(
+    outcome = refine_in_stages(
         spectra,
         pair.start,
         stages,
@@ -217,8 +217,7 @@ def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESU
         partial=pair.partial,
         other_starts=pair.other_starts(),
     )
-    refined = refinements[-1]
-    return refined.pointwise_map, refined.result
+    return outcome.pointwise_map, outcome.refinements[-1].result
 
 
 # ZoomOut's published sizes of C.
