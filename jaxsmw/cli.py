@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         required=True,
         help="gets one target vertex per source vertex, one per line, counted from 0; or, with the suffix "
-        ".mat, as the column T12 for MATLAB, counted from 1",
+        ".npy, as an array for numpy.load; or, with .mat, as the column T12 for MATLAB, counted from 1",
     )
     match.add_argument(
         "--surface-points",
@@ -173,7 +173,10 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("source", metavar="SOURCE", help="the source mesh")
     evaluate.add_argument("target", metavar="TARGET", help="the target mesh")
     evaluate.add_argument(
-        "map", metavar="MAP", nargs="+", help="maps, one target vertex per line, or .mat files (from 1)"
+        "map",
+        metavar="MAP",
+        nargs="+",
+        help="maps, one target vertex per line, or .npy files, or .mat files (from 1)",
     )
     evaluate.add_argument(
         "--ground-truth",
@@ -262,7 +265,8 @@ def _parser() -> argparse.ArgumentParser:
         "map",
         metavar="MAP",
         nargs="*",
-        help="the map, one target vertex per line, or a .mat file (from 1); for a page also several",
+        help="the map, one target vertex per line, or a .npy file, or a .mat file (from 1); for a page also "
+        "several",
     )
     render.add_argument(
         "--output",
@@ -509,6 +513,15 @@ def _demo(options: argparse.Namespace) -> None:
 def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
+    without_effect = {
+        "--evaluation-samples is for --ground-truth": options.evaluation_samples and not options.ground_truth,
+        "--up is for --report": options.up and not options.report,
+        "--index-base is for --ground-truth and for files of --init": options.index_base is not None
+        and not (options.ground_truth or init_file),
+    }
+    for said, is_so in without_effect.items():
+        if is_so:
+            raise InputError(f"{said}: name one, or leave it out.")
     inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable

@@ -203,9 +203,10 @@ def test_the_least_recently_used_go_first_and_nothing_else_goes(directory, monke
     assert [entry(number) for number in (0, 2, 3, 1)] == [0, 0, 0, 1]
 
 
-def test_the_limit_must_be_a_number(directory, monkeypatch):
-    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", "4 GiB")
-    with pytest.raises(InputError, match="JAXSMW_CACHE_LIMIT is '4 GiB': give the size"):
+@pytest.mark.parametrize("limit", ["4 GiB", "-1", "nan", "inf", ""])
+def test_the_limit_must_be_a_number(directory, monkeypatch, limit):
+    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", limit)
+    with pytest.raises(InputError, match=f"JAXSMW_CACHE_LIMIT is '{limit}': give the size"):
         cached("test", [INPUT], Computation())
 
 

@@ -608,6 +608,9 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
     [
         ("match {x} {y}", "--output"),
         ("match {x} {y} --output {t}/no/such/map.txt", "no/such"),
+        ("match {x} {y} --output {t}/m --evaluation-samples 9", "is for --ground-truth: name one"),
+        ("match {x} {y} --output {t}/m --index-base 1", "--index-base is for --ground-truth"),
+        ("match {x} {y} --output {t}/m --up z", "--up is for --report: name one"),
         ("match {x} {y} --output {t}", "is not a file"),
         ("match {x} {y} --output /proc/map.txt", "/proc/map.txt"),
         ("match {x} {t}/missing.off --output {t}/m", "missing.off"),

@@ -21,6 +21,7 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh, make_spectrum
+from jaxsmw.evaluation.ground_truth import read_landmarks
 
 K = 12
 
@@ -330,6 +331,42 @@ def test_maps_of_geomfum_are_ours(spectra, pointwise_map):
         convert.P2pFromFmConverter()(rectangular, a, b),
         decode(jnp.asarray(rectangular), x, y.truncate(K - 4)),
     )
+
+
+# --------------------------------------------------------------------------------------- .npy files
+
+
+def test_maps_as_arrays(tmp_path, bodies):
+    x, y = bodies
+    pointwise_map = np.random.default_rng(0).integers(0, len(y.vertices), len(x.vertices))
+    path = tmp_path / "map.npy"
+    jaxsmw.write_pointwise_map(path, pointwise_map)
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npy"]
+    np.testing.assert_array_equal(np.load(path), pointwise_map)
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y), pointwise_map)
+    np.save(path, pointwise_map + 1)
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y, index_base=1), pointwise_map)
+    np.save(path, np.stack([pointwise_map[:5]] * 2, axis=1))
+    np.testing.assert_array_equal(read_landmarks(path, y, y), np.load(path))
+
+
+@pytest.mark.parametrize(
+    ("contents", "fault"),
+    [
+        (np.zeros((3, 2), int), "holds int64 of shape .3, 2.: give the file with a list of numbers"),
+        (np.zeros(0, int), "holds int64 of shape .0,.: give"),
+        (np.array(["a", "b"]), "holds <U1 of shape"),
+        (np.array([None, 1]), "is no array that NumPy saved"),
+        (np.zeros(3, complex), "holds complex128 of shape"),
+        (np.zeros(3), "has 3 rows, but one is needed"),
+        (None, "is no array that NumPy saved"),
+    ],
+)
+def test_hostile_arrays(tmp_path, bodies, contents, fault):
+    path = tmp_path / "map.npy"
+    path.write_text("0\n1\n") if contents is None else np.save(path, contents, allow_pickle=True)
+    with pytest.raises(jaxsmw.InputError, match=f"map.npy: {fault}"):
+        jaxsmw.read_pointwise_map(path, *bodies)
 
 
 # --------------------------------------------------------------------------------------- .mat files

@@ -103,6 +103,12 @@ def test_squares_sum_to_one(make, filters, lambda_max, seed):
         np.testing.assert_allclose(frame_function(responses), 1, atol=1e-12)
 
 
+@pytest.mark.parametrize("make", PARSEVAL_OF_ANY_SIZE.values(), ids=PARSEVAL_OF_ANY_SIZE.keys())
+def test_more_filters_than_single_precision_has_octaves(make):
+    eigenvalues = spectrum().astype(jnp.float32)
+    np.testing.assert_allclose(frame_function(sample(make(200), eigenvalues, eigenvalues)), 1, atol=1e-5)
+
+
 @pytest.mark.parametrize("bank_class", [Held, Simoncelli, Papadakis])
 @settings(max_examples=20)
 @given(edge=st.floats(0.01, 0.99), lambda_max=st.floats(1e-3, 1e4))

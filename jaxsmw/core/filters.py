@@ -104,8 +104,10 @@ class _DyadicBands(_Transitions):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        edges = lambda_max * 2.0 ** jnp.arange(1 - self.filters, 0, dtype=points.dtype)
-        return self.profile(jnp.clip(points[None, :] / edges[:, None] - 1, 0, 1))
+        # So many octaves below the largest eigenvalue there is nothing but zero, and soon no float either.
+        octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
+        ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
+        return self.profile(jnp.clip(ratios - 1, 0, 1))
 
 
 def _meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

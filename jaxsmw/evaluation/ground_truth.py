@@ -6,6 +6,7 @@ file does not say, so each form has the base with which it circulates; in `.mat`
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import warnings
@@ -183,7 +184,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 def read_pointwise_map(
     path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
 ) -> Int64[np.ndarray, " m"]:
-    """Read a pointwise map T: X -> Y, one target vertex per line, or from a `.mat` file.
+    """Read a pointwise map T: X -> Y, one target vertex per line, or from a `.mat` or `.npy` file.
 
     **Arguments:**
 
@@ -222,7 +223,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     """Write a pointwise map T: X -> Y; never half of it.
 
     One 0-based target vertex per line; or, where the name ends in `.mat`, the column `T12` in MATLAB's
-    format, which counts from 1 as MATLAB does.
+    format, which counts from 1 as MATLAB does; or, where it ends in `.npy`, an array for `numpy.load`.
 
     **Arguments:**
 
@@ -241,7 +242,14 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
         write_variables(path, {POINTWISE_MAP: targets.astype(np.float64) + 1})
         return
     with atomic_write(path) as temporary:
-        temporary.write_text("".join(f"{target}\n" for target in targets.tolist()), encoding="ascii")
+        if _is_npy_file(path):
+            np.save(temporary, targets.astype(np.int64))
+        else:
+            temporary.write_text("".join(f"{target}\n" for target in targets.tolist()), encoding="ascii")
+
+
+def _is_npy_file(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".npy"
 
 
 class _Table:
@@ -249,23 +257,45 @@ class _Table:
 
     def __init__(self, path: Path, *, columns: int | None = None) -> None:
         self.path = path
-        self.is_mat = is_mat_file(path)
+        self.is_mat, self.is_text = is_mat_file(path), False
         if self.is_mat:
             self.values = read_matrix(path, POINTWISE_MAP, columns=columns)
+        elif _is_npy_file(path):
+            self.values = self._read_array(columns)
         else:
+            self.is_text = True
             self._words = self._read_text(columns)
             self.values = np.array(self._words, dtype=np.float64)
         self.rows, self.columns = self.values.shape
+
+    def _bytes(self) -> bytes:
+        try:
+            return self.path.read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be read ({error.strerror}): check the path and its permissions."
+            ) from error
+
+    def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
+        """An array of NumPy's; of one column a list will do, too."""
+        try:
+            array = np.load(io.BytesIO(self._bytes()), allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise InputError(f"{self.path}: is no array that NumPy saved: give one, or text.") from error
+        table = array[:, None] if array.ndim == 1 else array
+        fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size
+        if not fits or table.dtype.kind not in "iuf":
+            wanted = "a list of numbers" if columns == 1 else f"numbers in {columns or 'some'} columns"
+            raise InputError(
+                f"{self.path}: holds {array.dtype} of shape {array.shape}: give the file with {wanted}."
+            )
+        return table.astype(np.float64)
 
     def _read_text(self, columns: int | None) -> list[list[str]]:
         """The numbers as they are written."""
         path = self.path
         try:
-            text = path.read_bytes().decode("utf-8-sig")
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read ({error.strerror}): check the path and its permissions."
-            ) from error
+            text = self._bytes().decode("utf-8-sig")
         except UnicodeDecodeError:
             text = "\0"
         if "\0" in text:
@@ -294,18 +324,18 @@ class _Table:
         return 1 if self.is_mat else usual
 
     def _at(self, row: int) -> str:
-        return f"{self.path}, {'row' if self.is_mat else 'line'} {row + 1}"
+        return f"{self.path}, {'line' if self.is_text else 'row'} {row + 1}"
 
     def _word(self, row: int, column: int) -> str:
         """A number as it is written."""
-        return f"{self.values[row, column]:.15g}" if self.is_mat else self._words[row][column][:40]
+        return self._words[row][column][:40] if self.is_text else f"{self.values[row, column]:.15g}"
 
     def require_rows(self, mesh_x: Mesh) -> None:
         """One for each source vertex."""
         m = len(mesh_x.vertices)
         if self.rows != m:
             raise InputError(
-                f"{self.path}: has {self.rows} {'rows' if self.is_mat else 'lines'}, but one is needed for "
+                f"{self.path}: has {self.rows} {'lines' if self.is_text else 'rows'}, but one is needed for "
                 f"each of the {m} vertices of {mesh_x.name}: give the file that belongs to this pair, in "
                 "this direction."
             )

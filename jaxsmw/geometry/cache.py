@@ -49,7 +49,7 @@ def cached(
 
     **Returns:** The arrays, bit for bit as computed.
 
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number.
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number, or below 0.
     """
     place, limit = _place(), _limit()
     if place is None:
@@ -110,6 +110,8 @@ def keep_programs() -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # `cached` says so
+    if not os.access(directory, os.W_OK):
+        return  # JAX would warn of every program
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
@@ -131,11 +133,12 @@ def _limit() -> float:
     """The size limit in bytes."""
     text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
     try:
-        return float(text) * 2**30
+        limit = float(text)
     except ValueError:
-        raise InputError(
-            f"JAXSMW_CACHE_LIMIT is {text!r}: give the size of the cache in GiB as a number."
-        ) from None
+        limit = -1.0
+    if not 0 <= limit < np.inf:
+        raise InputError(f"JAXSMW_CACHE_LIMIT is {text!r}: give the size of the cache in GiB as a number.")
+    return limit * 2**30
 
 
 def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
