@@ -624,6 +624,8 @@ HOSTILE = {
     ),
     "no faces.ply": (PLY_HEAD + PLY_FACE.replace("face 1", "face 0") + T, "no faces"),
     "word.ply": (PLY_HEAD + PLY_FACE + "0 0 zero\n1 0 0\n0 1 0\n3 0 1 2\n", "word"),
+    "truncated.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3", "truncated"),
+    "truncated in texture.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\nf 1/1 3/", "truncated"),
     "truncated text.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1", "'face'"),
     "truncated vertices.ply": (PLY_HEAD + PLY_FACE + T[:9], "'vertex'"),
     "text goes on.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 2\n3 0 1 2\n", "goes on"),

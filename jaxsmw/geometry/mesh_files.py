@@ -187,9 +187,12 @@ def _parse_obj(data: bytes) -> _Polygons:
     if not len(vertices):
         raise InputError("has no line that begins with v: this is no OBJ file, export it again.")
     lines = face.findall(text)
+    ends_in_face = bool(lines) and not text.endswith("\n") and text.endswith(lines[-1])
     if any("/" in line for line in lines):  # texture and normal indices: corner/texture/normal
         lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
     corners, sizes = _polygon_lines([f"{len(line.split())} {line}" for line in lines])
+    if ends_in_face and sizes[-1] < 3:
+        raise InputError("ends in the middle of a face: the file is truncated, export it again.")
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export it again.")
     if (corners < 0).any():  # counted back from the vertices above the face
