@@ -460,9 +460,11 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {
             "ours": ours_from_files,
             "ours, search in patches": partial(ours_from_files, search="patches"),
+            "ours, on samples, in patches": partial(ours_from_files, search="patches", samples=SAMPLES),
         }
         if "pyFM" not in missing:
             runs["pyFM, its defaults"] = pyfm_defaults_from_files
+            runs["pyFM, its defaults, ZoomOut on to 100"] = partial(pyfm_defaults_from_files, step=5)
             runs["pyFM, ZoomOut 20 to 100 from our start"] = pyfm_from_files
         if "geomfum" not in missing:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
@@ -504,12 +506,13 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     )
 
 
-def ours_from_files(files: list[str], search: Search = "auto") -> tuple[np.ndarray, float]:
+def ours_from_files(
+    files: list[str], search: Search = "auto", samples: int | None = None
+) -> tuple[np.ndarray, float]:
     """The map, and the seconds of refinement alone."""
-    result = match(
-        *map(read_mesh, files),
-        preset=Stage(WaveletPreservation(search=search), EIGENVECTORS, iterations=ITERATIONS),
-    )
+    refiner = WaveletPreservation(search=search)
+    stage = Stage(refiner, EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples)
+    result = match(*map(read_mesh, files), preset=stage)
     return result.pointwise_map, result.seconds["refinement"]
 
 
@@ -520,8 +523,11 @@ def our_start(*files: str) -> np.ndarray:
     return initial_map(*meshes, *paired_spectra(*meshes, EIGENVECTORS))
 
 
-def pyfm_defaults_from_files(files: list[str]) -> tuple[np.ndarray, float]:
-    """Descriptors, functional map and ZoomOut of `pyFM.functional.FunctionalMapping`, as they come."""
+def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
+    """Descriptors, functional map and ZoomOut of `pyFM.functional.FunctionalMapping`, as they come.
+
+    It takes ten steps from k = 50, of 1 by default.
+    """
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
 
@@ -530,7 +536,7 @@ def pyfm_defaults_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     model.preprocess()
     model.fit(verbose=False)
     start = time.perf_counter()
-    model.zoomout_refine()
+    model.zoomout_refine(step=step)
     found = model.get_p2p()
     return np.asarray(found), time.perf_counter() - start
 

@@ -399,3 +399,47 @@ def test_two_float_types_are_refused(pair):
 def test_what_is_no_bank_or_solution_is_refused(settings):
     with pytest.raises((TypeError, TypeCheckError), match=r"bank|solution"):
         WaveletPreservation(**settings)
+
+
+_OF_ANOTHER_KIND = """
+import jax.numpy as jnp, jaxsmw
+from jaxsmw import Meyer, Registration, WaveletPreservation, refine
+
+x = jaxsmw.Spectrum(jnp.arange(3.0), jnp.ones((5, 3)), jnp.ones(5), jnp.ones(5, bool))
+start = jnp.arange(5)
+for call in (
+    lambda: refine(x, x, start, refiner=WaveletPreservation),
+    lambda: refine(x, x, start, refiner="paper"),
+    lambda: refine(x, None, start),
+    lambda: refine(x, x, [0, 1, 2, 3, 4]),
+    lambda: WaveletPreservation("meyer"),
+    lambda: Meyer(3.5),
+    lambda: Registration([35, 60]),
+    lambda: Registration((3.5,)),
+    lambda: jaxsmw.compute_spectrum("mesh.off", 3),
+    lambda: jaxsmw.match("mesh.off", "mesh.off"),
+):
+    try:
+        call()
+    except (TypeError, jaxsmw.InputError) as error:
+        print(error)
+"""
+
+
+def test_what_is_of_another_kind_is_named():
+    """In a process of its own, where types are not checked for tests."""
+    said = subprocess.run(
+        [sys.executable, "-c", _OF_ANOTHER_KIND], check=True, capture_output=True, text=True
+    )
+    assert said.stdout.splitlines() == [
+        "the refiner is <class 'jaxsmw.core.refinement.WaveletPreservation'>, but a Refiner is needed",
+        "the refiner is 'paper', but a Refiner is needed",
+        "the spectrum of Y is None, but a Spectrum is needed",
+        "the initial map is a list, but a ndarray is needed",
+        "the bank is 'meyer', but a FilterBank is needed",
+        "Meyer needs a whole number of filters, not 3.5",
+        "the levels are [35, 60], but a tuple of whole numbers is needed",
+        "the levels are (3.5,), but a tuple of whole numbers is needed",
+        "the mesh is 'mesh.off', but a Mesh is needed",
+        "source mesh: 'mesh.off' is the name of a file: read it with jaxsmw.read_mesh first.",
+    ]

@@ -35,6 +35,15 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
 
 
+def check_kind(name: str, value: Any, *kinds: type) -> None:
+    """**Raises:** `TypeError` if an argument is of none of these kinds."""
+    if not isinstance(value, kinds):
+        shown = (
+            repr(value) if isinstance(value, str | int | float | type | None) else f"a {type(value).__name__}"
+        )
+        raise TypeError(f"the {name} is {shown}, but a {kinds[0].__name__} is needed")
+
+
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:

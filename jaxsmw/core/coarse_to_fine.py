@@ -25,7 +25,8 @@ class CoarseToFine(Refiner):
     - `partial`: one shape is a part of the other.
     - `search`: how the last matches are found, among all vertices: `"exhaustive"`, `"patches"` or `"auto"`.
 
-    **Raises:** `ValueError` for a level below 1, or another kind of search.
+    **Raises:** `TypeError` if `levels` is no tuple of integers; `ValueError` for a level below 1, or another
+    kind of search.
     """
 
     levels: tuple[int, ...] = eqx.field(static=True, default=())
@@ -34,6 +35,8 @@ class CoarseToFine(Refiner):
 
     def __check_init__(self) -> None:
         check_choice("search", self.search, ("auto", "exhaustive", "patches"))
+        if not isinstance(self.levels, tuple) or not all(isinstance(n, int) for n in self.levels):
+            raise TypeError(f"the levels are {self.levels!r}, but a tuple of whole numbers is needed")
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each needs an eigenvector at least")
 

@@ -61,6 +61,8 @@ def sample_bank(
 
 
 def _require_filters(bank: FilterBank, filters: int, least: int) -> None:
+    if not isinstance(filters, int | np.integer):
+        raise TypeError(f"{type(bank).__name__} needs a whole number of filters, not {filters!r}")
     if filters < least:
         raise ValueError(f"{type(bank).__name__} needs at least {least} filters, not {filters}")
 

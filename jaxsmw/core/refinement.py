@@ -8,11 +8,13 @@ from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import all_finite, check_choice, counts_iterations
+from jaxsmw.core.checks import all_finite, check_choice, check_kind, counts_iterations
 from jaxsmw.core.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
@@ -163,9 +165,8 @@ class WaveletPreservation(Refiner):
     search: Search = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
-        for name, kind in (("bank", FilterBank), ("solution", Solution)):
-            if not isinstance(getattr(self, name), kind):
-                raise TypeError(f"the {name} is {getattr(self, name)!r}, but a {kind.__name__} is needed")
+        check_kind("bank", self.bank, FilterBank)
+        check_kind("solution", self.solution, Solution)
         check_choice("convention", self.convention, get_args(Convention))
         check_choice("lambda_max", self.lambda_max, ("own", "common"))
         check_choice("search", self.search, get_args(Search))
@@ -271,8 +272,11 @@ def refine(
 
     **Raises:** `ValueError` for fewer than one iteration, samples on one side only, an initial map that is
     not one vertex per vertex of X, or spectra of two float types; `TypeError` if `iterations` or what the
-    initial map holds is no integer.
+    initial map holds is no integer, or an argument is of another kind.
     """
+    check_kind("refiner", refiner, Refiner)
+    check_spectra(spectrum_x, spectrum_y)
+    check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
     if (samples_x is None) != (samples_y is None):
         raise ValueError("samples are needed on both shapes or on neither")
     if pointwise_map.shape != spectrum_x.mask.shape:
@@ -281,8 +285,6 @@ def refine(
         )
     if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
         raise TypeError(f"the initial map has type {pointwise_map.dtype}; it must be integer vertex indices")
-
-    check_same_precision(spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype
 
     whole = working = refiner.prepare(spectrum_x, spectrum_y)
@@ -391,8 +393,10 @@ _Record = tuple[Array, Array, Array, Array | None]
 """What one turn adds to the four series of `History`."""
 
 
-def check_same_precision(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """**Raises:** `ValueError` if two spectra are of two float types."""
+def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
+    """**Raises:** `TypeError` if these are no spectra, `ValueError` if they are of two float types."""
+    check_kind("spectrum of X", spectrum_x, Spectrum)
+    check_kind("spectrum of Y", spectrum_y, Spectrum)
     dtype_x, dtype_y = spectrum_x.eigenvectors.dtype, spectrum_y.eigenvectors.dtype
     if dtype_x != dtype_y:
         raise ValueError(

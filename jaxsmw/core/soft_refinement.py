@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
-from jaxsmw.core.checks import check_choice, counts_iterations
-from jaxsmw.core.refinement import WaveletPreservation, check_same_precision, checked, diagnose
+from jaxsmw.core.checks import check_choice, check_kind, counts_iterations
+from jaxsmw.core.refinement import WaveletPreservation, check_spectra, checked, diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
@@ -84,9 +84,9 @@ def refine_softly(
     raise equinox's runtime error where the outcome is a failure, or GMRES does not come to its tolerance.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
-    for name, value, kind in (("refiner", refiner, WaveletPreservation), ("recovery", recovery, Recovery)):
-        if not isinstance(value, kind):
-            raise TypeError(f"the {name} is {value!r}, but a {kind.__name__} is needed")
+    check_kind("refiner", refiner, WaveletPreservation)
+    check_kind("recovery", recovery, Recovery)
+    check_spectra(spectrum_x, spectrum_y)
     if not tolerance > 0:
         raise ValueError(f"refine_softly needs a positive tolerance, not {tolerance}")
     m, n = spectrum_x.mask.shape[0], spectrum_y.mask.shape[0]
@@ -102,7 +102,6 @@ def refine_softly(
         matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
         if matches.shape[0] != m or matches.ndim != 1 + sparse:
             raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
-    check_same_precision(spectrum_x, spectrum_y)
     problem = refiner.prepare(spectrum_x, spectrum_y)
     start, result = refiner.update(problem, pointwise_map, None)
     start_went = checked(start, start, result)

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
+from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.cache import cached
@@ -94,6 +95,7 @@ def eigenpairs(
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
     """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors, vertex areas, for total area 1."""
+    check_kind("mesh", mesh, Mesh)
     used = np.flatnonzero(mesh.used_vertices)
     if not isinstance(number_of_eigenvectors, int | np.integer):
         raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -382,6 +383,8 @@ def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
                 raise InputError(f"{name}: not all its faces are triangles: triangulate it first.")
             table = table.reshape(-1, 4)[:, 1:]
         return mesh.points, table
+    if isinstance(mesh, str | os.PathLike):
+        raise InputError(f"{name}: {str(mesh)!r} is the name of a file: read it with jaxsmw.read_mesh first.")
     raise InputError(
         f"{name}: {type(mesh).__name__} is no triangle mesh, for it has no faces beside vertices: give "
         "vertices and faces, or a mesh of trimesh, pyFM, geomfum or PyVista."
