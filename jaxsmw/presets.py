@@ -129,7 +129,7 @@ def _regression(*levels: int, mending: Stage | None = None) -> Stage:
 
 def _registration(*levels: int) -> Stage:
     """Registration, once per level."""
-    return Stage(Registration(levels), max(levels), 0, len(levels), 1000)
+    return Stage(Registration(levels), max(levels), 30, len(levels), 1000)
 
 
 Preset = Literal["fast", "paper", "accurate"]

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.core.checks import check_choice
 from jaxsmw.core.refinement import Problem, Refiner
+from jaxsmw.core.spectrum import Spectrum
 
 
 class CoarseToFine(Refiner):
@@ -61,6 +62,13 @@ class CoarseToFine(Refiner):
     def is_settled(self, updated: Any) -> Bool[Array, ""]:
         """Whether all levels have been gone through."""
         return updated.iteration >= len(self.levels)
+
+
+def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
+    """**Raises:** `ValueError` if only one shape has descriptors, or they differ in number."""
+    numbers = [0 if s.descriptors is None else s.descriptors.shape[1] for s in (spectrum_x, spectrum_y)]
+    if numbers[0] != numbers[1]:
+        raise ValueError(f"X has {numbers[0]} descriptors and Y {numbers[1]}, but they must be the same")
 
 
 def doubted(

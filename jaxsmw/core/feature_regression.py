@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.coarse_to_fine import CoarseToFine, doubted
+from jaxsmw.core.coarse_to_fine import CoarseToFine, check_descriptors, doubted
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
 from jaxsmw.core.refinement import Problem, Samples
@@ -49,9 +49,7 @@ class FeatureRegression(CoarseToFine):
 
         **Raises:** `ValueError` if only one shape has descriptors, or they differ in number.
         """
-        numbers = [0 if s.descriptors is None else s.descriptors.shape[1] for s in (spectrum_x, spectrum_y)]
-        if numbers[0] != numbers[1]:
-            raise ValueError(f"X has {numbers[0]} descriptors and Y {numbers[1]}, but they must be the same")
+        check_descriptors(spectrum_x, spectrum_y)
         all_x, all_y = _Features.of(spectrum_x), _Features.of(spectrum_y)
         if samples is None:
             patches = chosen_patches(self.search, spectrum_x, spectrum_y)

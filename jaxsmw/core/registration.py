@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.coarse_to_fine import CoarseToFine, doubted
+from jaxsmw.core.coarse_to_fine import CoarseToFine, check_descriptors, doubted
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
@@ -21,6 +21,9 @@ from jaxsmw.core.spectrum import Spectrum
 # What counts beside positions in units of the square root of the area: unit normals; and the first so many
 # eigenfunctions over the square root of their eigenvalue and one.
 _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
+# And descriptors, of mean square 1, over this power of how many eigenvectors count: more than positions where
+# these are coarse, hardly anything at last.
+_DESCRIPTORS, _FALLING = 2.8, 1.5
 # The time for which heat flows that averages over a vertex's surroundings: it spreads over a disk of radius
 # 0.1. It is longer where the eigenvectors do not reach so far that the last of them fades by this exponent.
 _HEAT_TIME, _FADES = 3e-3, 4.0
@@ -39,7 +42,8 @@ class Registration(CoarseToFine):
     surroundings, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007); the one that fits best is had
     from averages by heat flow. Of all vertices of a shape all of this is filtering, nothing is solved; where
     eigenvectors are not orthonormal, on samples and on parts, coefficients are by least squares. The next
-    matches are nearest in position, normal and the first eigenfunctions, on both surfaces at once.
+    matches are nearest in position, normal and the first eigenfunctions, on both surfaces at once, and in
+    descriptors (`Spectrum.descriptors`), if there are any, which count less with every level.
 
     It starts from a map that is nearly right, and ends nearer the truth than methods that know
     eigenfunctions alone: docs/accuracy.md measures both. The spectra need positions and normals, which those
@@ -60,8 +64,9 @@ class Registration(CoarseToFine):
     def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
         """Bring both surfaces to one scale.
 
-        **Raises:** `ValueError` if a spectrum has no positions and normals.
+        **Raises:** `ValueError` if a spectrum has no positions and normals, or descriptors differ in number.
         """
+        check_descriptors(spectrum_x, spectrum_y)
         areas = [jnp.sum(spectrum.vertex_areas) for spectrum in (spectrum_x, spectrum_y)]
         if self.partial:
             areas = [jnp.maximum(*areas)] * 2
@@ -81,6 +86,8 @@ class Registration(CoarseToFine):
         x, y, all_x, all_y, _, patches = problem.prepared
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
         counts_x, counts_y = self.counting_eigenvectors(problem, iteration)
+        level = jnp.maximum(jnp.sum(counts_x), jnp.sum(counts_y)).astype(x.weights.dtype)
+        descriptors = _DESCRIPTORS / level**_FALLING
         if previous is None:  # The first way back is from where Y is to where X is bent to.
             forth = Bending.along(x, all_y, pointwise_map, counts_x)
             way_back = _nearest(y.points, forth.points(all_x), all_x.mask, patches)
@@ -88,14 +95,16 @@ class Registration(CoarseToFine):
             answering, asking = _product_space(all_x, y, previous)
             way_back = _nearest(asking, answering, all_x.mask, patches)
             if self.partial:
+                bent = previous._replace(descriptors=jnp.zeros_like(descriptors))
+                answering, asking = _product_space(all_x, y, bent)
                 residuals_y = jnp.sum((asking - answering[way_back]) ** 2, axis=1)
-                asking, answering = _product_space(x, all_y, previous)
+                asking, answering = _product_space(x, all_y, bent)
                 residuals_x = jnp.sum((asking - answering[pointwise_map]) ** 2, axis=1)
                 weights = doubted(x.weights, residuals_x, y.weights, residuals_y)
                 x, y = (side.weigh(each) for side, each in zip((x, y), weights, strict=True))
             forth = Bending.along(x, all_y, pointwise_map, counts_x)
         back = Bending.along(y, all_x, way_back, counts_y)
-        return Registered(forth, back, iteration), RESULTS.successful  # type: ignore[return-value]
+        return Registered(forth, back, descriptors, iteration), RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, problem: Problem, updated: Registered) -> Int32[Array, " m"]:
         """The nearest vertices."""
@@ -130,6 +139,7 @@ class _Surface(NamedTuple):
     positions: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
     points: Float[Array, "n d"]
+    descriptors: Float[Array, "n c"]
     mask: Bool[Array, " n"]
 
     @classmethod
@@ -158,6 +168,7 @@ class _Surface(NamedTuple):
             positions,
             spectrum.normals,
             jnp.concatenate(points, axis=1).astype(dtype),
+            jnp.zeros((len(weights), 0), dtype) if spectrum.descriptors is None else spectrum.descriptors,
             spectrum.mask,
         )
 
@@ -165,10 +176,9 @@ class _Surface(NamedTuple):
         """Some of them, whose spectrum is given, for all."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
-        fields = (self.positions, self.normals, self.points, self.mask)
-        positions, normals, points, mask = (field[vertices] for field in fields)
+        fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
         return _Surface(
-            spectrum.eigenvectors, dual, weights, self.heat, self.time, positions, normals, points, mask
+            spectrum.eigenvectors, dual, weights, self.heat, self.time, *(field[vertices] for field in fields)
         )
 
     def weigh(self, weights: Float[Array, " s"]) -> _Surface:
@@ -242,10 +252,11 @@ class Bending(NamedTuple):
 
 
 class Registered(NamedTuple):
-    """What `Registration` hands on: what bends X onto Y, and Y onto X."""
+    """What `Registration` hands on: what bends X onto Y, and Y onto X, and what descriptors count."""
 
     forth: Bending
     back: Bending
+    descriptors: Float[Array, ""]
     iteration: Int32[Array, ""]
 
     @property
@@ -258,9 +269,14 @@ def _product_space(
     x: _Surface, y: _Surface, registered: Registered
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     """Points of both surfaces, at small distances where one comes to lie on the other and vice versa."""
+    count = registered.descriptors
     return (
-        jnp.concatenate([registered.forth.points(x), x.points], axis=1),
-        jnp.concatenate([y.points, registered.back.points(y)], axis=1),
+        jnp.concatenate(
+            [registered.forth.points(x), x.points, registered.descriptors * x.descriptors], axis=1
+        ),
+        jnp.concatenate(
+            [y.points, registered.back.points(y), registered.descriptors * y.descriptors], axis=1
+        ),
     )
 
 
