@@ -79,13 +79,21 @@ def defined(x: Spectrum, y: Spectrum, t, levels):
         of_x, of_y = own(x)[2], own(y)[2]
         asked, asking = (forth, of_y) if back is None else (queries, database)
         back = KDTree(asked).query(asking)[1]
-        queries, database = np.hstack([forth, of_x]), np.hstack([of_y, bent(y, x, back, level)])
+        described = [
+            2.8 / level**1.5 * np.asarray(s.descriptors) for s in (x, y) if s.descriptors is not None
+        ]
+        queries = np.hstack([forth, of_x, *described[:1]])
+        database = np.hstack([of_y, bent(y, x, back, level), *described[1:]])
         t = KDTree(database).query(queries)[1]
     return t, queries, database
 
 
-def test_is_what_its_definition_says(pair):
+@pytest.mark.parametrize("number_of_descriptors", [0, 5])
+def test_is_what_its_definition_says(pair, number_of_descriptors):
     x, y, start, *_ = pair
+    if number_of_descriptors:
+        generator = np.random.default_rng(2)
+        x, y = (s.describe(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
     refiner = Registration((20,))
     found = refine(x, y, start, refiner=refiner, iterations=2, history=True)
     t, queries, database = defined(x, y, np.asarray(start), (20, K))
@@ -196,6 +204,7 @@ def test_signs_and_padding_and_vmap(pair):
 
 def test_patches_find_the_same(pair):
     x, y, start, *_ = pair
+    x, y = (s.describe(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
     maps = [
         refine(x, y, start, refiner=Registration(search=search)).pointwise_map
         for search in ("exhaustive", "patches")
@@ -256,6 +265,8 @@ def test_what_cannot_work_is_refused(pair):
     np.testing.assert_array_equal(
         placed.pointwise_map, refine(x, y, start, refiner=Registration()).pointwise_map
     )
+    with pytest.raises(ValueError, match="X has 2 descriptors and Y 0"):
+        refine(x.describe(x.eigenvectors[:, :2]), y, start, refiner=Registration())
     with pytest.raises(ValueError, match="needs an eigenvector"):
         Registration((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):

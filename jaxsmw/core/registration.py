@@ -271,12 +271,8 @@ def _product_space(
     """Points of both surfaces, at small distances where one comes to lie on the other and vice versa."""
     count = registered.descriptors
     return (
-        jnp.concatenate(
-            [registered.forth.points(x), x.points, registered.descriptors * x.descriptors], axis=1
-        ),
-        jnp.concatenate(
-            [y.points, registered.back.points(y), registered.descriptors * y.descriptors], axis=1
-        ),
+        jnp.concatenate([registered.forth.points(x), x.points, count * x.descriptors], axis=1),
+        jnp.concatenate([y.points, registered.back.points(y), count * y.descriptors], axis=1),
     )
 
 
