@@ -231,8 +231,9 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for a stage that mends; with fewer vertices than spectra that are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken if a stage that is to mend could not; the least doubtful outcome is returned, by
-      its flaw and, of `FeatureRegression`, how badly features predict each other.
+    - `other_starts`: taken if a stage that is to mend could not, until three lead to the same map, which is
+      then no longer suspicious; if they do not, the least doubtful outcome is returned, by its flaw and, of
+      `FeatureRegression`, how badly features predict each other.
     - `history`: see `jaxsmw.refine`.
     """
     steps = list(zip(spectra, stages, strict=True))
@@ -246,12 +247,31 @@ def refine_in_stages(
     logger.info(
         "limbs may be swapped (flaw %.2f; right maps have up to %.2f): other starts", best.flaw, _DOUBTFUL
     )
-    tried = [best, *(outcome for outcome in map(through, other_starts) if outcome.successful)]
+    tried = [best]
+    for start in other_starts:
+        outcome = through(start)
+        if not outcome.successful:
+            continue
+        alike = [other for other in tried if meshes is not None and _agree(*meshes, outcome, other)]
+        tried.append(outcome)
+        if len(alike) >= _AGREEING - 1:
+            # Wrong maps are each wrong in their own way, mostly. This clears up what only looks torn, as
+            # where a body touches itself and its surface is one there.
+            logger.info("%d of %d starts lead to the same map", 1 + len(alike), len(tried))
+            return min(outcome, *alike, key=doubt)._replace(suspicious=False)
     best = min(tried, key=doubt)
     if len(tried) > 1:
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d starts has flaw %.2f%s", len(tried), best.flaw, left)
     return best
+
+
+def _agree(mesh_x: Mesh, mesh_y: Mesh, one: Outcome, other: Outcome) -> bool:
+    """Whether two outcomes are the same map but for details."""
+    m = len(mesh_x.vertices)
+    one_at, other_at = (mesh_y.vertices[np.asarray(found.pointwise_map)[:m]] for found in (one, other))
+    apart = np.linalg.norm(one_at - other_at, axis=1) > _APART * mesh_y.area**0.5
+    return mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area
 
 
 def doubt(outcome: Outcome) -> float:
@@ -399,6 +419,9 @@ _TOO_MUCH = 0.5
 _SUSPICIOUS, _DOUBTFUL = 1.12, 1.15
 # In `doubt`: right maps differ by less, mostly, and those upside down by more.
 _HARDLY = 0.25
+# Maps agree that differ by more than so many square roots of the area on less than such a share of it. Two
+# that are wrong sometimes do.
+_APART, _NEARLY_NOTHING, _AGREEING = 0.1, 0.03, 3
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -68,6 +68,17 @@ def test_another_start_helps_where_mending_does_not(body, monkeypatch):
     assert wrong > 0.5 and alone.suspicious and alone.flaw > 1.3
 
 
+def test_three_starts_that_agree_are_believed(body):
+    """However torn their map looks, and no fourth is asked for."""
+    mesh = body[0]
+    _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    start, identity = jnp.asarray(turned, jnp.int32), jnp.arange(len(mesh.vertices), dtype=jnp.int32)
+    asked = iter([start, start, identity])
+    wrong, found = outcome(body, [MENDING], start, other_starts=asked)
+    assert wrong > 0.5 and found.flaw > 1.3 and not found.suspicious
+    assert next(asked) is identity
+
+
 def test_no_other_start_is_asked_for_without_need(body):
     def none():
         raise AssertionError("a start was asked for")
