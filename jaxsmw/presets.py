@@ -271,7 +271,7 @@ def _agree(mesh_x: Mesh, mesh_y: Mesh, one: Outcome, other: Outcome) -> bool:
     m = len(mesh_x.vertices)
     one_at, other_at = (mesh_y.vertices[np.asarray(found.pointwise_map)[:m]] for found in (one, other))
     apart = np.linalg.norm(one_at - other_at, axis=1) > _APART * mesh_y.area**0.5
-    return mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area
+    return bool(mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area)
 
 
 def doubt(outcome: Outcome) -> float:
