@@ -12,7 +12,7 @@ from synthetic import bumpy_mesh
 
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.refinement import WaveletPreservation, refine
-from jaxsmw.core.registration import Registration, _nearest_rotation
+from jaxsmw.core.registration import Registration, _nearest_rotations
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
@@ -117,7 +117,7 @@ def test_rotations_are_the_best_there_are():
     u, _, vt = np.linalg.svd(covariances)
     hand = np.linalg.det(u @ vt)
     expected = np.einsum("nia,na,naj->nji", u, np.stack([hand**0, hand**0, hand], axis=1), vt)
-    found = np.asarray(jax.vmap(_nearest_rotation)(jnp.asarray(covariances)))
+    found = np.asarray(_nearest_rotations(jnp.asarray(covariances)))
     np.testing.assert_allclose(
         found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), found.shape), atol=1e-9
     )
@@ -127,7 +127,7 @@ def test_rotations_are_the_best_there_are():
     clear = np.abs(gain - best) < 1e-9
     assert clear.mean() > 0.9
     np.testing.assert_allclose(found[clear], expected[clear], atol=1e-4)
-    assert np.isfinite(_nearest_rotation(jnp.zeros((3, 3)))).all()
+    assert np.isfinite(_nearest_rotations(jnp.zeros((1, 3, 3)))).all()
 
 
 def test_a_body_that_only_moved_is_found_again(pair):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
-from jaxtyping import Array, Bool, Float, Int, Int32
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Float64, Int, Int32
 
 from jaxsmw.core.coarse_to_fine import CoarseToFine, check_descriptors, doubted
 from jaxsmw.core.functional_map import dual_eigenvectors
@@ -298,28 +300,37 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
     covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
     turned = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
     hand = jnp.where(turned, -1, 1).astype(covariance.dtype)
-    return hand * jax.vmap(_nearest_rotation)(hand * covariance)
+    return hand * _nearest_rotations(hand * covariance)
 
 
-def _nearest_rotation(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The rotation R that makes the trace of R S greatest, from quaternions (Horn 1987)."""
-    total = jnp.trace(covariance)
-    skew = covariance - covariance.T
-    axis = jnp.stack([skew[1, 2], skew[2, 0], skew[0, 1]])
-    identity = jnp.eye(3, dtype=covariance.dtype)
-    inner = covariance + covariance.T - total * identity
-    matrix = jnp.block([[total[None, None], axis[None, :]], [axis[:, None], inner]])
-    size = jnp.sqrt(jnp.sum(matrix**2))
+def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
+    """The rotations R that make the trace of R S greatest, from unit quaternions (Horn 1987).
+
+    Both R and its trace with S are quadratic in a quaternion, so that the best one is an eigenvector.
+    """
+    table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
+    quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
+    sizes = jnp.sqrt(jnp.sum(quadratic**2, axis=(1, 2), keepdims=True))
     # Without negative eigenvalues the largest is what prevails in powers.
-    powers = matrix / jnp.where(size > 0, size, 1) + jnp.eye(4, dtype=matrix.dtype)
-    for _ in range(_SQUARINGS):
-        powers = jnp.sum(powers[:, :, None] * powers[None, :, :], axis=1)
-        powers = powers / jnp.trace(powers)
-    quaternion = powers[jnp.argmax(jnp.diagonal(powers))]
-    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
-    rows = (
-        (1 - 2 * (y**2 + z**2), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x**2 + z**2), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)),
-    )
-    return jnp.stack([jnp.stack(row) for row in rows])
+    powers = quadratic / jnp.where(sizes > 0, sizes, 1) + jnp.eye(4, dtype=covariances.dtype)[None]
+
+    def squared(_: Any, powers: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
+        powers = jnp.sum(powers[:, :, :, None] * powers[:, None, :, :], axis=2)
+        return powers / jnp.trace(powers, axis1=1, axis2=2)[:, None, None]
+
+    powers = lax.fori_loop(0, _SQUARINGS, squared, powers)
+    largest = jnp.argmax(jnp.diagonal(powers, axis1=1, axis2=2), axis=1)
+    quaternions = jnp.take_along_axis(powers, largest[:, None, None], axis=1)
+    products = quaternions.mT * quaternions / jnp.sum(quaternions**2, axis=2, keepdims=True)
+    return product(products.reshape(-1, 16), table.T).reshape(-1, 3, 3)
+
+
+@cache
+def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
+    """What the rotation by a quaternion q is of the products of its components."""
+    signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
+    units = np.arange(4)
+    multiplication = np.zeros((4, 4, 4))  # one unit times another is plus or minus a third
+    multiplication[units[:, None], units, units[:, None] ^ units] = signs
+    rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])  # q v q*
+    return rotations[1:, 1:].reshape(9, 16)
