@@ -200,8 +200,11 @@ def _regress(
     xx = jnp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
     xy = jnp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
     yy = jnp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
-    functional_map = _least_squares(xy[:k_x, :k_y], yy[:k_y, :k_y])
-    matrix = jsp.linalg.block_diag(functional_map, _least_squares(xy[k_x:, k_y:], yy[k_y:, k_y:]))
+    # Eigenvectors by eigenvectors, descriptors by descriptors.
+    of_x, of_y = (jnp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
+    gram = jnp.where(of_y[:, None] == of_y[None, :], yy, 0) + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
+    cross = jnp.where(of_x[:, None] == of_y[None, :], xy, 0)
+    matrix = jsp.linalg.solve(gram, cross.T, assume_a="pos").T
     explained = product(matrix, xy.T)
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
@@ -210,9 +213,4 @@ def _regress(
     # out: it would add the same to all distances, and its rounding.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
-    return functional_map, Prediction(whitening, product(matrix.T, whitening), uncertainty)
-
-
-def _least_squares(cross: Float[Array, "p q"], gram: Float[Array, "q q"]) -> Float[Array, "p q"]:
-    ridge = _RIDGE * jnp.eye(gram.shape[0], dtype=gram.dtype)
-    return jsp.linalg.solve(gram + ridge, cross.T, assume_a="pos").T
+    return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)
