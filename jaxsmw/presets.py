@@ -231,9 +231,9 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for a stage that mends; with fewer vertices than spectra that are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken if a stage that is to mend could not, until three lead to the same map, which is
-      then no longer suspicious; if they do not, the least doubtful outcome is returned, by its flaw and, of
-      `FeatureRegression`, how badly features predict each other.
+    - `other_starts`: taken if a stage that is to mend could not. The least doubtful outcome is returned, by
+      its flaw and, of `FeatureRegression`, how badly features predict each other; but if not even that looks
+      right and three starts or more lead to the same map, the least doubtful of these.
     - `history`: see `jaxsmw.refine`.
     """
     steps = list(zip(spectra, stages, strict=True))
@@ -247,19 +247,14 @@ def refine_in_stages(
     logger.info(
         "limbs may be swapped (flaw %.2f; right maps have up to %.2f): other starts", best.flaw, _DOUBTFUL
     )
-    tried = [best]
-    for start in other_starts:
-        outcome = through(start)
-        if not outcome.successful:
-            continue
-        alike = [other for other in tried if meshes is not None and _agree(*meshes, outcome, other)]
-        tried.append(outcome)
-        if len(alike) >= _AGREEING - 1:
-            # Wrong maps are each wrong in their own way, mostly. This clears up what only looks torn, as
-            # where a body touches itself and its surface is one there.
-            logger.info("%d of %d starts lead to the same map", 1 + len(alike), len(tried))
-            return min(outcome, *alike, key=doubt)._replace(suspicious=False)
+    tried = [best, *(outcome for outcome in map(through, other_starts) if outcome.successful)]
     best = min(tried, key=doubt)
+    if best.suspicious and meshes is not None:
+        # Where a body touches itself, and its surface is one there, right maps look torn, too. Wrong ones are
+        # each wrong in their own way, mostly.
+        alike = [[other for other in tried if _agree(*meshes, outcome, other)] for outcome in tried]
+        most = max(alike, key=len)
+        best = min(most, key=doubt) if len(most) >= _AGREEING else best
     if len(tried) > 1:
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d starts has flaw %.2f%s", len(tried), best.flaw, left)

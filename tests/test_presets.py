@@ -68,15 +68,19 @@ def test_another_start_helps_where_mending_does_not(body, monkeypatch):
     assert wrong > 0.5 and alone.suspicious and alone.flaw > 1.3
 
 
-def test_three_starts_that_agree_are_believed(body):
-    """However torn their map looks, and no fourth is asked for."""
+def test_where_nothing_looks_right_what_three_starts_agree_on_is_taken(body, monkeypatch):
     mesh = body[0]
     _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     start, identity = jnp.asarray(turned, jnp.int32), jnp.arange(len(mesh.vertices), dtype=jnp.int32)
-    asked = iter([start, start, identity])
-    wrong, found = outcome(body, [MENDING], start, other_starts=asked)
-    assert wrong > 0.5 and found.flaw > 1.3 and not found.suspicious
-    assert next(asked) is identity
+    starts = [start, identity, start]
+    wrong, found = outcome(body, [MENDING], start, other_starts=starts)
+    assert wrong < 0.02 and not found.suspicious  # it looks right, whatever the others are
+    monkeypatch.setattr(presets, "_SUSPICIOUS", 0.5)
+    monkeypatch.setattr(presets, "_DOUBTFUL", 0.5)
+    wrong, found = outcome(body, [MENDING], start, other_starts=starts)
+    assert wrong > 0.5 and found.suspicious
+    wrong, found = outcome(body, [MENDING], start, other_starts=starts[:2])
+    assert wrong < 0.02 and found.suspicious  # two are not enough
 
 
 def test_no_other_start_is_asked_for_without_need(body):
