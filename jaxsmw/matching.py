@@ -305,8 +305,8 @@ def match(
     if outcome.suspicious:
         warnings.warn(
             f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round (flaw "
-            f"{outcome.flaw:.2f}; right maps have up to 1.15, between bodies of different kinds and where one "
-            "touches itself more): look at a report, and if so give a few landmarks",
+            f"{outcome.flaw:.2f}; right maps have up to 1.15, between bodies of different kinds, or where "
+            "one touches itself, more): look at a report, and if so give a few landmarks",
             stacklevel=2,
         )
     return Correspondence(
