@@ -424,14 +424,11 @@ def _add_evaluation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--evaluation-samples", metavar="N", type=_integer(1), help="measure at N random vertices only"
     )
-    parser.add_argument(
-        "--seed", type=_integer(0), default=0, help="of --evaluation-samples (default: %(default)s)"
-    )
+    parser.add_argument("--seed", type=_integer(0), help="of --evaluation-samples (default: 0)")
     parser.add_argument(
         "--geodesics",
         choices=("strips", "exact"),
-        default="strips",
-        help="strips is nearly always within 0.5 %% of exact, and much faster (default: %(default)s)",
+        help="strips is nearly always within 0.5 %% of exact, and much faster (default: strips)",
     )
 
 
@@ -503,7 +500,7 @@ def _demo(options: argparse.Namespace) -> None:
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
     write_ground_truth(directory / "truth.baryc_gt", truth, pair.target)
-    options.evaluation_samples, options.geodesics, options.up = None, "strips", "y"
+    options.evaluation_samples, options.geodesics, options.up = None, None, "y"
     correspondence = _run_match(options, pair.source, pair.target)
     write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
     _conclude(options, correspondence, truth, directory)
@@ -513,15 +510,12 @@ def _demo(options: argparse.Namespace) -> None:
 def _match(options: argparse.Namespace) -> None:
     # What would fail after minutes of work should fail now.
     _, _, init_file = options.init.partition(":")
-    without_effect = {
-        "--evaluation-samples is for --ground-truth": options.evaluation_samples and not options.ground_truth,
-        "--up is for --report": options.up and not options.report,
-        "--index-base is for --ground-truth and for files of --init": options.index_base is not None
-        and not (options.ground_truth or init_file),
-    }
-    for said, is_so in without_effect.items():
-        if is_so:
-            raise InputError(f"{said}: name one, or leave it out.")
+    measured = bool(options.ground_truth)
+    _refuse_without_effect(options, "a --report", bool(options.report), "up")
+    _refuse_without_effect(options, "--ground-truth", measured, "evaluation_samples", "geodesics")
+    _refuse_without_effect(options, "--evaluation-samples", bool(options.evaluation_samples), "seed")
+    read = measured or bool(init_file)
+    _refuse_without_effect(options, "--ground-truth or a file of --init", read, "index_base")
     inputs = (options.source, options.target, init_file, *(options.ground_truth or ()))
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
@@ -681,7 +675,16 @@ def _conclude(
     print(f"time:        {times} (compilation included)")
 
 
+def _refuse_without_effect(options: argparse.Namespace, what_for: str, is_given: bool, *names: str) -> None:
+    """Refuse options that were given, though what they are for was not."""
+    for name in names:
+        if not is_given and getattr(options, name) is not None:
+            option = name.replace("_", "-")
+            raise InputError(f"--{option}: is for {what_for}: give that as well, or leave --{option} out.")
+
+
 def _evaluate(options: argparse.Namespace) -> None:
+    _refuse_without_effect(options, "--evaluation-samples", bool(options.evaluation_samples), "seed")
     for output in filter(None, (options.output, options.figure, options.page)):
         _keep_inputs(output, options.source, options.target, *options.map, *options.ground_truth)
     _check_outputs(options)
@@ -755,6 +758,10 @@ def _match_outputs(options: argparse.Namespace) -> list[str]:
     points = options.surface_points
     if points and Path(points).suffix != ".baryc_gt":
         raise InputError(f"{points}: points are written as .baryc_gt; choose a name that ends in it.")
+    from jaxsmw.evaluation.ground_truth import check_map_name
+
+    for path in filter(None, (options.output, options.one_to_one)):
+        check_map_name(path)
     files = options.output, points, options.one_to_one, options.expected_error
     paths = [path for path in files if path]
     if options.texture:
@@ -795,9 +802,9 @@ def _errors(
             mesh_y,
             pointwise_map,
             truth,
-            method=options.geodesics,
+            method=options.geodesics or "strips",
             number_of_samples=options.evaluation_samples,
-            seed=options.seed,
+            seed=options.seed or 0,
         )
         for name, pointwise_map in maps.items()
     }
@@ -854,6 +861,7 @@ def _render(options: argparse.Namespace) -> None:
         )
     if not page and options.partial:
         raise InputError(f"--partial: is for pages; leave it out, or write {options.output} as .html.")
+    _refuse_without_effect(options, "a map", bool(options.map), "index_base")
     _keep_inputs(options.output, *filter(None, (options.source, options.target, *options.map)))
     from jaxsmw.report.figures import check_figure_path, draw_correspondence, draw_mesh, save_figure
 

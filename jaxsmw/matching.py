@@ -229,6 +229,7 @@ def match(
       that mend try `jaxsmw.starts.other_starts`, too, if it looks as if limbs were still swapped.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
+      (Presets tell their refiners; tell one of your own, as in `Registration(partial=True)`.)
     - `history`: record what happened in the last stage; see `jaxsmw.refine`.
 
     **Returns:** A `Correspondence`. A vertex of X that no face uses gets the match of the nearest one that
@@ -305,8 +306,9 @@ def match(
     if outcome.suspicious:
         warnings.warn(
             f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round (flaw "
-            f"{outcome.flaw:.2f}; right maps have up to 1.15, between bodies of different kinds, or where "
-            "one touches itself, more): look at a report, and if so give a few landmarks",
+            f"{outcome.flaw:.3f}; right maps have up to 1.12, or 1.15 if nothing looks reversed or torn off; "
+            "more between bodies of different kinds, or where one touches itself): look at it (--report, in "
+            "Python jaxsmw.report.summary.write_report), and if it is so start from a few landmarks",
             stacklevel=2,
         )
     return Correspondence(

@@ -57,8 +57,13 @@ class Stage:
     def __post_init__(self) -> None:
         for name in ("number_of_eigenvectors", "number_of_descriptors", "iterations", "number_of_samples"):
             value = getattr(self, name)
-            if not (isinstance(value, int | np.integer) or (value is None and name == "number_of_samples")):
+            if value is None and name == "number_of_samples":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise InputError(f"{name} is {value!r}; give a whole number.")
+            object.__setattr__(self, name, int(value))
+        if not isinstance(self.mending, Stage | None):
+            raise InputError(f"mending is {self.mending!r}; give a Stage.")
         if self.number_of_eigenvectors < 1:
             raise InputError(f"{self.number_of_eigenvectors} eigenvectors were asked for; give at least 1.")
         if not isinstance(self.refiner, Refiner):
@@ -244,10 +249,13 @@ def refine_in_stages(
     if not (best.successful and best.suspicious):
         return best
     # Of several that look right one may be better: once in doubt, all are tried.
-    logger.info(
-        "limbs may be swapped (flaw %.2f; right maps have up to %.2f): other starts", best.flaw, _DOUBTFUL
-    )
-    tried = [best, *(outcome for outcome in map(through, other_starts) if outcome.successful)]
+    logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, _DOUBTFUL)
+    tried = [best]
+    for number, start in enumerate(other_starts, 1):
+        logger.info("start %d", number + 1)
+        outcome = through(start)
+        if outcome.successful:
+            tried.append(outcome)
     best = min(tried, key=doubt)
     if best.suspicious and meshes is not None:
         # Where a body touches itself, and its surface is one there, right maps look torn, too. Wrong ones are

@@ -364,8 +364,26 @@ def test_maps_as_arrays(tmp_path, bodies):
 )
 def test_hostile_arrays(tmp_path, bodies, contents, fault):
     path = tmp_path / "map.npy"
-    path.write_text("0\n1\n") if contents is None else np.save(path, contents, allow_pickle=True)
+    if contents is None:
+        path.write_text("0\n1\n")
+    else:
+        np.save(path, contents, allow_pickle=True)
     with pytest.raises(jaxsmw.InputError, match=f"map.npy: {fault}"):
+        jaxsmw.read_pointwise_map(path, *bodies)
+
+
+def test_hostile_headers_of_arrays(tmp_path, bodies):
+    path = tmp_path / "map.npy"
+    huge = b"{'descr': '<i8', 'fortran_order': False, 'shape': (10000000000000,)}\n"
+    np.savez(tmp_path / "maps.npz", np.zeros(3))
+    archive = (tmp_path / "maps.npz").read_bytes()
+    started = b"\x93NUMPY\x01\x00"
+    for data in (archive, *(started + len(h).to_bytes(2, "little") + h for h in (huge, b"(" * 3000, b""))):
+        path.write_bytes(data)
+        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is no array that NumPy saved"):
+            jaxsmw.read_pointwise_map(path, *bodies)
+    path.unlink()
+    with pytest.raises(jaxsmw.InputError, match=r"map\.npy: cannot be read .No such file"):
         jaxsmw.read_pointwise_map(path, *bodies)
 
 

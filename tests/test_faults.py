@@ -70,6 +70,17 @@ def test_coarse_meshes_are_not_torn_by_their_own_edges():
     assert not torn_off(mesh, mesh, np.arange(len(mesh.vertices))).any()
 
 
+def test_a_map_that_collapses_is_flawed(spectrum, body):
+    mesh, _ = body
+    assert flaw(mesh, mesh, np.zeros(len(mesh.vertices), np.int64), spectrum) > 1e3
+    part = np.flatnonzero(mesh.vertices[:, 2] > 0.5 * mesh.vertices[:, 2].max())
+    shrunk = part[KDTree(mesh.vertices[part]).query(mesh.vertices)[1]]
+    assert stretch(mesh, mesh, shrunk, spectrum) < 0.8
+    assert flaw(mesh, mesh, shrunk, spectrum) > 1.25
+    # Of a whole body most may well have to go where a part of it ends.
+    assert flaw(mesh, mesh, shrunk, spectrum, partial=True) < flaw(mesh, mesh, shrunk, spectrum)
+
+
 def test_scattered_matches_are_no_flaw(spectrum, body):
     """Matches that are wrong by an edge, every one by itself; a map that leads an arm astray is one."""
     mesh, _ = body

@@ -402,8 +402,8 @@ def test_what_is_no_bank_or_solution_is_refused(settings):
 
 
 _OF_ANOTHER_KIND = """
-import jax.numpy as jnp, jaxsmw
-from jaxsmw import Meyer, Registration, WaveletPreservation, refine
+import jax.numpy as jnp, jaxsmw, numpy as np
+from jaxsmw import Meyer, Registration, Stage, WaveletPreservation, refine
 
 x = jaxsmw.Spectrum(jnp.arange(3.0), jnp.ones((5, 3)), jnp.ones(5), jnp.ones(5, bool))
 start = jnp.arange(5)
@@ -416,8 +416,14 @@ for call in (
     lambda: Meyer(3.5),
     lambda: Registration([35, 60]),
     lambda: Registration((3.5,)),
+    lambda: Registration(35),
+    lambda: print(Registration(tuple(np.array([35, 60]))).levels, Stage(iterations=np.int64(2)).iterations),
+    lambda: Stage(iterations=True),
+    lambda: Stage(mending="accurate"),
+    lambda: refine(x, x, start, samples_x=[1], samples_y=[1]),
     lambda: jaxsmw.compute_spectrum("mesh.off", 3),
     lambda: jaxsmw.match("mesh.off", "mesh.off"),
+    lambda: jaxsmw.compute_spectrum(jaxsmw.make_mesh(np.eye(3), [[0, 1, 2]]), 2, laplacian="Robust"),
 ):
     try:
         call()
@@ -435,11 +441,16 @@ def test_what_is_of_another_kind_is_named():
         "the refiner is <class 'jaxsmw.core.refinement.WaveletPreservation'>, but a Refiner is needed",
         "the refiner is 'paper', but a Refiner is needed",
         "the spectrum of Y is None, but a Spectrum is needed",
-        "the initial map is a list, but a ndarray is needed",
+        "the initial map is list, but an array is needed",
         "the bank is 'meyer', but a FilterBank is needed",
         "Meyer needs a whole number of filters, not 3.5",
-        "the levels are [35, 60], but a tuple of whole numbers is needed",
         "the levels are (3.5,), but a tuple of whole numbers is needed",
+        "the levels are 35, but a tuple of whole numbers is needed",
+        "(35, 60) 2",
+        "iterations is True; give a whole number.",
+        "mending is 'accurate'; give a Stage.",
+        "the samples of X is list, but an array is needed",
         "the mesh is 'mesh.off', but a Mesh is needed",
         "source mesh: 'mesh.off' is the name of a file: read it with jaxsmw.read_mesh first.",
+        "'Robust' is no Laplacian: choose auto, cotangent, robust.",
     ]

@@ -256,6 +256,13 @@ def test_does_not_stop_before_the_last_level(pair):
     assert 9 < found.iterations < 40
 
 
+def test_nothing_but_constants_to_go_by(pair):
+    """As where a mesh has as many parts as eigenvectors were asked for: still numbers."""
+    x, y, start, *_ = pair
+    found = refine(x.truncate(1), y.truncate(1), start, refiner=Registration())
+    assert found.result == RESULTS.successful and (np.asarray(found.pointwise_map) >= 0).all()
+
+
 def test_what_cannot_work_is_refused(pair):
     x, y, start, *_ = pair
     bare = Spectrum(y.eigenvalues, y.eigenvectors, y.vertex_areas, y.mask)

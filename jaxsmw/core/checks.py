@@ -37,11 +37,12 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 def check_kind(name: str, value: Any, *kinds: type) -> None:
     """**Raises:** `TypeError` if an argument is of none of these kinds."""
-    if not isinstance(value, kinds):
-        shown = (
-            repr(value) if isinstance(value, str | int | float | type | None) else f"a {type(value).__name__}"
-        )
-        raise TypeError(f"the {name} is {shown}, but a {kinds[0].__name__} is needed")
+    if isinstance(value, kinds):
+        return
+    shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
+    shown = "an array" if isinstance(value, jax.Array) else shown
+    needed = "an array" if kinds[0] is np.ndarray else f"a {kinds[0].__name__}"
+    raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 
 def check_between(

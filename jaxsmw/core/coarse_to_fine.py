@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,6 +14,13 @@ from jaxtyping import Array, Bool, Float, Int32
 from jaxsmw.core.checks import check_choice
 from jaxsmw.core.refinement import Problem, Refiner
 from jaxsmw.core.spectrum import Spectrum
+
+
+def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
+    try:
+        return tuple(operator.index(level) for level in levels)
+    except TypeError:
+        raise TypeError(f"the levels are {levels!r}, but a tuple of whole numbers is needed") from None
 
 
 class CoarseToFine(Refiner):
@@ -30,14 +39,12 @@ class CoarseToFine(Refiner):
     kind of search.
     """
 
-    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    levels: tuple[int, ...] = eqx.field(static=True, default=(), converter=_whole_numbers)
     partial: bool = eqx.field(static=True, default=False)
     search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
         check_choice("search", self.search, ("auto", "exhaustive", "patches"))
-        if not isinstance(self.levels, tuple) or not all(isinstance(n, int) for n in self.levels):
-            raise TypeError(f"the levels are {self.levels!r}, but a tuple of whole numbers is needed")
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each needs an eigenvector at least")
 

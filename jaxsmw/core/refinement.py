@@ -279,6 +279,9 @@ def refine(
     check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
     if (samples_x is None) != (samples_y is None):
         raise ValueError("samples are needed on both shapes or on neither")
+    if samples_x is not None:
+        check_kind("samples of X", samples_x, np.ndarray, jax.Array)
+        check_kind("samples of Y", samples_y, np.ndarray, jax.Array)
     if pointwise_map.shape != spectrum_x.mask.shape:
         raise ValueError(
             f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"

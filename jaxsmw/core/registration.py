@@ -160,7 +160,8 @@ class _Surface(NamedTuple):
         first = slice(min(_NUMBER_OF_EIGENFUNCTIONS, eigenvalues.shape[0]))
         smooth = eigenvectors[:, first] / jnp.sqrt(1 + eigenvalues[None, first])
         points = [positions, _NORMALS * spectrum.normals, _EIGENFUNCTIONS * smooth]
-        time = jnp.maximum(_HEAT_TIME, _FADES / eigenvalues[-1])
+        last = eigenvalues[-1]
+        time = jnp.maximum(_HEAT_TIME, jnp.where(last > 0, _FADES / last, 0))
         return cls(
             spectrum.eigenvectors,
             dual_eigenvectors(spectrum, "area"),

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
@@ -100,6 +101,7 @@ def refine_softly(
     else:
         sparse = isinstance(pointwise_map, SparseSoftMap)
         matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
+        check_kind("initial map", matches, np.ndarray, jax.Array)
         if matches.shape[0] != m or matches.ndim != 1 + sparse:
             raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
     problem = refiner.prepare(spectrum_x, spectrum_y)

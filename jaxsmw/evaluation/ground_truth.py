@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Literal
 
 import numpy as np
@@ -230,8 +231,10 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     - `path`: the file to create or to replace.
     - `pointwise_map`: the target vertex of each source vertex (m,), 0-based.
 
-    **Raises:** `InputError` if these are not vertices or the file cannot be written.
+    **Raises:** `InputError` if these are not vertices, the name is that of another kind of file, or it cannot
+    be written.
     """
+    check_map_name(path)
     targets = np.asarray(pointwise_map)
     if targets.ndim != 1 or targets.dtype.kind not in "iu" or (targets < 0).any():
         raise InputError(
@@ -246,6 +249,15 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
             np.save(temporary, targets.astype(np.int64))
         else:
             temporary.write_text("".join(f"{target}\n" for target in targets.tolist()), encoding="ascii")
+
+
+def check_map_name(path: str | os.PathLike[str]) -> None:
+    """**Raises:** `InputError` if the name is that of a file in which others expect something else."""
+    suffix = Path(path).suffix.lower()
+    if suffix in (".npz", ".baryc_gt", ".vts", ".json"):
+        raise InputError(
+            f"{path}: a map is written as text, .npy or .mat, not as {suffix}: choose another name."
+        )
 
 
 def _is_npy_file(path: str | os.PathLike[str]) -> bool:
@@ -278,9 +290,10 @@ class _Table:
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """An array of NumPy's; of one column a list will do, too."""
+        data = io.BytesIO(self._bytes())
         try:
-            array = np.load(io.BytesIO(self._bytes()), allow_pickle=False)
-        except (ValueError, EOFError) as error:
+            array = np.lib.format.read_array(data, allow_pickle=False)
+        except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
             raise InputError(f"{self.path}: is no array that NumPy saved: give one, or text.") from error
         table = array[:, None] if array.ndim == 1 else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size

@@ -108,6 +108,8 @@ def eigenpairs(
         )
     if eigensolver not in get_args(Eigensolver):
         raise InputError(f"{eigensolver!r} is no eigensolver: choose {', '.join(get_args(Eigensolver))}.")
+    if laplacian not in get_args(Laplacian):
+        raise InputError(f"{laplacian!r} is no Laplacian: choose {', '.join(get_args(Laplacian))}.")
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if eigensolver == "auto":

@@ -66,6 +66,7 @@ def flaw(
 ) -> float:
     """How bad a map looks: its `stretch`, the more so the more of X has `reversed_orientation`.
 
+    What shrinks is as bad as what stretches, but between a part and the whole, much of which has no place.
     Stretch alone would have a body mapped to its mirror image rather than one leg to the other. What
     registration ends with has up to 1.12 between poses of one body and up to 1.2 between bodies of different
     kinds where it is right, mostly above 1.3 where limbs are swapped.
@@ -73,9 +74,10 @@ def flaw(
     eigenvectors = np.asarray(spectrum_x.eigenvectors)[: len(mesh_x.vertices), :_EIGENVECTORS]
     reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
     share = float(mesh_x.vertex_areas[reversed_].sum() / mesh_x.area)
-    return stretch(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial) * (
-        1 + _WEIGHT_OF_REVERSED * share
-    )
+    stretched = stretch(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial)
+    if not partial:
+        stretched = max(stretched, 1 / max(stretched, 1e-6))
+    return stretched * (1 + _WEIGHT_OF_REVERSED * share)
 
 
 def torn_off(

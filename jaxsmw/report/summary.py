@@ -147,6 +147,8 @@ def write_report(
     summary = {
         "settings": dict(settings or {}),
         "result": facts,
+        "flaw": correspondence.flaw,
+        "suspicious": correspondence.suspicious,
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "provenance": provenance(),
     }
@@ -287,7 +289,7 @@ def summarize(
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.flaw is not None:
         doubt = "; limbs may be swapped" if correspondence.suspicious else ""
-        facts["flaw"] = f"{correspondence.flaw:.2f}{doubt}"
+        facts["flaw (1 is none)"] = f"{correspondence.flaw:.2f}{doubt}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
 
