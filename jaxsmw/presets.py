@@ -251,8 +251,8 @@ def refine_in_stages(
     # Of several that look right one may be better: once in doubt, all are tried.
     logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, _DOUBTFUL)
     tried = [best]
-    for number, start in enumerate(other_starts, 1):
-        logger.info("start %d", number + 1)
+    for number, start in enumerate(other_starts, 2):
+        logger.info("start %d", number)
         outcome = through(start)
         if outcome.successful:
             tried.append(outcome)
