@@ -123,7 +123,7 @@ NO_MESHES = {
         SimpleNamespace(points=np.eye(5, 3), faces=np.array([3, 0, 1, 2, 7, 0, 1, 2, 3, 4, 0, 1])),
         "not all its faces are triangles"),
     "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is no triangle mesh"),
-    "a path": ("body.off", "str is no triangle mesh"),
+    "a path": ("body.off", "is the name of a file: read it with jaxsmw.read_mesh first"),
 }  # fmt: skip
 
 
