@@ -459,15 +459,16 @@ def test_the_report_is_no_place_for_the_map(run, pair, tmp_path):
         ("points.txt", "ends in it"),
         ("missing/points.baryc_gt", "missing"),
         ("truth.baryc_gt", "is an input"),
-        ("map.baryc_gt", "another output as well"),
+        ("errors.baryc_gt", "another output as well"),
         ("start.baryc_gt", "is an input"),
     ],
 )
 def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault):
     (tmp_path / "truth.baryc_gt").write_text("1 1 0 0\n" * 642)
     (tmp_path / "start.baryc_gt").write_text("0\n" * 642)
-    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.baryc_gt", *SMALL, "--quiet"]
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL, "--quiet"]
     call += ["--init", f"map:{tmp_path / 'start.baryc_gt'}", "--ground-truth", tmp_path / "truth.baryc_gt"]
+    call += ["--expected-error", tmp_path / "errors.baryc_gt"]
     assert_refused(run(*call, "--surface-points", tmp_path / name), naming=fault)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["start.baryc_gt", "truth.baryc_gt"]
     assert (tmp_path / "start.baryc_gt").read_text() == "0\n" * 642
