@@ -65,7 +65,7 @@ from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.matching import match, paired_spectra
-from jaxsmw.presets import Preset, Stage
+from jaxsmw.presets import PRESETS, Preset, Stage
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
@@ -266,14 +266,17 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
 
             return run
 
-        def both(meshes: tuple[Mesh, Mesh] = (pair.source, pair.target)) -> object:
-            return [eigenpairs(mesh, EIGENVECTORS) for mesh in meshes]
+        def both(k: int, meshes: tuple[Mesh, Mesh] = (pair.source, pair.target)) -> object:
+            return [eigenpairs(mesh, k) for mesh in meshes]
+
+        accurate = max(stage.number_of_eigenvectors for stage in PRESETS["accurate"])
 
         kept = Path(directory) / "kept"
         started(*matching, cache=kept)()
         seconds = medians(
             {
-                "two eigenbases": both,
+                "two eigenbases": partial(both, EIGENVECTORS),
+                f"two eigenbases, k = {accurate}": partial(both, accurate),
                 "import jax": started("-c", "import jax"),
                 "import jaxsmw": started("-c", "import jaxsmw"),
                 "jaxsmw --help": started("-m", "jaxsmw", "--help"),
