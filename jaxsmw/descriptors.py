@@ -82,19 +82,21 @@ def describe(
         with suppress(InputError), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # where a mesh is too coarse for it, the usual one is enough
             of_radii.append(paired_shot(*sides, partial, _FINE_RADIUS))
-    shot = [np.hstack(of_shape) for of_shape in zip(*of_radii, strict=True)]
-    weights = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
-    both, weight = np.concatenate(shot), np.concatenate([w / w.sum() / 2 for w in weights])
+    dtype = spectrum_x.eigenvectors.dtype
+    both = np.hstack([np.concatenate(of_radius) for of_radius in of_radii], dtype=dtype)
+    areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
+    weight = np.concatenate([a / a.sum() / 2 for a in areas]).astype(dtype)
     centered = both - weight @ both
-    variances, directions = np.linalg.eigh(centered.T @ (weight[:, None] * centered))
+    covariance = centered.T @ (weight[:, None] * centered)
+    variances, directions = np.linalg.eigh(covariance.astype(np.float64))
     first = slice(None, -number_of_descriptors - 1, -1)
     scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
-    components = np.split(centered @ directions[:, first] / scale, [len(shot[0])])
+    components = np.split(centered @ (directions[:, first] / scale).astype(dtype), [len(areas[0])])
     described = []
     for spectrum, side, found in zip((spectrum_x, spectrum_y), sides, components, strict=True):
         everywhere = found if side.samples is None else found[side.samples.nearest]
         everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
-        described.append(spectrum.describe(jax.device_put(everywhere.astype(spectrum.eigenvectors.dtype))))
+        described.append(spectrum.describe(jax.device_put(everywhere)))
     return described[0], described[1]
 
 

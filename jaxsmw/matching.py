@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.core.compilation import compile_ahead, compiled
+from jaxsmw.core.batch import padded_size
+from jaxsmw.core.compilation import compile_ahead, compiled, release_programs
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.refinement import Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
@@ -243,14 +244,23 @@ def match(
         for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
     )
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
+    # Programs compiled for one pair serve all others of about its size.
+    size_x, size_y = (size if size > _NOT_PADDED else padded_size(size) for size in (m, n))
+    for mesh in (mesh_x, mesh_y):
+        if (used := int(mesh.used_vertices.sum())) < _FEWEST_VERTICES:
+            raise InputError(
+                f"{mesh.name}: its faces use {used} vertices, too few to be matched by shape: give a mesh of "
+                f"at least {_FEWEST_VERTICES}; of hundreds, for the result to mean anything."
+            )
     fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
     stages = chosen_stages(preset, fewest, partial=partial)
     k = max(stage.number_of_eigenvectors for stage in stages)
+    release_programs()
     compiling = []
     # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
     if not partial and 0 < k < min(m, n):
         for stage in stages:
-            outlines = partial_function(_outlines, m, n, stage)
+            outlines = partial_function(_outlines, size_x, size_y, stage)
             compiling.append(compile_ahead(refine, outlines, **stage.settings, history=history))
     seconds: dict[str, float] = {}
     with _stage("eigenbases", seconds):
@@ -284,23 +294,28 @@ def match(
                 lambda mesh: farthest_point_samples(mesh, number_of_samples), mesh_x, mesh_y
             )
             samples = jax.device_put(samples_x), jax.device_put(samples_y)
-    spectra = [stage.view(spectrum_x, spectrum_y, partial=partial) for stage in stages]
+    pad = compiled(Spectrum.pad)
+    padded = pad(spectrum_x, size_x), pad(spectrum_y, size_y)
+
+    def from_host(start: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
+        return jax.device_put(np.pad(start, (0, size_x - m)))
+
     with _stage("refinement", seconds):
         wait(compiling)
         others: Iterable[Int64[np.ndarray, " m"]] = ()
         if isinstance(init, str) and init == "shot":
             others = other_starts(mesh_x, mesh_y, spectrum_x, spectrum_y, partial=partial)
         outcome = refine_in_stages(
-            spectra,
-            jax.device_put(start),
+            [stage.view(*padded, partial=partial) for stage in stages],
+            from_host(start),
             stages,
             samples,
             meshes=(mesh_x, mesh_y),
             partial=partial,
-            other_starts=map(jax.device_put, others),
+            other_starts=map(from_host, others),
             history=history,
         )
-        last = jax.block_until_ready(outcome.refinements[-1])
+        last = jax.block_until_ready(outcome.refinements[-1]).unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(last.result)}")
     if outcome.suspicious:
@@ -311,15 +326,16 @@ def match(
             "Python jaxsmw.report.summary.write_report), and if it is so start from a few landmarks",
             stacklevel=2,
         )
+    spectrum_x, spectrum_y = stages[-1].view(spectrum_x, spectrum_y, partial=partial)
     return Correspondence(
         mesh_x=mesh_x,
         mesh_y=mesh_y,
         pointwise_map=extend_to_unused(mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
-        initial_map=np.asarray(outcome.initial_map).astype(np.int64),
+        initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         functional_map=np.asarray(last.functional_map),
         stages=stages,
-        spectrum_x=spectra[-1][0],
-        spectrum_y=spectra[-1][1],
+        spectrum_x=spectrum_x,
+        spectrum_y=spectrum_y,
         refinement=last,
         iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
         flaw=outcome.flaw,
@@ -387,6 +403,10 @@ def paired_spectra(
     return common_range(spectrum_x.scale(mesh_x.area / larger), spectrum_y.scale(mesh_y.area / larger))
 
 
+# From here on memory is dearer than compiling.
+_NOT_PADDED = 50_000
+# Of which half as many eigenvectors make sense: the constant, and one besides.
+_FEWEST_VERTICES = 4
 # A thousandth of a body's area shows nothing of its kind.
 _SMALLEST_PART = 1e-3
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.core.batch import padded_size
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.functional_map import encode, multiscale_kernel
@@ -205,11 +206,16 @@ def _nearest_compared(
     features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"], y: Compared
 ) -> Int64[np.ndarray, " a"]:
     dtype = y.spectrum.eigenvectors.dtype
+
+    def padded(rows: np.ndarray) -> Array:
+        missing = padded_size(len(rows)) - len(rows)
+        return jax.device_put(np.pad(rows, ((0, missing), *((0, 0),) * (rows.ndim - 1))))
+
     nearest = compiled(nearest_neighbor)(
-        *(jax.device_put(features.astype(dtype)) for features in (features_x, features_y)),
-        database_mask=y.spectrum.mask,
+        *(padded(features.astype(dtype)) for features in (features_x, features_y)),
+        database_mask=padded(np.asarray(y.spectrum.mask)),
     )
-    return np.asarray(nearest).astype(np.int64)
+    return np.asarray(nearest)[: len(features_x)].astype(np.int64)
 
 
 def _everywhere(found: Int64[np.ndarray, " a"], x: Compared, y: Compared) -> Int64[np.ndarray, " m"]:

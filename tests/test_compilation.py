@@ -2,6 +2,7 @@
 
 import logging
 from concurrent.futures import wait
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 
 from jaxsmw import compiler_options, nearest_neighbor
 from jaxsmw.core import compilation
-from jaxsmw.core.compilation import compile_ahead, compiled
+from jaxsmw.core.compilation import compile_ahead, compiled, release_programs
 
 
 @pytest.fixture
@@ -84,3 +85,19 @@ def test_no_options_where_there_are_none(monkeypatch):
 def test_what_is_done_to_options_stays_there():
     compiler_options()["xla_something"] = True
     assert "xla_something" not in compiler_options()
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory maps are looked at on Linux only")
+def test_programs_are_released_when_they_take_too_much(monkeypatch):
+    traced = []
+
+    def total(values):
+        traced.append(values)
+        return jnp.sum(values)
+
+    for part, times in ((0.25, 1), (0.0, 2), (0.25, 2)):
+        monkeypatch.setattr(compilation, "_GOOD_PART", part)
+        compiled(total)(jnp.zeros(7))
+        release_programs()
+        compiled(total)(jnp.zeros(7))
+        assert len(traced) == times

@@ -17,11 +17,12 @@ from jaxsmw import descriptors
 from jaxsmw.core import refinement
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import Meyer
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
+from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import match, paired_spectra
@@ -127,6 +128,21 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
         match(*pair[:2], preset=replace(STAGE, number_of_samples=samples))
     # Where messages about compilation are wanted in this thread only, those of another do not appear.
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
+
+
+def test_pairs_of_about_one_size_share_programs(caplog):
+    pairs = [creature_pair(vertices=vertices) for vertices in (700, 720)]
+    assert len({len(mesh.vertices) for pair in pairs for mesh in (pair.source, pair.target)}) == 4
+    match(pairs[0].source, pairs[0].target, preset=STAGE)
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        found = match(pairs[1].source, pairs[1].target, preset=STAGE, history=False)
+    assert "jit(pad)" in caplog.text  # of the size that is theirs
+    assert "jit(refine)" not in caplog.text and "jit(nearest_neighbor)" not in caplog.text
+    m = len(pairs[1].source.vertices)
+    assert found.refinement.pointwise_map.shape == found.spectrum_x.mask.shape == (m,)
+    assert found.initial_map.shape == found.pointwise_map.shape == (m,)
+    alone = refine(found.spectrum_x, found.spectrum_y, jnp.asarray(found.initial_map), **STAGE.settings)
+    assert (np.asarray(alone.pointwise_map) == found.pointwise_map).mean() > 0.99
 
 
 def test_scale_and_rotation_do_not_matter(pair):
@@ -377,6 +393,12 @@ def test_an_unknown_preset_is_refused():
 def test_stages_that_cannot_be_are_refused(settings, fault):
     with pytest.raises((InputError, TypeCheckError), match=fault):
         Stage(**settings)
+
+
+def test_a_single_triangle_is_too_little(pair):
+    triangle = make_mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle.off")
+    with pytest.raises(InputError, match=r"triangle\.off: its faces use 3 vertices, .* at least 4"):
+        match(triangle, pair[1])
 
 
 def test_a_soup_of_triangles_is_named(pair):

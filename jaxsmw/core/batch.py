@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -142,7 +141,8 @@ def refine_pairs(
                 refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
                 refined = multihost_utils.process_allgather(refined, tiled=True)
                 for row, position in enumerate(chosen):
-                    yield position, _row(refined, row, len(pointwise_maps[position]))
+                    one = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
+                    yield position, one.unpadded(len(pointwise_maps[position]))
 
     return results()
 
@@ -194,15 +194,6 @@ def _refine_batch(refiner: Refiner, batch: Any, mesh: Mesh, settings: dict[str, 
     # compiler has no trouble dividing it.
     refined = lax.map(one, batch) if len(batch[-1]) == 1 else jax.vmap(one)(batch)
     return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
-
-
-def _row(refined: Refinement, row: int, vertices: int) -> Refinement:
-    """One pair of a batch, without its padding."""
-    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), refined)
-    history = one.history
-    if history is not None and history.pointwise_maps is not None:
-        history = dataclasses.replace(history, pointwise_maps=history.pointwise_maps[:, :vertices])
-    return dataclasses.replace(one, pointwise_map=one.pointwise_map[:vertices], history=history)
 
 
 def _default_batch_size(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -80,3 +81,22 @@ def compile_ahead(
     future = executor.submit(compile_it)
     executor.shutdown(wait=False)
     return future
+
+
+def release_programs() -> None:
+    """Let go of all compiled programs if they take a good part of the memory maps that a process may have.
+
+    On Linux: with a few dozen pairs of unlike sizes they would take all, and LLVM ends a process that gets no
+    more. What is still needed is compiled again, or loaded if programs are kept on disk.
+    """
+    try:
+        used = Path("/proc/self/maps").read_bytes().count(b"\n")
+        most = int(Path("/proc/sys/vm/max_map_count").read_text("ascii"))
+    except (OSError, ValueError):
+        return
+    if used > _GOOD_PART * most:
+        jax.clear_caches()
+
+
+# A pair of new sizes takes up to three hundredths, and 250 MB.
+_GOOD_PART = 0.25

@@ -132,6 +132,15 @@ class Refinement(eqx.Module):
     iterations: Int32[Array, ""]
     history: History | None
 
+    def unpadded(self, number_of_vertices: int) -> Refinement:
+        """The same without what `Spectrum.pad` added to X."""
+        history = self.history
+        if history is not None and history.pointwise_maps is not None:
+            maps = history.pointwise_maps[:, :number_of_vertices]
+            history = dataclasses.replace(history, pointwise_maps=maps)
+        kept = self.pointwise_map[:number_of_vertices]
+        return dataclasses.replace(self, pointwise_map=kept, history=history)
+
 
 Search = Literal["auto", "exhaustive", "patches", "approximate"]
 

@@ -74,6 +74,8 @@ class Spectrum(eqx.Module):
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
             raise ValueError(f"a shape of {self.mask.shape[0]} vertices does not fit {number_of_vertices}")
+        if rows == 0:
+            return self
         return self._at_vertices(lambda field: jnp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1))))
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Int, Int64
 from tqdm import tqdm
 
 from jaxsmw.core.batch import padded_size
+from jaxsmw.core.compilation import release_programs
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
@@ -294,6 +295,7 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 
 def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
     """Match a pair with every method and measure the maps; a row for each."""
+    release_programs()
     data = task.pair
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
@@ -26,7 +26,7 @@ _PAIRS_PER_BLOCK = 100_000
 
 def shot_descriptors(
     mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: Samples | None = None
-) -> Float64[np.ndarray, "n 352"]:
+) -> Float32[np.ndarray, "n 352"]:
     """Signatures of histograms of orientations, one per vertex.
 
     Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
@@ -76,7 +76,8 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        descriptors = np.zeros((number, SHOT_DIMENSION))
+        # Seven digits are more than anything in them means.
+        descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
@@ -89,7 +90,7 @@ def shot_descriptors(
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
     chosen = () if samples is None else samples
-    result = cached("shot-descriptors", (mesh.vertices, mesh.faces, radius, *chosen), compute)
+    result = cached("shot", (mesh.vertices, mesh.faces, radius, *chosen), compute)
     if (lonely := float(result["lonely"])) > 0.01:
         warnings.warn(_too_coarse(mesh, lonely, radius), stacklevel=2)
     return result["descriptors"]
@@ -98,8 +99,8 @@ def shot_descriptors(
 def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
-        f"the SHOT radius of {radius:.3g} sqrt(area), as the mesh is coarse there; use a finer mesh or start "
-        "from another map (init='wks', on the command line --init wks)."
+        f"the SHOT radius of {radius:.3g} sqrt(area), as the mesh is coarse there; use a finer mesh or do "
+        "without SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
     )
 
 
