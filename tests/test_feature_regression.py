@@ -160,6 +160,14 @@ def test_vmap_is_the_loop(pair):
         np.testing.assert_array_equal(both.pointwise_map[row], alone.pointwise_map)
 
 
+def test_rows_that_are_not_those_of_the_vertices_are_refused(pair):
+    x, _, _, _ = pair
+    with pytest.raises(ValueError, match=rf"descriptors have shape \(3, 2\), .* each of the {M} vertices"):
+        x.describe(jnp.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"positions have shape .* a row of 3 numbers"):
+        x.place(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
+
+
 def test_descriptors_that_are_no_numbers_are_reported(pair):
     x, y, start, _ = pair
     broken = x.describe(x.descriptors.at[3, 1].set(jnp.nan))

@@ -59,11 +59,20 @@ class Spectrum(eqx.Module):
         )
 
     def describe(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """The same shape with other descriptors, or none."""
+        """The same shape with other descriptors, or none.
+
+        **Raises:** `ValueError` if there is not a row for each vertex.
+        """
+        self._check_rows("descriptors", descriptors)
         return dataclasses.replace(self, descriptors=descriptors)
 
     def place(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """The same shape with these positions, in its own unit of length, and unit normals."""
+        """The same shape with these positions, in its own unit of length, and unit normals.
+
+        **Raises:** `ValueError` if there is not a row for each vertex.
+        """
+        self._check_rows("positions", positions, 3)
+        self._check_rows("normals", normals, 3)
         return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
@@ -87,6 +96,14 @@ class Spectrum(eqx.Module):
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
         sampled = self._at_vertices(lambda field: field[vertices])
         return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
+
+    def _check_rows(self, name: str, rows: Array | None, columns: int | None = None) -> None:
+        if rows is None:
+            return
+        n, shape = self.mask.shape[0], jnp.shape(rows)
+        if len(shape) != 2 or shape[0] != n or columns not in (None, shape[1]):
+            row = "a row" if columns is None else f"a row of {columns} numbers"
+            raise ValueError(f"{name} have shape {shape}, but {row} is needed for each of the {n} vertices")
 
     def _at_vertices(self, change: Callable[[Array], Array]) -> Spectrum:
         """The same shape with everything that it has of each vertex changed."""
