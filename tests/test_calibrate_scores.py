@@ -4,11 +4,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
+
+from jaxsmw import creature_pair, match
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
-import calibrate_scores
-from calibrate_scores import Measured, tables
+from calibrate_scores import AS_IT_STARTS, Measured, looks, tables
 
 
 def cells(table: str) -> list[list[str]]:
@@ -29,4 +31,16 @@ def test_tables_say_what_was_measured():
 
 
 def test_stages_after_the_first_do_not_mend():
-    assert all(stage.mending is None for stage in calibrate_scores.AS_IT_STARTS)
+    assert all(stage.mending is None for stage in AS_IT_STARTS)
+
+
+def test_a_map_is_looked_at_in_every_way():
+    pair = creature_pair(vertices=1100)
+    found = match(pair.source, pair.target, preset="fast")
+    scores = looks(found)
+    assert np.isfinite(list(scores.values())).all()
+    # The same, with what lies left and right of its middle exchanged.
+    other = pair.target.vertices * (-1, 1, 1)
+    mirrored = cKDTree(pair.target.vertices).query(other[found.pointwise_map])[1]
+    wrong = looks(match(pair.source, pair.target, init=mirrored, preset="fast"))
+    assert wrong.keys() == scores.keys() and wrong["flaw"] > scores["flaw"]
