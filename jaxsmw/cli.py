@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         "--ground-truth",
         metavar="FILE",
         nargs="+",
-        help="the true map; the error is printed before and after",
+        help="the true map, in one of the forms that evaluate takes; the error is printed before and after",
     )
     _add_partial(match)
     _add_method(match)
@@ -183,7 +183,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         nargs="+",
         required=True,
-        help="target vertices, one per line; or two .vts files; or a .baryc_gt file; or a two-column file",
+        help="target vertices, one per line; or two .vts files, of the source and of the target; or a "
+        ".baryc_gt file; or a two-column file",
     )
     evaluate.add_argument("--output", metavar="FILE", help="write the figures as JSON, curves included")
     evaluate.add_argument("--figure", metavar="FILE", help="draw the correspondence quality curves")

@@ -28,6 +28,10 @@ class Compared(NamedTuple):
 
     @classmethod
     def make(cls, mesh: Mesh, samples: Samples | None, spectrum: Spectrum) -> Compared:
+        if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
+            raise InputError(
+                f"{mesh.name}: it has {n} vertices, but the spectrum given for it is of {rows}: give its own."
+            )
         if samples is not None:
             spectrum = spectrum.sample(jnp.asarray(samples.vertices))
         return cls(mesh, samples, spectrum)

@@ -202,7 +202,7 @@ def match(
     mesh_y: Mesh | MeshLike,
     *,
     preset: Preset | Stage | Sequence[Stage] = "accurate",
-    init: Start | ArrayLike = "shot",
+    init: Start | ArrayLike | SurfacePoints = "shot",
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
@@ -224,7 +224,7 @@ def match(
     - `init`: where to start: `"shot"`, `"wks"`, `"hks"` or `"wavelet"` for nearest neighbours of that
       descriptor (only SHOT tells left from right); `"functional"` for the functional map that preserves
       SHOT and commutes with the Laplacian (section 3.2 of the MWP paper), smoother and much less wrong to
-      begin with; an array (m,) of vertices of Y for a map of your own;
+      begin with; an array (m,) of vertices of Y, or m `SurfacePoints`, for a map of your own;
       an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
       and in geodesic distance to the landmarks (a few, on both sides of the body). After `"shot"` presets
       that mend try `jaxsmw.starts.other_starts`, too, if it looks as if limbs were still swapped.
@@ -243,6 +243,8 @@ def match(
         mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
         for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
     )
+    if not isinstance(partial, bool | np.bool):
+        raise InputError(f"partial is {partial!r}; give True or False.")
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
     # Programs compiled for one pair serve all others of about its size.
     size_x, size_y = (size if size > _NOT_PADDED else padded_size(size) for size in (m, n))

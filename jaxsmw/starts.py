@@ -26,7 +26,7 @@ from jaxsmw.descriptors import Compared, compared, paired_shot
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.extremities import extremities, likely_pairings
 from jaxsmw.geometry.faults import flaw
-from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
@@ -55,7 +55,7 @@ def initial_map(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
-    init: Start | ArrayLike = "shot",
+    init: Start | ArrayLike | SurfacePoints = "shot",
     partial: bool = False,
 ) -> Int64[np.ndarray, " m"]:
     """The map T: X -> Y (m,) that refinement starts from; `match` explains the choices.
@@ -66,12 +66,14 @@ def initial_map(
 
     **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
     """
+    if isinstance(init, SurfacePoints):
+        init = check_surface_points(init, mesh_y, "initial map").nearest_corners(mesh_y)
     if not isinstance(init, str):
         given = np.asarray(init)
         if not np.issubdtype(given.dtype, np.integer):
             raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
         if given.ndim == 1:
-            return extend_to_unused(mesh_x, _checked_map(given, mesh_x, mesh_y))
+            return extend_to_unused(mesh_x, _checked_map(init, mesh_x, mesh_y))
     x, y = compared(mesh_x, mesh_y, spectrum_x, spectrum_y)
     if not isinstance(init, str):
         features_x, features_y = _landmark_features(given, x, y, partial)
@@ -246,22 +248,17 @@ def _functional_embeddings(
     return np.asarray(embedded_x), np.asarray(embedded_y)
 
 
-def _checked_map(given: np.ndarray, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
-    m, n = len(mesh_x.vertices), len(mesh_y.vertices)
-    if len(given) != m:
+def _checked_map(init: ArrayLike, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
+    given = check_indices(init, len(mesh_y.vertices), f"initial map on {mesh_y.name}: vertex")
+    if len(given) != (m := len(mesh_x.vertices)):
         raise InputError(f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices.")
-    if given.min() < 0 or given.max() >= n:
-        raise InputError(
-            f"the initial map runs from {given.min()} to {given.max()}, but the vertices of {mesh_y.name} "
-            f"are 0 to {n - 1}; count from 0."
-        )
     unused = ~mesh_y.used_vertices[given] & mesh_x.used_vertices
     if unused.any():
         raise InputError(
             f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that no face uses, "
             f"for example {np.flatnonzero(unused)[0]} to {given[unused][0]}; send them to the surface."
         )
-    return given.astype(np.int64)
+    return given
 
 
 def _landmark_features(

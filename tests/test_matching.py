@@ -24,6 +24,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import match, paired_spectra
 from jaxsmw.presets import Stage, chosen_stages
@@ -239,8 +240,11 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
         ({"init": "shoot"}, "choose shot"),
         ({"init": [0, 1]}, "has 2 entries"),
         ({"init": np.zeros(2562)}, "must be integer"),
-        ({"init": np.full(2562, -1)}, "count from 0"),
-        ({"init": np.full(2562, 2562)}, "count from 0"),
+        ({"init": np.full(2562, -1)}, "between 0 and 2561"),
+        ({"init": np.full(2562, 2562)}, "count from 1"),
+        ({"init": np.ma.masked_array(np.zeros(2562, int), np.arange(2562) < 2)}, "masked in part"),
+        ({"init": SurfacePoints(np.zeros(2, int), np.zeros((2, 3)))}, "barycentric weights"),
+        ({"partial": "yes"}, "partial"),
         ({"init": np.zeros((3, 3), int)}, "shape"),
         ({"init": np.zeros((0, 2), int)}, "shape"),
         ({"init": np.array([[0, 2562]])}, "landmark 2562"),
@@ -249,7 +253,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     ids=str,
 )
 def test_bad_arguments(pair, options, fault):
-    with pytest.raises(InputError, match=fault):
+    with pytest.raises((InputError, TypeCheckError), match=fault):
         match(*pair[:2], **(OPTIONS | options))
 
 
@@ -523,3 +527,20 @@ def test_soft_map_carries_positions(pair):
     for settings in ({"temperature": 0.0}, {"temperature": np.nan}, {"iterations": 0}):
         with pytest.raises(InputError, match="is none"):
             result.soft_map(**settings)
+
+
+def test_a_start_on_triangles_is_taken_to_their_corners(pair):
+    mesh_x, mesh_y, _ = pair
+    start = mesh_y.faces[np.arange(len(mesh_x.vertices)) % len(mesh_y.faces)]
+    weights = np.full((len(start), 3), 0.01)
+    weights[:, 1] = 0.98
+    points = SurfacePoints(np.arange(len(start)) % len(mesh_y.faces), weights)
+    found = match(mesh_x, mesh_y, **OPTIONS, init=points)
+    np.testing.assert_array_equal(found.initial_map, start[:, 1])
+
+
+def test_a_spectrum_of_another_mesh_is_refused(pair):
+    mesh_x, mesh_y, _ = pair
+    spectrum, other = compute_spectrum(mesh_x, 10), compute_spectrum(bumpy_mesh(3), 10)
+    with pytest.raises(InputError, match="the spectrum given for it is of 642"):
+        initial_map(mesh_x, mesh_y, spectrum, other)

@@ -49,9 +49,7 @@ class CreaturePair:
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
         """The truth as a pointwise map: the nearest of the corners of each point's triangle."""
-        corners = self.target.faces[self.truth.faces]
-        offsets = self.target.vertices[corners] - self.truth.positions(self.target)[:, None]
-        return corners[np.arange(len(corners)), np.linalg.norm(offsets, axis=2).argmin(axis=1)]
+        return self.truth.nearest_corners(self.target)
 
 
 # ------------------------------------------------------------------------------------------- implicit bodies

@@ -66,6 +66,12 @@ class SurfacePoints:
         """Where the points lie in space."""
         return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
 
+    def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
+        """Of the vertices of each point's face the nearest one."""
+        corners = mesh.faces[self.faces]
+        distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
+        return corners[np.arange(len(corners)), distances.argmin(axis=1)]
+
 
 class _Sides(NamedTuple):
     """The sides of all triangles and of their mirror images: 6 f of them.
@@ -456,6 +462,10 @@ def check_points(
     """The same points, known to lie on the mesh; `InputError` that calls them by a name where they do not."""
     if not isinstance(points, SurfacePoints):
         return check_indices(points, len(mesh.vertices), f"{name} on {mesh.name}: vertex")
+    return check_surface_points(points, mesh, name)
+
+
+def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
     faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
     with np.errstate(invalid="ignore"):  # NaN is bad, as it compares false
         good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)
@@ -469,6 +479,8 @@ def check_points(
 
 
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
+    if np.ma.is_masked(values):
+        raise InputError(f"{name} indices are masked in part: fill these in, or drop them.")
     indices = np.asarray(values)
     if indices.ndim != 1 or indices.dtype.kind not in "iu":
         raise InputError(

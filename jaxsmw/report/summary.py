@@ -288,7 +288,7 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.flaw is not None:
-        doubt = "; limbs may be swapped" if correspondence.suspicious else ""
+        doubt = "; above 1.12 limbs may be swapped" if correspondence.suspicious else ""
         facts["flaw (1 is none)"] = f"{correspondence.flaw:.2f}{doubt}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
