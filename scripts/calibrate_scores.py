@@ -1,13 +1,13 @@
 """How far scores that need no ground truth can be trusted.
 
-    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--output FILE.md]
+    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME] [--output FILE.md]
 
 Two tables, over pairs drawn at random from each data set (see `docs/datasets.md`):
 
-- `Correspondence.expected_error` of the preset `accurate` beside the true errors: their rank correlation, and
+- `Correspondence.expected_error` of a preset's outcomes beside the true errors: their rank correlation, and
   how many gross errors (over a tenth of the square root of the area) lie in the tenth of the vertices for
   which it is largest; then what errors vertices have, by what was expected of them.
-- how often each score prefers the map that the preset ends at to one of the body's mirror image, which the
+- for `accurate`, how often each score prefers the map that it ends at to one of the body's mirror image, which the
   same stages, but for mending, make of the mirrored truth. Only for sets that have that, vertex by vertex.
   The uncertainty of the regression is that of one begun from the map.
 """
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -33,7 +34,7 @@ from jaxsmw.evaluation.datasets import DataPair, DataSet, open_data_set
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.faults import flaw, stretch
 from jaxsmw.matching import Correspondence
-from jaxsmw.presets import PRESETS
+from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.provenance import made_with
 from jaxsmw.report.tables import markdown
 
@@ -50,18 +51,20 @@ class Measured(NamedTuple):
     scores: dict[str, tuple[float, float]]
 
 
-def measure(pair: DataPair, seed: int, number_of_samples: int | None = 1000) -> Measured:
+def measure(
+    pair: DataPair, seed: int, preset: Preset = "accurate", number_of_samples: int | None = 1000
+) -> Measured:
     """Match a pair and look at its outcome with and without the truth."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
-    found = match(mesh_x, mesh_y, partial=pair.partial)
+    found = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
     error = geodesic_error(mesh_y, found.pointwise_map, truth, number_of_samples=number_of_samples, seed=seed)
     known = np.isfinite(error.errors)
     scores: dict[str, tuple[float, float]] = {}
-    try:
-        mirrored = pair.ground_truth(mesh_x, mesh_y, mirrored=True)
-    except InputError:
-        mirrored = None
+    mirrored = None
+    if preset == "accurate":
+        with suppress(InputError):
+            mirrored = pair.ground_truth(mesh_x, mesh_y, mirrored=True)
     if mirrored is not None and isinstance(mirrored.targets, np.ndarray) and not pair.partial:
         turned = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=AS_IT_STARTS)
         direct, other = (looks(result) for result in (found, turned))
@@ -136,6 +139,7 @@ def main() -> None:
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument("--pairs", metavar="N", default="20", help="of each set (default: 20)")
     parser.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")
+    parser.add_argument("--preset", choices=PRESETS, default="accurate", help="(default: accurate)")
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="gets the tables as well")
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # about meshes, of which each would tell
@@ -146,7 +150,7 @@ def main() -> None:
         chosen += [(data_set, pair) for pair in choose_pairs(data_set, options.pairs, options.seed)]
     measured: dict[str, list[Measured]] = {}
     for data_set, pair in tqdm(chosen, unit="pair"):
-        measured.setdefault(data_set.name, []).append(measure(pair, options.seed))
+        measured.setdefault(data_set.name, []).append(measure(pair, options.seed, options.preset))
     page = "\n".join((*tables(measured), made_with() + "\n"))
     print(page)
     if options.output:
