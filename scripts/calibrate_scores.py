@@ -1,15 +1,16 @@
 """How far scores that need no ground truth can be trusted.
 
-    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME] [--output FILE.md]
+    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME]
+        [--output FILE.md]
 
 Two tables, over pairs drawn at random from each data set (see `docs/datasets.md`):
 
 - `Correspondence.expected_error` of a preset's outcomes beside the true errors: their rank correlation, and
   how many gross errors (over a tenth of the square root of the area) lie in the tenth of the vertices for
   which it is largest; then what errors vertices have, by what was expected of them.
-- for `accurate`, how often each score prefers the map that it ends at to one of the body's mirror image, which the
-  same stages, but for mending, make of the mirrored truth. Only for sets that have that, vertex by vertex.
-  The uncertainty of the regression is that of one begun from the map.
+- for `accurate`, how often each score prefers the map that it ends at to one of the body's mirror image,
+  which the same stages, but for mending, make of the mirrored truth. Only for sets that have that, vertex by
+  vertex. The uncertainty of the regression is that of one begun from the map.
 """
 
 from __future__ import annotations
