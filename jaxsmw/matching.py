@@ -36,9 +36,9 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.geometry.threads import side_by_side
 from jaxsmw.presets import Preset, Stage, chosen_stages, common_range, refine_in_stages
 from jaxsmw.starts import Start, initial_map, other_starts
+from jaxsmw.threads import one_blas_thread, side_by_side
 
 logger = logging.getLogger("jaxsmw")
 
@@ -302,7 +302,7 @@ def match(
     def from_host(start: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         return jax.device_put(np.pad(start, (0, size_x - m)))
 
-    with _stage("refinement", seconds):
+    with _stage("refinement", seconds), one_blas_thread():
         wait(compiling)
         others: Iterable[Int64[np.ndarray, " m"]] = ()
         if isinstance(init, str) and init == "shot":

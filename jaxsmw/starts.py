@@ -30,8 +30,8 @@ from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surfac
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
-from jaxsmw.geometry.threads import side_by_side
 from jaxsmw.presets import Outcome, Stage, doubt, fitting, run_stage
+from jaxsmw.threads import side_by_side
 
 Start = Literal["shot", "wks", "hks", "wavelet", "functional"]
 

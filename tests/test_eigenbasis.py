@@ -15,7 +15,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.mesh_files import read_mesh
-from jaxsmw.geometry.threads import side_by_side
+from jaxsmw.threads import side_by_side
 
 
 @pytest.fixture(autouse=True)

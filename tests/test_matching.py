@@ -12,8 +12,9 @@ import pytest
 from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from jaxsmw import descriptors
+from jaxsmw import descriptors, matching, presets
 from jaxsmw.core import refinement
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import Meyer
@@ -222,6 +223,25 @@ def test_unused_vertices_on_either_side(pair):
     result = match(stray_x, stray_y, **OPTIONS).pointwise_map
     assert np.mean(np.delete(result, 5) == plain + 1) > 0.99
     assert result[5] == result[10]
+
+
+def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
+    """Threads of OpenBLAS that wait for work would slow down all that is not linear algebra."""
+
+    def threads() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    def watched(*arguments, **options):
+        meanwhile.append(threads())
+        return presets.refine_in_stages(*arguments, **options)
+
+    meanwhile: list[list[int]] = []
+    monkeypatch.setattr(matching, "refine_in_stages", watched)
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        match(*pair[:2], **OPTIONS)
+        assert threads() == before and 2 in before
+    assert meanwhile == [[1] * len(before)]
 
 
 def test_stages_are_logged(pair, caplog, monkeypatch):

@@ -17,6 +17,7 @@ from jaxtyping import Array, Int
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.threads import one_blas_thread
 
 # Sizes are rounded up to a multiple of an eighth of the power of two below them, and of the search's block:
 # at most an eighth of a padded shape is padding, and all shapes from 4000 to 16 000 vertices share 16 sizes.
@@ -138,8 +139,9 @@ def refine_pairs(
                     *(stack.rows([pairs[p][side] for p in filled]) for side, stack in enumerate(stacks)),
                     jax.device_put(np.stack(starts).astype(np.int32), NamedSharding(mesh, _DIVIDED)),
                 )
-                refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
-                refined = multihost_utils.process_allgather(refined, tiled=True)
+                with one_blas_thread():
+                    refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
+                    refined = multihost_utils.process_allgather(refined, tiled=True)
                 for row, position in enumerate(chosen):
                     one = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
                     yield position, one.unpadded(len(pointwise_maps[position]))

@@ -54,6 +54,7 @@ from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.matching import paired_spectra
 from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
 from jaxsmw.starts import Start, initial_map, other_starts
+from jaxsmw.threads import one_blas_thread
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
 """Where correspondence quality curves are kept, in square roots of the area."""
@@ -325,7 +326,8 @@ def _timed(name: str, method: Method, pair: PreparedPair) -> tuple[Int[np.ndarra
     """The map and its seconds, without compilation; NaN for a map that was computed elsewhere."""
     for _ in range(2):
         compiling_before, began = _compiling.seconds, time.perf_counter()
-        pointwise_map, result = jax.block_until_ready(method(pair))
+        with one_blas_thread():
+            pointwise_map, result = jax.block_until_ready(method(pair))
         seconds = time.perf_counter() - began
         compiling = _compiling.seconds - compiling_before
         seconds -= compiling

@@ -21,7 +21,7 @@ from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.coarsening import coarsen
 from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.threads import one_blas_thread
+from jaxsmw.threads import one_blas_thread
 
 # On a surface of area 1, where the first non-zero eigenvalue of a body lies between 1 and 30.
 _SHIFT = -1e-2

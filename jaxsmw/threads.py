@@ -1,4 +1,4 @@
-"""Both shapes at once on a computer with few cores."""
+"""Computers with few cores: both shapes at once, and no threads that wait for each other."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ Result = TypeVar("Result")
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """For as long NumPy's and SciPy's linear algebra uses one thread: more gain nothing on small arrays."""
+    """For as long NumPy's and SciPy's linear algebra uses one thread, and XLA's on CPUs, which is SciPy's.
+
+    More gain nothing on small arrays; and OpenBLAS's, done with a matrix, keep their cores busy for another
+    while, waiting for the next one.
+    """
     return _libraries().limit(limits=1, user_api="blas")
 
 
