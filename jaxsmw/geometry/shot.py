@@ -21,7 +21,7 @@ SHOT_RADIUS = 0.06
 """The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
 # Vertex–neighbour pairs handled at once, at about 300 bytes per pair: few enough for their histograms to stay
 # in the cache.
-_PAIRS_PER_BLOCK = 100_000
+_PAIRS_PER_BLOCK = 30_000
 
 
 def shot_descriptors(
