@@ -127,7 +127,12 @@ def other_starts(
         start = compiled(_both_ways)(*jax.device_put((there, back, share)), *spectra)
         yield extend_to_unused(mesh_x, np.asarray(start).astype(np.int64))
     if not partial and spectrum_x.descriptors is not None:
-        yield from _starts_from_extremities(x, y, shot[SHOT_RADIUS], spectrum_x)
+        fewer = compared(mesh_x, mesh_y, spectrum_x, spectrum_y, _ENOUGH_FOR_LIMBS)
+        descriptors_x, descriptors_y = (
+            described[side.rows(few.vertices)]
+            for described, side, few in zip(shot[SHOT_RADIUS], (x, y), fewer, strict=True)
+        )
+        yield from _starts_from_extremities(*fewer, (descriptors_x, descriptors_y), spectrum_x)
 
 
 def _starts_from_extremities(
@@ -169,6 +174,7 @@ def _starts_from_extremities(
 
 
 # Enough to find the place of limbs.
+_ENOUGH_FOR_LIMBS = 2000
 _ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8, 1000)
 _PAIRINGS, _LEAST_DOUBTFUL = 16, 2
 
