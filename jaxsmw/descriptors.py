@@ -36,11 +36,6 @@ class Compared(NamedTuple):
             spectrum = spectrum.sample(jnp.asarray(samples.vertices))
         return cls(mesh, samples, spectrum)
 
-    @property
-    def vertices(self) -> Int64[np.ndarray, " v"]:
-        """Those that are compared."""
-        return np.arange(len(self.mesh.vertices)) if self.samples is None else self.samples.vertices
-
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
         """Where what is known of vertices, or of the samples nearest to them, stands."""
         return vertices if self.samples is None else self.samples.nearest[vertices]
@@ -48,7 +43,7 @@ class Compared(NamedTuple):
 
 # Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
 # ten thousand vertices are plenty.
-_COMPARED, _HARDLY_MORE = 10_000, 1.5
+_COMPARED, _COMPARED_FROM = 10_000, 15_000
 # The smaller neighbourhoods hold ten vertices from this many on.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
 # Descriptors of wider neighbourhoods vary more slowly.
@@ -56,16 +51,15 @@ _SPREAD = 2000
 
 
 def compared(
-    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum, number: int | None = None
+    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Compared, Compared]:
-    """Both shapes, thinned where they have too many vertices, or more than a number."""
-    most = number or _COMPARED
-
-    def thinned(mesh: Mesh) -> Samples | None:
-        return spread_samples(mesh, most) if len(mesh.vertices) > _HARDLY_MORE * most else None
-
-    samples_x, samples_y = side_by_side(thinned, mesh_x, mesh_y)
+    """Both shapes, thinned where they have too many vertices."""
+    samples_x, samples_y = side_by_side(_samples, mesh_x, mesh_y)
     return Compared.make(mesh_x, samples_x, spectrum_x), Compared.make(mesh_y, samples_y, spectrum_y)
+
+
+def _samples(mesh: Mesh) -> Samples | None:
+    return spread_samples(mesh, _COMPARED) if len(mesh.vertices) > _COMPARED_FROM else None
 
 
 def describe(

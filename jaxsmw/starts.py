@@ -28,6 +28,7 @@ from jaxsmw.geometry.extremities import extremities, likely_pairings
 from jaxsmw.geometry.faults import flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
+from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.presets import Outcome, Stage, doubt, fitting, run_stage
 from jaxsmw.threads import side_by_side
@@ -126,12 +127,7 @@ def other_starts(
         start = compiled(_both_ways)(*jax.device_put((there, back, share)), *spectra)
         yield extend_to_unused(mesh_x, np.asarray(start).astype(np.int64))
     if not partial and spectrum_x.descriptors is not None:
-        fewer = compared(mesh_x, mesh_y, spectrum_x, spectrum_y, _ENOUGH_FOR_LIMBS)
-        descriptors_x, descriptors_y = (
-            described[side.rows(few.vertices)]
-            for described, side, few in zip(shot[SHOT_RADIUS], (x, y), fewer, strict=True)
-        )
-        yield from _starts_from_extremities(*fewer, (descriptors_x, descriptors_y), spectrum_x)
+        yield from _starts_from_extremities(x, y, shot[SHOT_RADIUS], spectrum_x)
 
 
 def _starts_from_extremities(
@@ -143,10 +139,13 @@ def _starts_from_extremities(
     """From `shot` of what is compared; judged by the spectrum of all of X."""
     fewest = min(int(side.mesh.used_vertices.sum()) for side in (x, y))
     stage = fitting(_ROUGHLY, fewest)
-    m, n = (len(side.vertices) for side in (x, y))
+    m = len(x.spectrum.mask)
     spectrum_x, spectrum_y = (
-        spectrum.pad(padded_size(number))
-        for spectrum, number in zip(stage.view(x.spectrum, y.spectrum), (m, n), strict=True)
+        spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in stage.view(x.spectrum, y.spectrum)
+    )
+    samples_x, samples_y = (
+        jax.device_put(side.rows(farthest_point_samples(side.mesh, stage.number_of_samples or fewest)))
+        for side in (x, y)
     )
     outcomes = []
     ends = side_by_side(lambda side: extremities(side.mesh), x, y)
@@ -160,8 +159,10 @@ def _starts_from_extremities(
             for described, to_ends, chosen in zip(shot, reach, pairing.T, strict=True)
         )
         nearest = _nearest_compared(features_x, features_y, y)
-        start = jax.device_put(np.pad(nearest, (0, padded_size(m) - m)))
-        refinement = run_stage(stage, spectrum_x, start, spectrum_y=spectrum_y, samples=None)
+        start = jax.device_put(np.pad(nearest, (0, len(spectrum_x.mask) - m)))
+        refinement = run_stage(
+            stage, spectrum_x, start, spectrum_y=spectrum_y, samples=(samples_x, samples_y)
+        )
         if refinement.result == RESULTS.successful:
             found = _everywhere(np.asarray(refinement.pointwise_map)[:m].astype(np.int64), x, y)
             flawed = flaw(x.mesh, y.mesh, found, everything)
@@ -172,8 +173,7 @@ def _starts_from_extremities(
 
 
 # Enough to find the place of limbs.
-_ENOUGH_FOR_LIMBS = 2000
-_ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8)
+_ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8, 1000)
 _PAIRINGS, _LEAST_DOUBTFUL = 16, 2
 
 

@@ -74,6 +74,7 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(mesh_x, mesh_y, 30)
     monkeypatch.setattr(descriptors, "_COMPARED", 1200)
+    monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     start = initial_map(mesh_x, mesh_y, *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1500
@@ -310,6 +311,7 @@ def test_other_starts_differ_and_are_better_here(pair, thinned, monkeypatch):
     spectra = paired_spectra(mesh_x, mesh_y, 30)
     if thinned:
         monkeypatch.setattr(descriptors, "_COMPARED", 1200)
+        monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(other_starts(mesh_x, mesh_y, *spectra))
     assert len(starts) == 3
     # With descriptors there are more, by the ends of limbs; of this body there is but one way to pair them.
