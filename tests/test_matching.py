@@ -15,6 +15,7 @@ from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw import descriptors, matching, presets
+from jaxsmw import threads as threads_module
 from jaxsmw.core import refinement
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.filters import Meyer
@@ -237,6 +238,7 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
     meanwhile: list[list[int]] = []
     monkeypatch.setattr(matching, "refine_in_stages", watched)
+    threads_module._libraries.cache_clear()  # other tests load libraries with a BLAS of their own
     with threadpool_limits(2, user_api="blas"):
         before = threads()
         match(*pair[:2], **OPTIONS)
