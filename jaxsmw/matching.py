@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.core.batch import padded_size
+from jaxsmw.core.batch import pad_rows, padded_size
 from jaxsmw.core.compilation import compile_ahead, compiled, release_programs
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.refinement import Refinement, Refiner, refine
@@ -300,7 +300,7 @@ def match(
     padded = pad(spectrum_x, size_x), pad(spectrum_y, size_y)
 
     def from_host(start: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
-        return jax.device_put(np.pad(start, (0, size_x - m)))
+        return jax.device_put(pad_rows(start, size_x))
 
     with _stage("refinement", seconds), one_blas_thread():
         wait(compiling)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.core.batch import padded_size
+from jaxsmw.core.batch import pad_rows, padded_size
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.functional_map import encode, multiscale_kernel
@@ -159,7 +159,7 @@ def _starts_from_extremities(
             for described, to_ends, chosen in zip(shot, reach, pairing.T, strict=True)
         )
         nearest = _nearest_compared(features_x, features_y, y)
-        start = jax.device_put(np.pad(nearest, (0, len(spectrum_x.mask) - m)))
+        start = jax.device_put(pad_rows(nearest, len(spectrum_x.mask)))
         refinement = run_stage(
             stage, spectrum_x, start, spectrum_y=spectrum_y, samples=(samples_x, samples_y)
         )
@@ -214,8 +214,7 @@ def _nearest_compared(
     dtype = y.spectrum.eigenvectors.dtype
 
     def padded(rows: np.ndarray) -> Array:
-        missing = padded_size(len(rows)) - len(rows)
-        return jax.device_put(np.pad(rows, ((0, missing), *((0, 0),) * (rows.ndim - 1))))
+        return jax.device_put(pad_rows(rows, padded_size(len(rows))))
 
     nearest = compiled(nearest_neighbor)(
         *(padded(features.astype(dtype)) for features in (features_x, features_y)),

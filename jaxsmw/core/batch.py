@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Shaped
 
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
@@ -34,6 +34,11 @@ def padded_size(number_of_vertices: int) -> int:
     power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
     step = max(power // _SUBDIVISION, _SMALLEST_STEP)
     return -(-number_of_vertices // step) * step
+
+
+def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
+    """The same with zeros up to a number of rows: on the host, what belongs to a spectrum that is padded."""
+    return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
@@ -134,7 +139,7 @@ def refine_pairs(
                 chosen = positions[begin : begin + per_call]
                 # The last batch is filled up, so that it needs no program of its own.
                 filled = chosen + chosen[-1:] * (per_call - len(chosen))
-                starts = [np.pad(pointwise_maps[p], (0, m - len(pointwise_maps[p]))) for p in filled]
+                starts = [pad_rows(np.asarray(pointwise_maps[p]), m) for p in filled]
                 batch = (
                     *(stack.rows([pairs[p][side] for p in filled]) for side, stack in enumerate(stacks)),
                     jax.device_put(np.stack(starts).astype(np.int32), NamedSharding(mesh, _DIVIDED)),
