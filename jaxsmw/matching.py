@@ -36,7 +36,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.presets import Preset, Stage, chosen_stages, common_range, refine_in_stages
+from jaxsmw.presets import DOUBTFUL, SUSPICIOUS, Preset, Stage, chosen_stages, common_range, refine_in_stages
 from jaxsmw.starts import Start, initial_map, other_starts
 from jaxsmw.threads import one_blas_thread, side_by_side
 
@@ -323,9 +323,10 @@ def match(
     if outcome.suspicious:
         warnings.warn(
             f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round (flaw "
-            f"{outcome.flaw:.3f}; right maps have up to 1.12, or 1.15 if nothing looks reversed or torn off; "
-            "more between bodies of different kinds, or where one touches itself): look at it (--report, in "
-            "Python jaxsmw.report.summary.write_report), and if it is so start from a few landmarks",
+            f"{outcome.flaw:.3f}; right maps have up to {SUSPICIOUS}, or {DOUBTFUL} if nothing looks "
+            "reversed or torn off; more between bodies of different kinds, or where one touches itself): "
+            "look at it (--report, in Python jaxsmw.report.summary.write_report), and if it is so start from "
+            "a few landmarks",
             stacklevel=2,
         )
     spectrum_x, spectrum_y = stages[-1].view(spectrum_x, spectrum_y, partial=partial)

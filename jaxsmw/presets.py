@@ -249,7 +249,7 @@ def refine_in_stages(
     if not (best.successful and best.suspicious):
         return best
     # Of several that look right one may be better: once in doubt, all are tried.
-    logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, _DOUBTFUL)
+    logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, DOUBTFUL)
     tried = [best]
     for number, start in enumerate(other_starts, 2):
         logger.info("start %d", number)
@@ -383,10 +383,10 @@ def _mended(
         if not outcome.successful:
             return outcome._replace(flaw=np.inf, suspicious=True)
         flawed = flaw(*meshes, matches(outcome), finest, partial=partial)
-        return outcome._replace(flaw=flawed, suspicious=flawed >= _SUSPICIOUS)
+        return outcome._replace(flaw=flawed, suspicious=flawed >= SUSPICIOUS)
 
     def looks_right(outcome: Outcome) -> bool:
-        doubtful = outcome.flaw is None or outcome.flaw >= _DOUBTFUL
+        doubtful = outcome.flaw is None or outcome.flaw >= DOUBTFUL
         return not outcome.suspicious or not (doubtful or faults(outcome))
 
     best = last = judged(steps[0], before.pointwise_map)
@@ -419,7 +419,7 @@ _TOO_MUCH = 0.5
 # What is more flawed than the first is mended: right maps between poses of one body are less. What is more
 # flawed than the second even then, or something of it looks faulty, is begun elsewhere: between bodies of
 # different kinds some right maps are, too.
-_SUSPICIOUS, _DOUBTFUL = 1.12, 1.15
+SUSPICIOUS, DOUBTFUL = 1.12, 1.15
 # In `doubt`: right maps differ by less, mostly, and those upside down by more.
 _HARDLY = 0.25
 # Maps agree that differ by more than so many square roots of the area on less than such a share of it. Two

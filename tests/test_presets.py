@@ -75,8 +75,8 @@ def test_where_nothing_looks_right_what_three_starts_agree_on_is_taken(body, mon
     starts = [start, identity, start]
     wrong, found = outcome(body, [MENDING], start, other_starts=starts)
     assert wrong < 0.02 and not found.suspicious  # it looks right, whatever the others are
-    monkeypatch.setattr(presets, "_SUSPICIOUS", 0.5)
-    monkeypatch.setattr(presets, "_DOUBTFUL", 0.5)
+    monkeypatch.setattr(presets, "SUSPICIOUS", 0.5)
+    monkeypatch.setattr(presets, "DOUBTFUL", 0.5)
     wrong, found = outcome(body, [MENDING], start, other_starts=starts)
     assert wrong > 0.5 and found.suspicious
     wrong, found = outcome(body, [MENDING], start, other_starts=starts[:2])

@@ -26,6 +26,7 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.files import atomic_write, make_directory
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence, paired_spectra
+from jaxsmw.presets import SUSPICIOUS
 from jaxsmw.provenance import machine, versions
 from jaxsmw.report.figures import (
     draw_correspondence,
@@ -288,7 +289,7 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.flaw is not None:
-        doubt = "; above 1.12 limbs may be swapped" if correspondence.suspicious else ""
+        doubt = f"; above {SUSPICIOUS} limbs may be swapped" if correspondence.suspicious else ""
         facts["flaw (1 is none)"] = f"{correspondence.flaw:.2f}{doubt}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
