@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int64
 
+from jaxsmw.core.batch import pad_rows
 from jaxsmw.core.coarse_to_fine import CoarseToFine
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.feature_regression import FeatureRegression, Regression
@@ -20,7 +21,7 @@ from jaxsmw.core.registration import Registration
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.faults import flaw, reversed_orientation, torn_off
+from jaxsmw.geometry.faults import alike, flaw, reversed_orientation, torn_off
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 
@@ -224,11 +225,12 @@ def refine_in_stages(
     """Refine by one stage after the other, as long as they go well.
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
-    left and right, and for where it joins the body. From a stage that is to mend this on, the outcome is
-    looked at for both (`jaxsmw.geometry.faults`), by turns, and these stages are gone through again from a
-    functional map that the faulty part had no say in, and at last with `mending` in place of the first of
-    them. That is the outcome if it looks right, otherwise the least doubtful map so far; and all stages are
-    gone through from other starts, too. Maps that look right at once are let be.
+    left and right, and for where it joins the body. If a stage mends, the outcome is looked at for both
+    (`jaxsmw.geometry.faults`), and let be if it looks right. Otherwise that stage is gone through in rounds,
+    each begun from a functional map in which the last one's faults had no say, one kind by turns, as long as
+    that makes the map less doubtful; and then with `mending` in its place. Stages after it finish both. What
+    mending led to is the outcome if it looks right, otherwise the less doubtful one; and if that does not
+    look right, the same is done from other starts.
 
     **Arguments:**
 
@@ -236,45 +238,49 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for a stage that mends; with fewer vertices than spectra that are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken if a stage that is to mend could not. The least doubtful outcome is returned, by
-      its flaw and, of `FeatureRegression`, how badly features predict each other; but if not even that looks
-      right and three starts or more lead to the same map, the least doubtful of these.
+    - `other_starts`: taken if a stage that is to mend could not. Those that are the least doubtful after the
+      rounds are finished, of which no two are alike; the least doubtful outcome is returned, by its flaw
+      and, of `FeatureRegression`, how badly features predict each other. But if not even that looks right
+      and three starts or more lead to the same map, the least doubtful of these is finished and returned.
     - `history`: see `jaxsmw.refine`.
     """
+    run = partial_function(_run, samples=samples, history=history)
     steps = list(zip(spectra, stages, strict=True))
-    through = partial_function(
-        _through, steps, samples=samples, meshes=meshes, partial=partial, history=history
-    )
-    best = through(pointwise_map)
+    position = next((place for place, stage in enumerate(stages) if stage.mending is not None), None)
+    if position is None or meshes is None:
+        return run(steps, Outcome([], pointwise_map))
+    # Flaws show best in as many eigenvectors as there are.
+    finest = max((of_x for of_x, _ in spectra), key=lambda of_x: of_x.eigenvalues.shape[0])
+    judge = _Judge(meshes, finest, partial)
+    mending = _Mending(run, judge, steps, position)
+
+    best = mending.finished(mending.begun(pointwise_map))
+    if best.successful and best.suspicious:
+        best = mending.mended(best)
     if not (best.successful and best.suspicious):
         return best
     # Of several that look right one may be better: once in doubt, all are tried.
     logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, DOUBTFUL)
-    tried = [best]
+    rough: list[Outcome] = []
     for number, start in enumerate(other_starts, 2):
         logger.info("start %d", number)
-        outcome = through(start)
-        if outcome.successful:
-            tried.append(outcome)
-    best = min(tried, key=doubt)
-    if best.suspicious and meshes is not None:
+        rough.append(mending.without_faults(mending.begun(start), _ROUGH_ROUNDS))
+    rough = sorted((outcome for outcome in rough if outcome.successful), key=doubt)
+    finished, tried = [best], [best, *rough]
+    for outcome in judge.distinct(rough)[:_FINALISTS]:
+        finished.append(mending.mended(mending.finished(outcome)))
+    best = min(finished, key=doubt)
+    if best.suspicious:
         # Where a body touches itself, and its surface is one there, right maps look torn, too. Wrong ones are
         # each wrong in their own way, mostly.
-        alike = [[other for other in tried if _agree(*meshes, outcome, other)] for outcome in tried]
-        most = max(alike, key=len)
-        best = min(most, key=doubt) if len(most) >= _AGREEING else best
-    if len(tried) > 1:
+        most = max(([o for o in tried if judge.alike(outcome, o)] for outcome in tried), key=len)
+        if len(most) >= _AGREEING:
+            known = [outcome for outcome in finished if judge.alike(outcome, most[0])]
+            best = min(known, key=doubt) if known else mending.mended(mending.finished(most[0]))
+    if rough:
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d starts has flaw %.2f%s", len(tried), best.flaw, left)
     return best
-
-
-def _agree(mesh_x: Mesh, mesh_y: Mesh, one: Outcome, other: Outcome) -> bool:
-    """Whether two outcomes are the same map but for details."""
-    m = len(mesh_x.vertices)
-    one_at, other_at = (mesh_y.vertices[np.asarray(found.pointwise_map)[:m]] for found in (one, other))
-    apart = np.linalg.norm(one_at - other_at, axis=1) > _APART * mesh_y.area**0.5
-    return bool(mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area)
 
 
 def doubt(outcome: Outcome) -> float:
@@ -293,41 +299,16 @@ def doubt(outcome: Outcome) -> float:
 _Step = tuple[tuple[Spectrum, Spectrum], Stage]
 
 
-def _through(
-    steps: Sequence[_Step],
-    pointwise_map: Int[Array, " m"],
-    *,
-    samples: Samples | None,
-    meshes: tuple[Mesh, Mesh] | None,
-    partial: bool,
-    history: bool,
-) -> Outcome:
-    """The outcome of stages from one start. Without a stage that mends nobody asks for a flaw."""
-
-    def run(steps: Sequence[_Step], before: Outcome) -> Outcome:
-        for (spectrum_x, spectrum_y), stage in steps:
-            found = run_stage(
-                stage,
-                spectrum_x,
-                before.pointwise_map,
-                spectrum_y=spectrum_y,
-                samples=samples,
-                history=history,
-            )
-            before = before._replace(refinements=[*before.refinements, found])
-            if not before.successful:
-                break
-        return before
-
-    mending = [position for position, (_, stage) in enumerate(steps) if stage.mending is not None]
-    if not mending or meshes is None:
-        return run(steps, Outcome([], pointwise_map))
-    before = run(steps[: mending[0]], Outcome([], pointwise_map))
-    if not before.successful:
-        return before
-    # Flaws show best in as many eigenvectors as there are.
-    finest = max((of_x for (of_x, _), _ in steps), key=lambda of_x: of_x.eigenvalues.shape[0])
-    return _mended(steps[mending[0] :], before, run, meshes, finest, partial)
+def _run(steps: Iterable[_Step], before: Outcome, *, samples: Samples | None, history: bool) -> Outcome:
+    """The outcome of further stages."""
+    for (spectrum_x, spectrum_y), stage in steps:
+        if not before.successful:
+            break
+        found = run_stage(
+            stage, spectrum_x, before.pointwise_map, spectrum_y=spectrum_y, samples=samples, history=history
+        )
+        before = before._replace(refinements=[*before.refinements, found])
+    return before
 
 
 def run_stage(
@@ -349,69 +330,107 @@ def run_stage(
     )
 
 
-def _mended(
-    steps: Sequence[_Step],
-    before: Outcome,
-    run: Callable[[Sequence[_Step], Outcome], Outcome],
-    meshes: tuple[Mesh, Mesh],
-    finest: Spectrum,
-    partial: bool,
-) -> Outcome:
-    """The outcome of stages after others, or of rounds of them, each begun without the last one's faults.
+@dataclass(frozen=True)
+class _Judge:
+    """What can be said of outcomes without the truth; X's spectrum is the one with most eigenvectors."""
 
-    At last the least doubtful one is mended with all, and that taken if it looks right, otherwise the least
-    doubtful. What looks right at once is let be.
-    """
-    ((spectrum_x, spectrum_y), stage), *others = steps
-    m = len(meshes[0].vertices)
-    areas = np.asarray(spectrum_x.vertex_areas)
-    eigenvectors = np.asarray(finest.eigenvectors)[:m, :_EIGENVECTORS]
+    meshes: tuple[Mesh, Mesh]
+    spectrum_x: Spectrum
+    partial: bool
 
-    def matches(outcome: Outcome) -> Int64[np.ndarray, " m"]:
-        return np.asarray(outcome.pointwise_map)[:m].astype(np.int64)
-
-    def faults(outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
-        found = matches(outcome)
-        reversed_ = reversed_orientation(*meshes, found, eigenvectors, partial=partial)
-        both = reversed_, torn_off(*meshes, found, partial=partial)
-        return [fault for fault in both if _NEGLIGIBLE < areas[:m][fault].sum() / areas.sum() < _TOO_MUCH]
-
-    def judged(first: _Step, pointwise_map: Int[Array, " m"]) -> Outcome:
-        """What becomes of a map in these stages."""
-        found = run([first, *others], Outcome([], pointwise_map))
-        outcome = before._replace(refinements=[*before.refinements, *found.refinements])
+    def __call__(self, outcome: Outcome) -> Outcome:
+        """The outcome with its flaw."""
         if not outcome.successful:
             return outcome._replace(flaw=np.inf, suspicious=True)
-        flawed = flaw(*meshes, matches(outcome), finest, partial=partial)
+        flawed = flaw(*self.meshes, self._matches(outcome), self.spectrum_x, partial=self.partial)
         return outcome._replace(flaw=flawed, suspicious=flawed >= SUSPICIOUS)
 
-    def looks_right(outcome: Outcome) -> bool:
-        doubtful = outcome.flaw is None or outcome.flaw >= DOUBTFUL
-        return not outcome.suspicious or not (doubtful or faults(outcome))
+    def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
+        """What is reversed and what is torn off, if it is worth mending."""
+        mesh_x, found = self.meshes[0], self._matches(outcome)
+        eigenvectors = np.asarray(self.spectrum_x.eigenvectors)[: len(found), :_EIGENVECTORS]
+        both = (
+            reversed_orientation(*self.meshes, found, eigenvectors, partial=self.partial),
+            torn_off(*self.meshes, found, partial=self.partial),
+        )
+        areas = mesh_x.vertex_areas / mesh_x.area
+        return [fault for fault in both if _NEGLIGIBLE < areas[fault].sum() < _TOO_MUCH]
 
-    best = last = judged(steps[0], before.pointwise_map)
-    if not (best.successful and best.suspicious):
+    def looks_right(self, outcome: Outcome) -> bool:
+        """Whether there is nothing to mend."""
+        doubtful = outcome.flaw is None or outcome.flaw >= DOUBTFUL
+        return not outcome.suspicious or not (doubtful or self.faults(outcome))
+
+    def alike(self, one: Outcome, other: Outcome) -> bool:
+        """Whether two outcomes are the same map but for details."""
+        return alike(*self.meshes, self._matches(one), self._matches(other))
+
+    def distinct(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
+        """Those that are not like one before."""
+        found: list[Outcome] = []
+        for outcome in outcomes:
+            if not any(self.alike(outcome, other) for other in found):
+                found.append(outcome)
+        return found
+
+    def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
+        return np.asarray(outcome.pointwise_map)[: len(self.meshes[0].vertices)].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class _Mending:
+    """What is done about maps that look wrong, by the stage at a position among all, which mends."""
+
+    run: Callable[[Iterable[_Step], Outcome], Outcome]
+    judge: _Judge
+    steps: list[_Step]
+    position: int
+
+    def begun(self, start: Int[Array, " m"]) -> Outcome:
+        """Up to the stage that mends: a rough outcome."""
+        return self.judge(self.run(self.steps[: self.position + 1], Outcome([], start)))
+
+    def finished(self, rough: Outcome) -> Outcome:
+        """After all stages."""
+        return self.judge(self.run(self.steps[self.position + 1 :], rough))
+
+    def without_faults(self, outcome: Outcome, rounds: int, *, finished: bool = False) -> Outcome:
+        """The least doubtful outcome of some rounds, each begun without the last one's faults."""
+        (spectrum_x, _), stage = self.steps[self.position]
+        areas = np.asarray(spectrum_x.vertex_areas)
+        best = last = outcome
+        for done in range(rounds):
+            if not (last.successful and best.suspicious and (faults := self.judge.faults(last))):
+                break
+            # By turns, what is reversed and what is torn off.
+            fault = faults[done % len(faults)]
+            sound = np.where(pad_rows(fault, len(areas)), 0, areas)
+            last = self._again(last, replace(spectrum_x, vertex_areas=jax.device_put(sound)), stage)
+            last = self.finished(last) if finished else last
+            best = min(best, last, key=doubt)
         return best
-    for done in range(_ROUNDS):
-        if not (last.successful and best.suspicious):
-            break
-        if not (some := faults(last)):
-            break
-        # By turns, what is reversed and what is torn off.
-        sound = np.where(np.pad(some[done % len(some)], (0, len(areas) - m)), 0, areas)
-        begun_without = replace(spectrum_x, vertex_areas=jax.device_put(sound))
-        last = judged(((begun_without, spectrum_y), stage), last.pointwise_map)
-        best = min(best, last, key=doubt)
-    if stage.mending is not None:
-        last = judged(((spectrum_x, spectrum_y), stage.mending), best.pointwise_map)
+
+    def mended(self, outcome: Outcome) -> Outcome:
+        """What becomes of a finished outcome without faults, and with the stage that mends at last."""
+        outcome = self.without_faults(outcome, _ROUNDS, finished=True)
+        (spectrum_x, _), stage = self.steps[self.position]
+        assert stage.mending is not None
+        last = self.finished(self._again(outcome, spectrum_x, stage.mending))
         # It knows least of what misled the others, and is preferred if it looks right and is hardly more
         # doubtful: those upside down are far more.
-        preferred = looks_right(last) and doubt(last) < doubt(best) + _HARDLY
-        best = last if preferred else min(best, last, key=doubt)
-    return best._replace(suspicious=not looks_right(best))
+        preferred = self.judge.looks_right(last) and doubt(last) < doubt(outcome) + _HARDLY
+        best = last if preferred else min(outcome, last, key=doubt)
+        return best._replace(suspicious=not self.judge.looks_right(best))
+
+    def _again(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
+        """The rough outcome if this were the stage that mends, begun from a map that there is already."""
+        (_, spectrum_y), _ = self.steps[self.position]
+        found = self.run([((spectrum_x, spectrum_y), stage)], Outcome([], outcome.pointwise_map))
+        before = outcome.refinements[: self.position]
+        return self.judge(outcome._replace(refinements=[*before, *found.refinements]))
 
 
-_ROUNDS, _EIGENVECTORS = 4, 50
+_ROUNDS, _ROUGH_ROUNDS, _EIGENVECTORS = 4, 2, 50
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.
@@ -422,9 +441,8 @@ _TOO_MUCH = 0.5
 SUSPICIOUS, DOUBTFUL = 1.12, 1.15
 # In `doubt`: right maps differ by less, mostly, and those upside down by more.
 _HARDLY = 0.25
-# Maps agree that differ by more than so many square roots of the area on less than such a share of it. Two
-# that are wrong sometimes do.
-_APART, _NEARLY_NOTHING, _AGREEING = 0.1, 0.03, 3
+# Other starts of which so many are finished. Two that are wrong are sometimes alike, three seldom.
+_FINALISTS, _AGREEING = 2, 3
 # Beside the flaw's logarithm, when outcomes are compared: a map upside down is the more uncertain, one of
 # the mirror image the larger flaw. From 6 to 12, nearly the same outcomes are chosen.
 _UNCERTAINTY = 10.0

@@ -25,10 +25,10 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import Compared, compared, paired_shot
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.extremities import extremities, likely_pairings
-from jaxsmw.geometry.faults import flaw
+from jaxsmw.geometry.faults import alike, flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
-from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.presets import Outcome, Stage, doubt, fitting, run_stage
 from jaxsmw.threads import side_by_side
@@ -110,7 +110,7 @@ def other_starts(
 
     Of two whole bodies with descriptors (`describe`) two more, by the ends of their limbs, paired in all ways
     that distances between them allow: from each, nearest neighbours in SHOT and in distances to the ends,
-    refined with few eigenvectors; the two least doubtful outcomes.
+    refined with few eigenvectors; the two least doubtful outcomes that are not alike.
     """
     x, y = compared(mesh_x, mesh_y, spectrum_x, spectrum_y)
     spectra = [spectrum.truncate(_PAPER_EIGENVECTORS) for spectrum in (spectrum_x, spectrum_y)]
@@ -140,6 +140,10 @@ def _starts_from_extremities(
     fewest = min(int(side.mesh.used_vertices.sum()) for side in (x, y))
     stage = fitting(_ROUGHLY, fewest)
     m = len(x.spectrum.mask)
+    # Refinement begins with a few eigenvectors, for which as many matches are enough.
+    asking = spread_samples(x.mesh, stage.number_of_samples or fewest)
+    rows = x.rows(asking.vertices)
+    answered = asking.nearest if x.samples is None else asking.nearest[x.samples.vertices]
     spectrum_x, spectrum_y = (
         spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in stage.view(x.spectrum, y.spectrum)
     )
@@ -158,7 +162,7 @@ def _starts_from_extremities(
             np.hstack([described, to_ends[:, chosen]])
             for described, to_ends, chosen in zip(shot, reach, pairing.T, strict=True)
         )
-        nearest = _nearest_compared(features_x, features_y, y)
+        nearest = _nearest_compared(features_x[rows], features_y, y)[answered]
         start = jax.device_put(pad_rows(nearest, len(spectrum_x.mask)))
         refinement = run_stage(
             stage, spectrum_x, start, spectrum_y=spectrum_y, samples=(samples_x, samples_y)
@@ -168,12 +172,15 @@ def _starts_from_extremities(
             flawed = flaw(x.mesh, y.mesh, found, everything)
             outcomes.append((doubt(Outcome([refinement], start, flawed)), found))
     outcomes.sort(key=lambda outcome: outcome[0])
-    for _, found in outcomes[:_LEAST_DOUBTFUL]:
-        yield extend_to_unused(x.mesh, found)
+    given: list[Int64[np.ndarray, " m"]] = []
+    for _, found in outcomes:
+        if len(given) < _LEAST_DOUBTFUL and not any(alike(x.mesh, y.mesh, found, other) for other in given):
+            given.append(found)
+            yield extend_to_unused(x.mesh, found)
 
 
 # Enough to find the place of limbs.
-_ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 60, 8, 1000)
+_ROUGHLY = Stage(FeatureRegression((8, 8, 11, 11, 15, 15, 20, 20)), 20, 30, 8, 500)
 _PAIRINGS, _LEAST_DOUBTFUL = 16, 2
 
 

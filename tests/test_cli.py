@@ -397,7 +397,8 @@ def test_seams_are_named_and_welded(run, tmp_path):
 
 
 def test_demo(run, tmp_path):
-    outcome = run("demo", "--output", tmp_path / "demo", "--vertices", "1000", "--eigenvectors", "40")
+    small = ["--vertices", "1000", "--preset", "paper", "--eigenvectors", "40"]
+    outcome = run("demo", "--output", tmp_path / "demo", *small)
     assert outcome.code == 0, outcome.errors
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     assert {

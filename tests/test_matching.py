@@ -248,7 +248,9 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
 
 def test_stages_are_logged(pair, caplog, monkeypatch):
-    monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", True)  # which the command line ends
+    # Whatever a command has set up in this process before.
+    monkeypatch.setattr(logging.getLogger("jaxsmw"), "handlers", [caplog.handler])
+    monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
     assert caplog.messages == ["eigenbases", "initial map", "samples", "refinement"]

@@ -246,25 +246,25 @@ def test_vmap_over_pairs_equals_a_loop():
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to tell the peak memory")
 def test_memory_stays_far_below_all_distances():
-    """50 000 x 50 000 distances would take 10 GB; the process as a whole has to do with a tenth of it."""
+    """30 000 x 30 000 distances would take 3.6 GB; the process as a whole has to do with a fifth of it."""
     program = """
 import re
 import jax.numpy as jnp
 import numpy as np
 from jaxsmw import Spectrum, refine
 generator = np.random.default_rng(0)
-n, k = 50_000, 20
+n, k = 30_000, 20
 def spectrum():
     vectors = jnp.asarray(generator.normal(size=(n, k)), jnp.float32)
     return Spectrum(jnp.arange(k, dtype=jnp.float32), vectors, jnp.full(n, 1 / n, jnp.float32), jnp.ones(n, bool))
-t = refine(spectrum(), spectrum(), jnp.zeros(n, jnp.int32), iterations=2).pointwise_map
+t = refine(spectrum(), spectrum(), jnp.zeros(n, jnp.int32), iterations=1).pointwise_map
 assert len(np.unique(t)) > 1
 # Not getrusage: its peak counts what the parent process had before this one began.
 print(re.search(r"VmHWM:\\s*(\\d+) kB", open("/proc/self/status").read())[1])
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    assert int(result.stdout) * 1024 < 1e9
+    assert int(result.stdout) * 1024 < 0.7e9
 
 
 def test_compiles_once_per_size_and_setting():

@@ -16,6 +16,8 @@ _TORN, _STRETCHED = 0.1, 3.0
 _REVERSED = -0.2
 # Of which the flaw counts what shows in so many eigenvectors, by this weight.
 _EIGENVECTORS, _WEIGHT_OF_REVERSED = 50, 4
+# Maps are alike that differ by more than so many square roots of the area on less than such a share of it.
+_APART, _NEARLY_NOTHING = 0.1, 0.03
 # What `expected_error` makes of how far off one comes back, and of how much distances between neighbours
 # change: so, errors on real pairs are 0.8 to 1.4 times what is expected.
 _DETOUR, _DISTORTION = 0.5, 2.0
@@ -127,6 +129,12 @@ def reversed_orientation(
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
     density = eigenvectors_x @ (eigenvectors_x.T @ at_vertices)
     return density < _REVERSED
+
+
+def alike(mesh_x: Mesh, mesh_y: Mesh, one: Int64[np.ndarray, " m"], other: Int64[np.ndarray, " m"]) -> bool:
+    """Whether two maps are the same but for details."""
+    apart = np.linalg.norm(mesh_y.vertices[one] - mesh_y.vertices[other], axis=1) > _APART * mesh_y.area**0.5
+    return bool(mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area)
 
 
 def expected_error(
