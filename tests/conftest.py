@@ -14,6 +14,8 @@ from threadpoolctl import threadpool_limits
 if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
+# Nor is it worth a tenth of the time to note for every operation in which line of which function it was called.
+jax.config.update("jax_include_full_tracebacks_in_locations", False)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

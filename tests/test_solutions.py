@@ -212,7 +212,8 @@ def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, de
         return jnp.sum(jnp.sin(3 * c))
 
     shift = jnp.linspace(0.1, 0.3, K_X)
-    check_grads(corner, (jnp.asarray(0.4), shift), order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
+    arguments = jnp.asarray(0.4), shift
+    check_grads(jax.jit(corner), arguments, order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
 
 
 def test_derivative_of_the_closed_form(pair, pointwise_map):
