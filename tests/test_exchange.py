@@ -346,6 +346,8 @@ def test_maps_as_arrays(tmp_path, bodies):
     np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y), pointwise_map)
     np.save(path, pointwise_map + 1)
     np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y, index_base=1), pointwise_map)
+    np.save(path, pointwise_map[None])
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, x, y), pointwise_map)
     np.save(path, np.stack([pointwise_map[:5]] * 2, axis=1))
     np.testing.assert_array_equal(read_landmarks(path, y, y), np.load(path))
 
@@ -355,6 +357,7 @@ def test_maps_as_arrays(tmp_path, bodies):
     [
         (np.zeros((3, 2), int), "holds int64 of shape .3, 2.: give the file with a list of numbers"),
         (np.zeros(0, int), "holds int64 of shape .0,.: give"),
+        (np.zeros((1, 0), int), "holds int64 of shape .1, 0.: give"),
         (np.array(["a", "b"]), "holds <U1 of shape"),
         (np.array([None, 1]), "is no array that NumPy saved"),
         (np.zeros(3, complex), "holds complex128 of shape"),

@@ -289,13 +289,14 @@ class _Table:
             ) from error
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
-        """An array of NumPy's; of one column a list will do, too."""
+        """An array of NumPy's; of one column a list or a row will do, too."""
         data = io.BytesIO(self._bytes())
         try:
             array = np.lib.format.read_array(data, allow_pickle=False)
         except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
             raise InputError(f"{self.path}: is no array that NumPy saved: give one, or text.") from error
-        table = array[:, None] if array.ndim == 1 else array
+        is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
+        table = array.reshape(-1, 1) if is_list else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size
         if not fits or table.dtype.kind not in "iuf":
             wanted = "a list of numbers" if columns == 1 else f"numbers in {columns or 'some'} columns"
