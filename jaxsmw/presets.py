@@ -226,11 +226,11 @@ def refine_in_stages(
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. If a stage mends, the outcome is looked at for both
-    (`jaxsmw.geometry.faults`), and let be if it looks right. Otherwise that stage is gone through in rounds,
-    each begun from a functional map in which the last one's faults had no say, one kind by turns, as long as
-    that makes the map less doubtful; and then with `mending` in its place. Stages after it finish both. What
-    mending led to is the outcome if it looks right, otherwise the less doubtful one; and if that does not
-    look right, the same is done from other starts.
+    (`jaxsmw.geometry.faults`), and let be if it looks right. Otherwise that stage and those after it are gone
+    through in rounds, each begun from a functional map in which the last one's faults had no say, one kind by
+    turns; and at last, from the least doubtful outcome, with `mending` in its place. What that leads to is
+    kept if it looks right, the less doubtful of both otherwise; and if that does not look right, other starts
+    are tried.
 
     **Arguments:**
 
@@ -238,10 +238,11 @@ def refine_in_stages(
     - `samples`: vertices of X and of Y in farthest-point order, as many as any stage takes of them.
     - `meshes`: X and Y, for a stage that mends; with fewer vertices than spectra that are padded.
     - `partial`: one shape is a part of the other, in the same unit of length.
-    - `other_starts`: taken if a stage that is to mend could not. Those that are the least doubtful after the
-      rounds are finished, of which no two are alike; the least doubtful outcome is returned, by its flaw
-      and, of `FeatureRegression`, how badly features predict each other. But if not even that looks right
-      and three starts or more lead to the same map, the least doubtful of these is finished and returned.
+    - `other_starts`: taken if a stage that is to mend could not. All are taken up to that stage, and through
+      two rounds of it; the least doubtful, of which no two are alike, through what is left, and are mended.
+      The least doubtful outcome is returned, by its flaw and, of `FeatureRegression`, how badly features
+      predict each other. But if not even that looks right and three starts or more lead to the same map, the
+      outcome of these is returned.
     - `history`: see `jaxsmw.refine`.
     """
     run = partial_function(_run, samples=samples, history=history)
