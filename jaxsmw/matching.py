@@ -36,7 +36,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.presets import DOUBTFUL, SUSPICIOUS, Preset, Stage, chosen_stages, common_range, refine_in_stages
+from jaxsmw.presets import SUSPICIOUS, Preset, Stage, chosen_stages, common_range, refine_in_stages
 from jaxsmw.starts import Start, initial_map, other_starts
 from jaxsmw.threads import one_blas_thread, side_by_side
 
@@ -322,11 +322,11 @@ def match(
         raise ArithmeticError(f"{mesh_x.name} to {mesh_y.name}: {sentence(last.result)}")
     if outcome.suspicious:
         warnings.warn(
-            f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round (flaw "
-            f"{outcome.flaw:.3f}; right maps have up to {SUSPICIOUS}, or {DOUBTFUL} if nothing looks "
-            "reversed or torn off; more between bodies of different kinds, or where one touches itself): "
-            "look at it (--report, in Python jaxsmw.report.summary.write_report), and if it is so start from "
-            "a few landmarks",
+            f"{mesh_x.name} to {mesh_y.name}: limbs may be swapped, or the body turned round, for the map "
+            f"has flaw {outcome.flaw:.3f} and right ones have up to {SUSPICIOUS} (more between bodies of "
+            "different kinds, where one touches itself, or one is the mirror image of the other): look at it "
+            "(--report, in Python jaxsmw.report.summary.write_report), and if it is so "
+            f"{_what_may_help(init, partial)}",
             stacklevel=2,
         )
     spectrum_x, spectrum_y = stages[-1].view(spectrum_x, spectrum_y, partial=partial)
@@ -346,6 +346,15 @@ def match(
         partial=partial,
         seconds=seconds,
     )
+
+
+def _what_may_help(init: Start | ArrayLike | SurfacePoints, partial: bool) -> str:
+    """Where a map came out wrong."""
+    more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
+    landmarks = f"start from {'more' if more else 'a few'} landmarks"
+    if partial:
+        return f"{landmarks}, and see that both meshes have the same unit of length"
+    return f"{landmarks}, or say that one is a part of the other if it is (partial=True, --partial)"
 
 
 def _outlines(

@@ -42,7 +42,7 @@ class Stage:
     - `stop_when_unchanged`: see `jaxsmw.refine`.
     - `mending`: what is done at last where the outcome of this stage and those after it looks as if limbs
       were swapped, and they done again without the matches of these do not help: see `refine_in_stages`. Of
-      the same eigenvectors and descriptors.
+      as many eigenvectors, descriptors and samples. One stage of several may have it.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -79,9 +79,11 @@ class Stage:
             )
         if self.mending is not None and self._sizes != self.mending._sizes:
             raise InputError(
-                f"{self._sizes[0]} eigenvectors and {self._sizes[1]} descriptors are to be mended by a stage "
-                f"with {self.mending._sizes[0]} and {self.mending._sizes[1]}: give both the same."
+                f"a stage with {self._sizes} is to be mended by one with {self.mending._sizes}: give both "
+                "the same."
             )
+        if self.mending is not None and self.mending.mending is not None:
+            raise InputError("mending is a stage that has mending, too: leave that out.")
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
                 f"{self.number_of_samples} samples cannot tell {self.number_of_eigenvectors} eigenvectors "
@@ -89,8 +91,12 @@ class Stage:
             )
 
     @property
-    def _sizes(self) -> tuple[int, int]:
-        return self.number_of_eigenvectors, self.number_of_descriptors
+    def _sizes(self) -> str:
+        samples = self.number_of_samples or "no"
+        return (
+            f"{self.number_of_eigenvectors} eigenvectors, {self.number_of_descriptors} descriptors and "
+            f"{samples} samples"
+        )
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -169,6 +175,8 @@ def chosen_stages(
     stages = tuple(preset) if isinstance(preset, Iterable) else (preset,)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise InputError(f"preset is {preset!r}; give one of {', '.join(PRESETS)}, or stages.")
+    if (mending := sum(stage.mending is not None for stage in stages)) > 1:
+        raise InputError(f"{mending} stages are to mend: let one of them.")
     return stages
 
 
@@ -344,7 +352,7 @@ class _Judge:
         if not outcome.successful:
             return outcome._replace(flaw=np.inf, suspicious=True)
         flawed = flaw(*self.meshes, self._matches(outcome), self.spectrum_x, partial=self.partial)
-        return outcome._replace(flaw=flawed, suspicious=flawed >= SUSPICIOUS)
+        return outcome._replace(flaw=flawed, suspicious=not flawed < SUSPICIOUS)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
         """What is reversed and what is torn off, if it is worth mending."""
@@ -359,12 +367,12 @@ class _Judge:
 
     def looks_right(self, outcome: Outcome) -> bool:
         """Whether there is nothing to mend."""
-        doubtful = outcome.flaw is None or outcome.flaw >= DOUBTFUL
-        return not outcome.suspicious or not (doubtful or self.faults(outcome))
+        assert outcome.flaw is not None
+        return not outcome.suspicious or (outcome.flaw < DOUBTFUL and not self.faults(outcome))
 
     def alike(self, one: Outcome, other: Outcome) -> bool:
         """Whether two outcomes are the same map but for details."""
-        return alike(*self.meshes, self._matches(one), self._matches(other))
+        return alike(*self.meshes, self._matches(one), self._matches(other), partial=self.partial)
 
     def distinct(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
         """Those that are not like one before."""

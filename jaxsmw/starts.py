@@ -280,6 +280,12 @@ def _landmark_features(
             f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) "
             "for landmarks."
         )
+    for vertex in landmarks[:, 0]:
+        if len(twice := np.unique(landmarks[landmarks[:, 0] == vertex, 1])) > 1:
+            raise InputError(
+                f"vertex {vertex} of {x.mesh.name} is a landmark that is to be {twice[0]} and {twice[1]} of "
+                f"{y.mesh.name}: keep one of them."
+            )
     features = []
     units = units_of_length(x.mesh, y.mesh, partial)
     shot = paired_shot(x, y, partial)

@@ -148,7 +148,7 @@ class TestReading:
         path = write("landmarks.txt", "0 8\n3 0\n")
         assert read_landmarks(path, X, Y).tolist() == [[0, 8], [3, 0]]
         assert read_landmarks(write("l.txt", "4 1"), X, Y, index_base=1).tolist() == [[3, 0]]
-        for content, message in (("0\n", "has 1 numbers where 2"), ("4 0\n", "4 is not one .* of mesh_x")):
+        for content, message in (("0\n", "has 1 number where 2"), ("4 0\n", "4 is not one .* of mesh_x")):
             with pytest.raises(InputError, match=message):
                 read_landmarks(write("l.txt", content), X, Y)
 
@@ -225,7 +225,7 @@ class TestBadFiles:
         [
             ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
             ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a truth with one per line"),
-            ("t.txt", "1 2\n3\n", "line 2: has 1 numbers where 2 should be"),
+            ("t.txt", "1 2\n3\n", "line 2: has 1 number where 2 should be"),
             (
                 "t.txt",
                 "1 9\n5 1\n",

@@ -1,5 +1,6 @@
 """What is wrong with a map, told without the truth."""
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -7,7 +8,7 @@ from synthetic import body_with_arms, bumpy_mesh
 
 from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.faults import expected_error, flaw, reversed_orientation, stretch, torn_off
+from jaxsmw.geometry.faults import alike, expected_error, flaw, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import spread_edges
 
@@ -138,6 +139,32 @@ def test_errors_are_expected_where_they_are(body, spectrum):
     assert 0.3 < expected[top].mean() / truly[top].mean() < 3
 
 
+def test_it_does_not_matter_how_far_away_a_mesh_lies():
+    """In float32, too, where a hundred bodies' widths take the digits that tell vertices apart."""
+    near = bumpy_mesh(3)
+    far = make_mesh(near.vertices + 1e5, near.faces)
+    identity = np.arange(len(near.vertices))
+    with jax.enable_x64(False):
+        here, there = compute_spectrum(near, 40), compute_spectrum(far, 40)
+    np.testing.assert_allclose(there.positions, here.positions, atol=1e-5)
+    for x, y, spectrum in ((near, far, here), (far, near, there), (far, far, there)):
+        assert stretch(x, y, identity, spectrum) == pytest.approx(1, abs=1e-4)
+
+
+def test_maps_are_alike_but_for_details(body):
+    mesh, _ = body
+    identity = np.arange(len(mesh.vertices))
+    _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    assert alike(mesh, mesh, identity, identity) and not alike(mesh, mesh, identity, mirrored)
+    few = np.arange(len(mesh.vertices)) < 5
+    assert alike(mesh, mesh, identity, np.where(few, mirrored, identity))
+    # To a part that is a tenth of the body a tenth of its own size is little.
+    piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
+    moved = np.empty_like(identity)
+    moved[shift] = np.roll(shift, 40)
+    assert not alike(mesh, piece, identity, moved) and alike(mesh, piece, identity, moved, partial=True)
+
+
 def test_lengths_of_a_part_are_measured_like_the_whole(body):
     """A part in the same unit is not stretched; compared by area it would be."""
     mesh, _ = body
@@ -151,3 +178,20 @@ def test_lengths_of_a_part_are_measured_like_the_whole(body):
     assert not reversed_orientation(part, mesh, old, eigenvectors, partial=True).any()
     back = KDTree(part.vertices).query(mesh.vertices)[1]
     assert expected_error(part, mesh, old, back, spectrum, partial=True).max() == pytest.approx(0, abs=1e-12)
+
+
+def test_errors_on_a_part_are_in_its_own_unit(body, spectrum):
+    """From the whole to a part: of the same detours the smaller part makes more of its own."""
+    mesh, _ = body
+    kept = mesh.vertices[:, 0] < 1
+    old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
+    part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))
+    found = KDTree(part.vertices).query(mesh.vertices)[1]
+    expected = expected_error(mesh, part, found, old, spectrum, partial=True)
+    gone = mesh.vertices[:, 0] > 1.3
+    placed = np.linalg.norm(mesh.vertices - part.vertices[found], axis=1)[gone] / part.area**0.5
+    assert 0.5 < expected[gone].mean() / placed.mean() < 4
+    halved = make_mesh(part.vertices, part.faces[: len(part.faces) // 2])
+    assert halved.area < 0.8 * part.area
+    smaller = expected_error(mesh, halved, found, old, spectrum, partial=True)
+    np.testing.assert_allclose(smaller.max() / expected.max(), (part.area / halved.area) ** 0.5, rtol=0.2)

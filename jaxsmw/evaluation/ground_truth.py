@@ -25,7 +25,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.files import atomic_write
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.mesh import Mesh, count_of
 
 IndexBase = Literal[0, 1]
 
@@ -326,8 +326,8 @@ class _Table:
                     raise InputError(f"{self._at(row)}: {word[:40]!a} is not a number: correct the line.")
             if len(words) != columns:
                 raise InputError(
-                    f"{self._at(row)}: has {len(words)} numbers where {columns} should be: correct the "
-                    "line, or give the file that belongs here."
+                    f"{self._at(row)}: has {count_of(len(words), 'number')} where {columns} should be: "
+                    "correct the line, or give the file that belongs here."
                 )
         return rows
 

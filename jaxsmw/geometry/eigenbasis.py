@@ -78,9 +78,12 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions and normals."""
+    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions from
+    the centroid on and normals."""
     used = mesh.used_vertices
-    positions = np.where(used[:, None], mesh.vertices / np.sqrt(mesh.area), 0)
+    # From the centroid on, so that single precision is enough wherever the mesh lies.
+    centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
+    positions = np.where(used[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
     # `jnp.asarray` would compile something for every size.
     arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))

@@ -53,8 +53,10 @@ def stretch(
     )
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
+        # The constant has no energy, but would leave its rounding errors.
+        centered = positions - np.average(positions, axis=0, weights=mesh_x.vertex_areas)
         # In the type of the eigenvectors, of which a large mesh has no room for a copy.
-        weighted = (areas[:m] * positions.T).astype(eigenvectors.dtype)
+        weighted = (areas[:m] * centered.T).astype(eigenvectors.dtype)
         return float(np.sum(eigenvalues * (weighted @ eigenvectors[:m]) ** 2))
 
     unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
@@ -131,9 +133,17 @@ def reversed_orientation(
     return density < _REVERSED
 
 
-def alike(mesh_x: Mesh, mesh_y: Mesh, one: Int64[np.ndarray, " m"], other: Int64[np.ndarray, " m"]) -> bool:
-    """Whether two maps are the same but for details."""
-    apart = np.linalg.norm(mesh_y.vertices[one] - mesh_y.vertices[other], axis=1) > _APART * mesh_y.area**0.5
+def alike(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    one: Int64[np.ndarray, " m"],
+    other: Int64[np.ndarray, " m"],
+    *,
+    partial: bool = False,
+) -> bool:
+    """Whether two maps are the same but for details; `partial`: one mesh is a part of the other."""
+    _, unit_y = units_of_length(mesh_x, mesh_y, partial)
+    apart = np.linalg.norm(mesh_y.vertices[one] - mesh_y.vertices[other], axis=1) > _APART * unit_y
     return bool(mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area)
 
 
@@ -176,7 +186,8 @@ def expected_error(
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, piece = connected_pieces(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(piece, areas, number))[piece]
-    return np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced * sizes
+    expected = np.maximum(eigenvectors @ heat, 0) + _MISPLACED * misplaced * sizes
+    return expected * units[1] / mesh_y.area**0.5
 
 
 def _lengths(
