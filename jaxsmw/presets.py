@@ -248,9 +248,9 @@ def refine_in_stages(
     - `partial`: one shape is a part of the other, in the same unit of length.
     - `other_starts`: taken if a stage that is to mend could not. All are taken up to that stage, and through
       two rounds of it; the least doubtful, of which no two are alike, through what is left, and are mended.
-      The least doubtful outcome is returned, by its flaw and, of `FeatureRegression`, how badly features
-      predict each other. But if not even that looks right and three starts or more lead to the same map, the
-      outcome of these is returned.
+      The least doubtful outcome that looks right is returned, by its flaw and, of `FeatureRegression`, how
+      badly features predict each other. If none does and three starts or more lead to the same map, the
+      outcome of these is, otherwise the least doubtful.
     - `history`: see `jaxsmw.refine`.
     """
     run = partial_function(_run, samples=samples, history=history)
@@ -278,7 +278,7 @@ def refine_in_stages(
     finished, tried = [best], [best, *rough]
     for outcome in judge.distinct(rough)[:_FINALISTS]:
         finished.append(mending.mended(mending.finished(outcome)))
-    best = min(finished, key=doubt)
+    best = min(finished, key=lambda outcome: (outcome.suspicious, doubt(outcome)))
     if best.suspicious:
         # Where a body touches itself, and its surface is one there, right maps look torn, too. Wrong ones are
         # each wrong in their own way, mostly.

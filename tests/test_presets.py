@@ -68,6 +68,15 @@ def test_another_start_helps_where_mending_does_not(body, monkeypatch):
     assert wrong > 0.5 and alone.suspicious and alone.flaw > 1.3
 
 
+def test_what_looks_right_goes_before_what_is_less_doubtful(body, monkeypatch):
+    mesh = body[0]
+    _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
+    start, identity = jnp.asarray(turned, jnp.int32), jnp.arange(len(mesh.vertices), dtype=jnp.int32)
+    monkeypatch.setattr(presets, "doubt", lambda outcome: -outcome.flaw)
+    wrong, found = outcome(body, [MENDING], start, other_starts=[identity])
+    assert wrong < 0.02 and not found.suspicious
+
+
 def test_where_nothing_looks_right_what_three_starts_agree_on_is_taken(body, monkeypatch):
     mesh = body[0]
     _, turned = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
