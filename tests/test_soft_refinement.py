@@ -229,6 +229,28 @@ def test_not_coming_to_rest_is_named(pair):
     assert few.result == RESULTS.fixed_point_not_reached
 
 
+def test_what_is_not_at_rest_has_no_derivative(pair):
+    x, y, start = pair
+
+    def loss(temperature, iterations):
+        found = refine_softly(
+            x, y, start, recovery=Softmax(temperature), iterations=iterations, differentiation="implicit"
+        )
+        return jnp.sum(jnp.sin(found.functional_map)), found.result
+
+    def forward(iterations):
+        return jax.jvp(lambda t: loss(t, iterations), (jnp.asarray(10.0),), (jnp.asarray(1.0),), has_aux=True)
+
+    value, tangent, result = forward(2)
+    assert result == RESULTS.fixed_point_not_reached and jnp.isfinite(value) and jnp.isnan(tangent)
+    with pytest.raises(RuntimeError, match="non-finite"):
+        jax.block_until_ready(jax.grad(loss, has_aux=True)(jnp.asarray(10.0), 2))
+    _, tangent, result = forward(100)
+    assert result == RESULTS.successful
+    gradient, _ = jax.grad(loss, has_aux=True)(jnp.asarray(10.0), 100)
+    np.testing.assert_allclose(tangent, gradient, rtol=1e-2)
+
+
 def test_the_start_has_a_derivative(pair):
     x, y, _ = pair
 

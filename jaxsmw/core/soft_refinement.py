@@ -82,7 +82,8 @@ def refine_softly(
     **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, another
     `differentiation`, a start of another size, or spectra of two float types; `TypeError` for what is no
     refiner or recovery, or iterations that are no integer. With `"implicit"`, derivatives (not the outcome)
-    raise equinox's runtime error where the outcome is a failure, or GMRES does not come to its tolerance.
+    raise equinox's runtime error where iterations were too few (are NaN, in forward mode), or GMRES does not
+    come to its tolerance.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
@@ -218,8 +219,23 @@ def _fixed_point(
         throw=False,
     )
     converged = jnp.asarray(solution.result == optx.RESULTS.successful)
-    functional_map = solution.value.astype(start.dtype) * unit
+    functional_map = _known_to_rest(solution.value.astype(start.dtype) * unit, converged)
     return functional_map, solution.stats["num_steps"].astype(jnp.int32), converged
+
+
+@jax.custom_jvp
+def _known_to_rest(
+    functional_map: Float[Array, "k_out k_in"], at_rest: Bool[Array, ""]
+) -> Float[Array, "k_out k_in"]:
+    """The same; where it is no fixed point, the formula for the derivatives of one does not hold: NaN."""
+    return functional_map
+
+
+@_known_to_rest.defjvp
+def _derivative_at_rest(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    functional_map, at_rest = primals
+    known = jnp.where(at_rest, 1.0, jnp.nan).astype(functional_map.dtype)
+    return functional_map, tangents[0] * known
 
 
 _State = tuple[Float[Array, "k_out k_in"], Float[Array, "k_out k_in"], RESULTS]
