@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
+from itertools import islice
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from jaxsmw.core.registration import Registration
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.faults import alike, flaw, reversed_orientation, torn_off
+from jaxsmw.geometry.faults import alike, distinct, flaw, reversed_orientation, torn_off
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 
@@ -273,10 +274,10 @@ def refine_in_stages(
     rough: list[Outcome] = []
     for number, start in enumerate(other_starts, 2):
         logger.info("start %d", number)
-        rough.append(mending.without_faults(mending.begun(start), _ROUGH_ROUNDS))
+        rough.append(mending.without_faults(judge(mending.begun(start)), _ROUGH_ROUNDS))
     rough = sorted((outcome for outcome in rough if outcome.successful), key=doubt)
     finished, tried = [best], [best, *rough]
-    for outcome in judge.distinct(rough)[:_FINALISTS]:
+    for outcome in islice(distinct(rough, judge.alike), _FINALISTS):
         finished.append(mending.mended(mending.finished(outcome)))
     best = min(finished, key=lambda outcome: (outcome.suspicious, doubt(outcome)))
     if best.suspicious:
@@ -374,14 +375,6 @@ class _Judge:
         """Whether two outcomes are the same map but for details."""
         return alike(*self.meshes, self._matches(one), self._matches(other), partial=self.partial)
 
-    def distinct(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
-        """Those that are not like one before."""
-        found: list[Outcome] = []
-        for outcome in outcomes:
-            if not any(self.alike(outcome, other) for other in found):
-                found.append(outcome)
-        return found
-
     def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
         return np.asarray(outcome.pointwise_map)[: len(self.meshes[0].vertices)].astype(np.int64)
 
@@ -396,8 +389,8 @@ class _Mending:
     position: int
 
     def begun(self, start: Int[Array, " m"]) -> Outcome:
-        """Up to the stage that mends: a rough outcome."""
-        return self.judge(self.run(self.steps[: self.position + 1], Outcome([], start)))
+        """Up to the stage that mends: a rough outcome, not yet judged."""
+        return self.run(self.steps[: self.position + 1], Outcome([], start))
 
     def finished(self, rough: Outcome) -> Outcome:
         """After all stages."""
@@ -415,7 +408,7 @@ class _Mending:
             fault = faults[done % len(faults)]
             sound = np.where(pad_rows(fault, len(areas)), 0, areas)
             last = self._again(last, replace(spectrum_x, vertex_areas=jax.device_put(sound)), stage)
-            last = self.finished(last) if finished else last
+            last = self.finished(last) if finished else self.judge(last)
             best = min(best, last, key=doubt)
         return best
 
@@ -432,11 +425,11 @@ class _Mending:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def _again(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
-        """The rough outcome if this were the stage that mends, begun from a map that there is already."""
+        """The rough outcome, not yet judged, if this were the stage that mends, begun from another."""
         (_, spectrum_y), _ = self.steps[self.position]
         found = self.run([((spectrum_x, spectrum_y), stage)], Outcome([], outcome.pointwise_map))
         before = outcome.refinements[: self.position]
-        return self.judge(outcome._replace(refinements=[*before, *found.refinements]))
+        return outcome._replace(refinements=[*before, *found.refinements])
 
 
 _ROUNDS, _ROUGH_ROUNDS, _EIGENVECTORS = 4, 2, 50

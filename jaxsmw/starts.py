@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial as partial_function
+from itertools import islice
 from typing import Literal
 
 import jax
@@ -25,7 +27,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import Compared, compared, paired_shot
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.extremities import extremities, likely_pairings
-from jaxsmw.geometry.faults import alike, flaw
+from jaxsmw.geometry.faults import alike, distinct, flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
@@ -172,11 +174,9 @@ def _starts_from_extremities(
             flawed = flaw(x.mesh, y.mesh, found, everything)
             outcomes.append((doubt(Outcome([refinement], start, flawed)), found))
     outcomes.sort(key=lambda outcome: outcome[0])
-    given: list[Int64[np.ndarray, " m"]] = []
-    for _, found in outcomes:
-        if len(given) < _LEAST_DOUBTFUL and not any(alike(x.mesh, y.mesh, found, other) for other in given):
-            given.append(found)
-            yield extend_to_unused(x.mesh, found)
+    unlike = distinct((found for _, found in outcomes), partial_function(alike, x.mesh, y.mesh))
+    for found in islice(unlike, _LEAST_DOUBTFUL):
+        yield extend_to_unused(x.mesh, found)
 
 
 # Enough to find the place of limbs.

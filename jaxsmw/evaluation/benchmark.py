@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Int, Int64
 from tqdm import tqdm
 
-from jaxsmw.core.batch import padded_size
+from jaxsmw.core.batch import pad_rows, padded_size
 from jaxsmw.core.compilation import release_programs
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import spectral_embeddings
@@ -381,7 +381,7 @@ def prepare_pair(
     sizes = [padded_size(len(mesh.vertices)) for mesh in meshes]
 
     def padded(pointwise_map: Int64[np.ndarray, " m"], size: int) -> Int[Array, " p"]:
-        return jnp.asarray(np.pad(pointwise_map, (0, size - len(pointwise_map))), jnp.int32)
+        return jnp.asarray(pad_rows(pointwise_map, size), jnp.int32)
 
     def others() -> Iterator[Int[Array, " p"]]:
         if init == "shot":

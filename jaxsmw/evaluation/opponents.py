@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Int64
 
+from jaxsmw.core.batch import pad_rows
 from jaxsmw.core.compilation import compiled
 from jaxsmw.core.filters import Identity
 from jaxsmw.core.functional_map import encode
@@ -133,8 +134,7 @@ class Published(Method):
     def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
         assert pair.meshes is not None
         pointwise_map = read_published_map(self.directory, pair.names, pair.meshes)
-        missing = pair.spectrum_x.mask.shape[0] - len(pointwise_map)
-        padded = jnp.asarray(np.pad(pointwise_map, (0, missing)), jnp.int32)
+        padded = jnp.asarray(pad_rows(pointwise_map, pair.spectrum_x.mask.shape[0]), jnp.int32)
         return padded, RESULTS.successful  # type: ignore[return-value]
 
     def check(self, pairs: Sequence[DataPair]) -> None:

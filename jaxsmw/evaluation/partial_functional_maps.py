@@ -59,7 +59,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.core.batch import padded_size
+from jaxsmw.core.batch import pad_rows, padded_size
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.pointwise_map import decode
@@ -116,12 +116,12 @@ class SurfaceGradient(eqx.Module):
         # Normal and edge in the unit of the area each: `n x e / (2 area)`, the normal of length 2 area.
         squared = np.where(doubled > 0, doubled, np.inf)[:, None, None] ** 2
         hats = np.cross(normals[:, None], opposite) / squared
-        missing = padded_size(len(mesh.faces)) - len(mesh.faces)
+        size = padded_size(len(mesh.faces))
         dtype = spectrum.eigenvectors.dtype
         return cls(
-            jnp.asarray(np.pad(mesh.faces, ((0, missing), (0, 0))), jnp.int32),
-            jnp.asarray(np.pad(hats, ((0, missing), (0, 0), (0, 0))), dtype),
-            jnp.asarray(np.pad(doubled / 2, (0, missing)), dtype),
+            jnp.asarray(pad_rows(mesh.faces, size), jnp.int32),
+            jnp.asarray(pad_rows(hats, size), dtype),
+            jnp.asarray(pad_rows(doubled / 2, size), dtype),
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:

@@ -78,8 +78,7 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions from
-    the centroid on and normals."""
+    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions and normals."""
     used = mesh.used_vertices
     # From the centroid on, so that single precision is enough wherever the mesh lies.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)

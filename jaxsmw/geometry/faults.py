@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, connected_pieces, units_of_length
 from jaxsmw.geometry.sampling import spread_edges
+
+_Item = TypeVar("_Item")
 
 # Neighbours whose matches are farther apart than this, in square roots of the area, and than so many times
 # their own distance, are torn apart. Matches of neighbours are 0.03 apart on bodies of 5000 vertices.
@@ -145,6 +150,15 @@ def alike(
     _, unit_y = units_of_length(mesh_x, mesh_y, partial)
     apart = np.linalg.norm(mesh_y.vertices[one] - mesh_y.vertices[other], axis=1) > _APART * unit_y
     return bool(mesh_x.vertex_areas[apart].sum() < _NEARLY_NOTHING * mesh_x.area)
+
+
+def distinct(items: Iterable[_Item], alike: Callable[[_Item, _Item], bool]) -> Iterator[_Item]:
+    """Those that are not like one before."""
+    found: list[_Item] = []
+    for item in items:
+        if not any(alike(item, other) for other in found):
+            found.append(item)
+            yield item
 
 
 def expected_error(
