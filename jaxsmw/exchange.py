@@ -257,10 +257,13 @@ def read_functional_map(
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
-    if matrix.shape[0] > most[0] or matrix.shape[1] > most[1]:
+    if np.greater(matrix.shape, most).any():
+        cure = "compute more eigenvectors, or leave out its last rows and columns"
+        if np.less_equal(matrix.shape[::-1], most).all():
+            cure = "transpose it"
         raise InputError(
             f"{path}: the functional map is {matrix.shape}, but from functions on Y to functions on X it can "
-            f"be at most {most}: transpose it, or compute more eigenvectors."
+            f"be at most {most}: {cure}."
         )
     if not np.isfinite(matrix).all():
         raise InputError(f"{path}: the functional map is not finite: compute it anew.")

@@ -261,7 +261,7 @@ def match(
     compiling = []
     # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
     if not partial and 0 < k < min(m, n):
-        for stage in stages:
+        for stage in reversed(stages):  # the last ones take longest
             outlines = partial_function(_outlines, size_x, size_y, stage)
             compiling.append(compile_ahead(refine, outlines, **stage.settings, history=history))
     seconds: dict[str, float] = {}

@@ -165,7 +165,14 @@ def train(
 
     order = np.random.default_rng(seed).integers(0, len(pairs), steps)
     begun = int(state.step)
-    progress = tqdm(range(begun, steps), desc=f"learning {name}", unit="step", initial=begun, total=steps)
+    progress = tqdm(
+        range(begun, steps),
+        desc=f"learning {name}",
+        unit="step",
+        initial=begun,
+        total=steps,
+        disable=begun == steps,
+    )
     for step in progress:
         pair = pairs[order[step]]
         state = _improve(watch(state), prepare(pair), loss, optimizer, unit)
@@ -327,7 +334,7 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
     """Read the arguments, open the data, and keep other processes and other settings out of the output.
 
     `provenance.json` there says what results come from; see `jaxsmw.evaluation.journal.claimed_directory`.
-    Leaves by the parser's error, with one sentence, on bad input.
+    Leaves by the parser's error, with one sentence, on bad input, and with another if interrupted.
     """
     options = arguments.parse_args()
     steps, test_pairs = (3, 2) if options.quick else (options.steps, options.test_pairs)
@@ -346,6 +353,8 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
             yield Run(data, directory, steps, test_pairs, options.seed, made_with())
     except InputError as error:
         arguments.error(str(error))
+    except KeyboardInterrupt:
+        sys.exit(f"\ninterrupted; the same command goes on from what {options.output} holds")
 
 
 def _public(options: argparse.Namespace) -> list[str]:

@@ -543,7 +543,7 @@ BAD_VARIABLES = {
     "no variable": ("pointwise map", {}, "is empty"),
     "words": ("pointwise map", {"T12": "one two"}, "no list of numbers"),
     "complex": ("functional map", {"C21": np.eye(3) * 1j}, "no matrix"),
-    "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): transpose it"),
+    "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): compute more eigenvectors"),
     "infinite": ("functional map", {"C21": np.full((3, 3), np.inf)}, "not finite"),
     "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "call the one that is meant C21"),
     "no basis": ("spectrum", {"S": {"evals": np.arange(3.0)}}, "no evals and evecs"),

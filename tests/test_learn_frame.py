@@ -96,6 +96,15 @@ def test_goes_on_where_it_was(pairs, tmp_path, monkeypatch):
     np.testing.assert_array_equal(resumed_losses, losses)
 
 
+def test_whoever_interrupts_is_told_how_to_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "open_data", lambda directory: learning.Data([], [], [], []))
+    output = tmp_path / "learned"
+    monkeypatch.setattr(sys, "argv", [learn_frame.__file__, str(tmp_path), "--output", str(output)])
+    told = pytest.raises(SystemExit, match=r"the same command goes on from what .*learned holds")
+    with told, learning.running(learning.parser("", output="", steps=1), {}):
+        raise KeyboardInterrupt
+
+
 def test_frames_are_kept(tmp_path):
     frame, points = like_meyer(), jnp.linspace(0, 7, 40)
     save(frame, tmp_path / "frame.npz")

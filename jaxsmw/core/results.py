@@ -21,9 +21,10 @@ class RESULTS(eqx.Enumeration):
     )
     nonfinite_functional_map = (
         "The functional map, or what determines it, became NaN or infinite: look at the filter bank's "
-        "responses, the weights and the descriptors. In float32 it can be overflow (scale the surfaces to "
-        "area 1, or use float64); with the least-squares pseudo-inverse it can be that there are fewer "
-        "samples than eigenvectors, or samples that do not tell the eigenvectors apart."
+        "responses, the weights, the descriptors and, of soft maps, the temperature, which must be positive. "
+        "In float32 it can be overflow (scale the surfaces to area 1, or use float64); with the "
+        "least-squares pseudo-inverse it can be that there are fewer samples than eigenvectors, or samples "
+        "that do not tell the eigenvectors apart."
     )
     undetermined_functional_map = (
         "Nothing determines a part of the functional map, to working precision: at an eigenvalue the frame "
