@@ -21,10 +21,10 @@ def compiler_options() -> dict[str, str | bool]:
     On CPUs XLA leaves products and sums to a library (YNNPACK) that takes longer to wake its threads than a
     small one lasts: without it a search in patches takes half the time. And it makes several loops of each
     long sum, to be rounded less: with one, programs compile in two thirds of the time (docs/speed.md), and
-    sums of a million numbers are still right within 5e-6. There are none for other devices, nor those that XLA does not know. JAX accepts
-    options in the outermost `jax.jit` only, which is why `jaxsmw.refine`, to be called from other compiled
-    functions, does not set them itself. They are for JAX's default backend, whatever `jax.default_device`
-    says.
+    sums of a million numbers are still right within 5e-6. There are none for other devices, nor those that
+    XLA does not know. JAX accepts options in the outermost `jax.jit` only, which is why `jaxsmw.refine`, to
+    be called from other compiled functions, does not set them itself. They are for JAX's default backend,
+    whatever `jax.default_device` says.
     """
     return dict(_options_for(jax.default_backend()))
 
