@@ -358,9 +358,8 @@ class _Judge:
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
         """What is reversed and what is torn off, if it is worth mending."""
         mesh_x, found = self.meshes[0], self._matches(outcome)
-        eigenvectors = np.asarray(self.spectrum_x.eigenvectors)[: len(found), :_EIGENVECTORS]
         both = (
-            reversed_orientation(*self.meshes, found, eigenvectors, partial=self.partial),
+            reversed_orientation(*self.meshes, found, self.spectrum_x, partial=self.partial),
             torn_off(*self.meshes, found, partial=self.partial),
         )
         areas = mesh_x.vertex_areas / mesh_x.area
@@ -432,7 +431,7 @@ class _Mending:
         return outcome._replace(refinements=[*before, *found.refinements])
 
 
-_ROUNDS, _ROUGH_ROUNDS, _EIGENVECTORS = 4, 2, 50
+_ROUNDS, _ROUGH_ROUNDS = 4, 2
 # Smaller parts of the area are let be: fingertips come and go.
 _NEGLIGIBLE = 0.002
 # What is left of a body turned round as a whole is no help.

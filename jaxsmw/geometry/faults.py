@@ -19,7 +19,7 @@ _Item = TypeVar("_Item")
 _TORN, _STRETCHED = 0.1, 3.0
 # Where the smoothed density of signed area is below this, orientation is reversed: 1 is what isometries have.
 _REVERSED = -0.2
-# Of which the flaw counts what shows in so many eigenvectors, by this weight.
+# It is smoothed in the span of so many eigenvectors, and counts in the flaw by this weight.
 _EIGENVECTORS, _WEIGHT_OF_REVERSED = 50, 4
 # Maps are alike that differ by more than so many square roots of the area on less than such a share of it.
 _APART, _NEARLY_NOTHING = 0.1, 0.03
@@ -83,8 +83,7 @@ def flaw(
     registration ends with has up to 1.12 between poses of one body and up to 1.2 between bodies of different
     kinds where it is right, mostly above 1.3 where limbs are swapped.
     """
-    eigenvectors = np.asarray(spectrum_x.eigenvectors)[: len(mesh_x.vertices), :_EIGENVECTORS]
-    reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
+    reversed_ = reversed_orientation(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial)
     share = float(mesh_x.vertex_areas[reversed_].sum() / mesh_x.area)
     stretched = stretch(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial)
     if not partial:
@@ -111,7 +110,7 @@ def reversed_orientation(
     mesh_x: Mesh,
     mesh_y: Mesh,
     pointwise_map: Int64[np.ndarray, " m"],
-    eigenvectors_x: Float[np.ndarray, "m k"],
+    spectrum_x: Spectrum,
     *,
     partial: bool = False,
 ) -> Bool[np.ndarray, " m"]:
@@ -119,8 +118,9 @@ def reversed_orientation(
 
     **Arguments:**
 
-    - `eigenvectors_x`: of X, scaled like lengths: in the span of these the area that triangles cover on Y,
-      negative where they come to lie upside down, is smoothed.
+    - `spectrum_x`: of X; what is beyond X's vertices is padding. In the span of its first eigenvectors the
+      area that triangles cover on Y, negative where they come to lie upside down, is smoothed.
+    - `partial`: whether one mesh is a part of the other, in the same unit of length.
     """
     unit_x, unit_y = units_of_length(mesh_x, mesh_y, partial)
     corners = pointwise_map[mesh_x.faces]
@@ -134,8 +134,8 @@ def reversed_orientation(
     most = 2 * mesh_x.face_areas / unit_x**2
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
-    density = eigenvectors_x @ (eigenvectors_x.T @ at_vertices)
-    return density < _REVERSED
+    eigenvectors = np.asarray(spectrum_x.eigenvectors)[: len(mesh_x.vertices), :_EIGENVECTORS]
+    return eigenvectors @ (eigenvectors.T @ at_vertices) < _REVERSED
 
 
 def alike(
@@ -195,7 +195,7 @@ def expected_error(
     signs = _DETOUR * detour + _DISTORTION * distortion
     heat = np.exp(-_HEAT_TIME * eigenvalues) * (eigenvectors.T @ (areas * signs))
     misplaced = torn_off(mesh_x, mesh_y, pointwise_map, partial=partial)
-    misplaced |= reversed_orientation(mesh_x, mesh_y, pointwise_map, eigenvectors, partial=partial)
+    misplaced |= reversed_orientation(mesh_x, mesh_y, pointwise_map, spectrum_x, partial=partial)
     # The larger a limb is, the farther from its place it can be.
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, piece = connected_pieces(mesh_x.edges[inside], m)
