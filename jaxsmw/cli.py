@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     _make_interruptible()
     logger = logging.getLogger("jaxsmw")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(message)s ..."))
+    handler.setFormatter(logging.Formatter("%(message)s"))
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(logging.WARNING if options.quiet else logging.INFO)
     try:
@@ -495,7 +495,7 @@ def _demo(options: argparse.Namespace) -> None:
     from jaxsmw.geometry.mesh_files import write_mesh
 
     directory = make_directory(options.output)
-    logging.getLogger("jaxsmw").info("making the creature")
+    logging.getLogger("jaxsmw").info("making the creature ...")
     pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
     truth = GroundTruth.of_all_vertices(pair.truth)
     write_mesh(directory / "source.off", pair.source)
@@ -545,11 +545,11 @@ def _match(options: argparse.Namespace) -> None:
     write_pointwise_map(options.output, correspondence.pointwise_map)
     others: dict[str, Any] = {}
     if options.one_to_one:
-        logging.getLogger("jaxsmw").info("one-to-one map")
+        logging.getLogger("jaxsmw").info("one-to-one map ...")
         others["one-to-one"] = correspondence.one_to_one()
         write_pointwise_map(options.one_to_one, others["one-to-one"])
     if options.surface_points or textured:
-        logging.getLogger("jaxsmw").info("points on the surface")
+        logging.getLogger("jaxsmw").info("points on the surface ...")
         points = correspondence.surface_points()
         if options.surface_points:
             others["surface"] = points
@@ -561,7 +561,7 @@ def _match(options: argparse.Namespace) -> None:
     if options.expected_error:
         import numpy as np
 
-        logging.getLogger("jaxsmw").info("expected error")
+        logging.getLogger("jaxsmw").info("expected error ...")
         with atomic_write(options.expected_error) as temporary:
             np.savetxt(temporary, correspondence.expected_error(), "%.6f")
     _conclude(options, correspondence, truth, directory, others)
@@ -661,7 +661,7 @@ def _conclude(
     if directory is not None:
         from jaxsmw.report.summary import write_report
 
-        logging.getLogger("jaxsmw").info("report")
+        logging.getLogger("jaxsmw").info("report ...")
         settings = {name: value for name, value in vars(options).items() if name != "run"}
         write_report(
             directory,
@@ -797,7 +797,7 @@ def _errors(
 ) -> dict[str, GeodesicError]:
     from jaxsmw.evaluation.metrics import geodesic_error
 
-    logging.getLogger("jaxsmw").info("geodesic errors")
+    logging.getLogger("jaxsmw").info("geodesic errors ...")
     return {
         name: geodesic_error(
             mesh_y,

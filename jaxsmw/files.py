@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,10 +41,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}): choose a place with free space "
-            "where you may create files."
-        ) from error
+        raise _unwritable(path, error) from error
     finally:
         # Nothing is left to remove after success, nor where the directory itself was the trouble.
         if os.path.lexists(temporary):
@@ -65,11 +63,20 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         )
     if target.exists() and not target.is_file():
         raise InputError(f"{path}: cannot be written because it is not a file: choose another name.")
-    for place in (target, target.parent):
-        if place.exists() and not os.access(place, os.W_OK):
-            raise InputError(
-                f"{path}: {place} is write-protected: choose another name or change permissions."
-            )
+    if target.exists() and not os.access(target, os.W_OK):
+        raise InputError(f"{path}: is write-protected: choose another name or change permissions.")
+    try:  # permissions do not tell all
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
+    return InputError(
+        f"{path}: cannot be written ({error.strerror or error}): choose a place with free space where you "
+        "may create files."
+    )
 
 
 def check_directory(path: str | os.PathLike[str]) -> None:

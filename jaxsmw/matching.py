@@ -425,7 +425,7 @@ _SMALLEST_PART = 1e-3
 
 @contextmanager
 def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    logger.info(name)
+    logger.info("%s ...", name)
     start = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - start

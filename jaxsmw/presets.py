@@ -273,7 +273,7 @@ def refine_in_stages(
     logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, DOUBTFUL)
     rough: list[Outcome] = []
     for number, start in enumerate(other_starts, 2):
-        logger.info("start %d", number)
+        logger.info("start %d ...", number)
         rough.append(mending.without_faults(judge(mending.begun(start)), _ROUGH_ROUNDS))
     rough = sorted((outcome for outcome in rough if outcome.successful), key=doubt)
     finished, tried = [best], [best, *rough]

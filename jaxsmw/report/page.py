@@ -31,6 +31,8 @@ from jaxsmw.report.rendering import ELEVATION, Axis, choose_azimuth, stand_pair
 # Of both shapes together a page holds so many values of eigenvectors, a byte each and a third more in
 # base64: as many eigenvectors as the paper has up to 60 000 vertices, and beyond 300 000 none.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
+# On a narrow screen bodies wider than this, for their height, are shown larger one above the other.
+_WIDE = 0.65
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,7 @@ def write_page(
         "error_names": error_names,
         "azimuth": choose_azimuth([shown_x, shown_y]),
         "elevation": ELEVATION,
-        "wide": bool(max(reach[0], reach[2]) > reach[1]),
+        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
     }
     filters = 0
     if spectra is not None and (cut := _cut(mesh_x, mesh_y, *spectra)):

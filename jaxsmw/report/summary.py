@@ -219,7 +219,7 @@ def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectru
     number = min(eigenvectors_on_page(mesh_x, mesh_y), fewest // 2)
     if not number:
         return None
-    logging.getLogger("jaxsmw").info("eigenbases")
+    logging.getLogger("jaxsmw").info("eigenbases ...")
     try:
         return paired_spectra(mesh_x, mesh_y, number, partial=partial)
     except InputError as error:
