@@ -1019,7 +1019,11 @@ def test_check_writable_tells_before_the_work_what_atomic_write_would_tell_after
     check_writable(tmp_path / "old.txt")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["old.txt"]
     # Nobody can create files in /proc, whatever permissions say.
-    for path in (tmp_path, tmp_path / "no" / "such.txt", *([Path("/proc/x")] if Path("/proc").exists() else [])):
+    for path in (
+        tmp_path,
+        tmp_path / "no" / "such.txt",
+        *([Path("/proc/x")] if Path("/proc").exists() else []),
+    ):
         with pytest.raises(InputError, match="cannot be written"):
             check_writable(path)
 
