@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="jaxsmw",
         description="Which vertex of one shape is which vertex of the other? Give two triangle meshes (OFF, "
-        "OBJ, PLY or STL) of the same kind of body in different poses.",
+        "OBJ, PLY, STL or MATLAB's MAT) of the same kind of body in different poses.",
     )
     parser.add_argument("--version", action="version", version=f"jaxsmw {metadata.version('jaxsmw')}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
@@ -117,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--vertices", type=_integer(1), default=5000, help="size of the meshes (default: %(default)s)"
     )
     demo.add_argument("--seed", type=_integer(0), default=0, help="another creature (default: %(default)s)")
-    demo.set_defaults(partial=False)
+    demo.set_defaults(partial=False, index_base=None)
     _add_method(demo)
     _add_common(demo, _demo)
 
@@ -211,7 +211,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         help="start, mwp, accurate, mwp-sampled, no-filter, icp, cpd, bcicp, pfm, zoomout, zoomout-sampled; "
         "pyfm-zoomout, geomfum-zoomout where these are installed; directories with maps X_Y.map made "
-        "elsewhere (default: all that suit the pairs; cpd and bcicp take half a minute per pair; "
+        "elsewhere (default: all that suit the pairs; cpd takes half a minute per pair, bcicp a quarter; "
         "pfm is for parts)",
     )
     benchmark.add_argument(
@@ -494,15 +494,16 @@ def _demo(options: argparse.Namespace) -> None:
     from jaxsmw.geometry.creature import creature_pair
     from jaxsmw.geometry.mesh_files import write_mesh
 
-    directory = make_directory(options.output)
+    check_directory(options.output)
     logging.getLogger("jaxsmw").info("making the creature ...")
     pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
     truth = GroundTruth.of_all_vertices(pair.truth)
+    options.evaluation_samples, options.geodesics, options.up = None, None, "y"
+    correspondence = _run_match(options, pair.source, pair.target)
+    directory = make_directory(options.output)
     write_mesh(directory / "source.off", pair.source)
     write_mesh(directory / "target.off", pair.target)
     write_ground_truth(directory / "truth.baryc_gt", truth, pair.target)
-    options.evaluation_samples, options.geodesics, options.up = None, None, "y"
-    correspondence = _run_match(options, pair.source, pair.target)
     write_pointwise_map(directory / "map.txt", correspondence.pointwise_map)
     _conclude(options, correspondence, truth, directory)
     print(f"Look at {directory / 'report.html'} and {directory / 'correspondence.png'}.")
@@ -812,6 +813,8 @@ def _errors(
 
 
 def _spectrum(options: argparse.Namespace) -> None:
+    for output in filter(None, (options.output, options.figure)):
+        _keep_inputs(output, options.mesh)
     _check_outputs(options)
     if options.output:
         from jaxsmw.exchange import check_spectrum_path

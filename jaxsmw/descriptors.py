@@ -15,7 +15,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, units_of_length
 from jaxsmw.geometry.sampling import Samples, spread_samples
-from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.threads import side_by_side
 
 
@@ -78,8 +78,16 @@ def describe(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`, `partial`: see `paired_spectra`.
-    - `number_of_descriptors`: d, at most 352; the components in which the shapes' vertices differ most.
+    - `number_of_descriptors`: d, from 1 to 352; the components in which the shapes' vertices differ most.
+
+    **Returns:** Both spectra with `descriptors`, (m, d) and (n, d).
+
+    **Raises:** `InputError` for another number, or a mesh that is too coarse for SHOT.
     """
+    if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
+        raise InputError(
+            f"{number_of_descriptors} descriptors were asked for; SHOT gives from 1 to {SHOT_DIMENSION}."
+        )
     sides = compared(mesh_x, mesh_y, spectrum_x, spectrum_y)
     of_radii = [paired_shot(*sides, partial)]
     if min(len(side.mesh.vertices) for side in sides) >= _FINE:

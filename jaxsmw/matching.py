@@ -260,7 +260,7 @@ def match(
     release_programs()
     compiling = []
     # Of a part the number of eigenvectors comes out later; and who is to be refused should not wait.
-    if not partial and 0 < k < min(m, n):
+    if not partial and k < min(m, n):
         for stage in reversed(stages):  # the last ones take longest
             outlines = partial_function(_outlines, size_x, size_y, stage)
             compiling.append(compile_ahead(refine, outlines, **stage.settings, history=history))
@@ -369,7 +369,8 @@ def _outlines(
             jnp.zeros(v),
             jnp.zeros(v, bool),
             jnp.zeros((v, d)) if d else None,
-            *(jnp.zeros((v, 3)),) * 2,
+            positions=jnp.zeros((v, 3)),
+            normals=jnp.zeros((v, 3)),
         )
         for v in (m, n)
     )

@@ -42,8 +42,8 @@ class Stage:
     - `number_of_samples`: take turns on so many samples of each shape, and search all vertices at the end.
     - `stop_when_unchanged`: see `jaxsmw.refine`.
     - `mending`: what is done at last where the outcome of this stage and those after it looks as if limbs
-      were swapped, and they done again without the matches of these do not help: see `refine_in_stages`. Of
-      as many eigenvectors, descriptors and samples. One stage of several may have it.
+      were swapped, and repeating these stages without the swapped matches does not help: see
+      `refine_in_stages`. Of as many eigenvectors, descriptors and samples. One stage of several may have it.
 
     **Raises:** `InputError` for what cannot work.
     """
@@ -270,7 +270,7 @@ def refine_in_stages(
     if not (best.successful and best.suspicious):
         return best
     # Of several that look right one may be better: once in doubt, all are tried.
-    logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, DOUBTFUL)
+    logger.info("limbs may be swapped (flaw %.3f; right maps have up to %.2f)", best.flaw, SUSPICIOUS)
     rough: list[Outcome] = []
     for number, start in enumerate(other_starts, 2):
         logger.info("start %d ...", number)

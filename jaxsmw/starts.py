@@ -66,7 +66,8 @@ def initial_map(
     15 000 vertices descriptors are computed and compared at about 10 000 evenly spread ones, and every other
     vertex of X takes the match of the nearest of them.
 
-    **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks.
+    **Raises:** `InputError` for an unknown descriptor, or an array that is neither a map nor landmarks;
+    `ArithmeticError` if numbers went wrong on the way to `"functional"`.
     """
     if isinstance(init, SurfacePoints):
         init = check_surface_points(init, mesh_y, "initial map").nearest_corners(mesh_y)

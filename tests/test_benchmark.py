@@ -32,6 +32,7 @@ from jaxsmw.evaluation.opponents import METHODS, Method, PreparedPair, find_meth
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.mesh_files import write_mesh
+from jaxsmw.provenance import measured_code
 from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
 
 
@@ -384,3 +385,14 @@ def test_times_are_without_compilation(monkeypatch):
 def test_a_table_has_its_first_row_for_a_header():
     rows = markdown([["a", "b"], ["1", "2"]])
     assert rows == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+
+
+def test_all_code_that_numbers_depend_on_counts():
+    """Whoever changes a preset does not go on with results of the one before."""
+    measured = {path.resolve() for path in measured_code()}
+    script = "import sys, jaxsmw.evaluation.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
+    found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    loaded = {Path(name).resolve() for name in found.stdout.split()}
+    drawing = {path for path in loaded if path.parent.name == "report"}
+    assert len(loaded) > 40 and loaded - drawing <= measured
+    assert not {"cli.py", "page.py"} & {path.name for path in measured}

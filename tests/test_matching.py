@@ -253,7 +253,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    assert caplog.messages == ["eigenbases", "initial map", "samples", "refinement"]
+    assert caplog.messages == ["eigenbases ...", "initial map ...", "samples ...", "refinement ..."]
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,33 @@ def test_every_option_changes_the_result(name):
     assert jnp.max(jnp.abs(default - other)) > 1e-3
 
 
+def products(jaxpr):
+    """All matrix products of a program, however deep."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda p: hasattr(p, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from products(inner)
+
+
+@pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
+def test_products_ask_for_all_digits(pair, refiner):
+    """GPUs would take fewer by default, and matches are decided by small differences."""
+    x, y, start, _ = pair
+    arrays, rest = eqx.partition((x, y, start, refiner), eqx.is_array)
+
+    def refined(arrays):
+        x, y, start, refiner = eqx.combine(arrays, rest)
+        return eqx.filter(refine(x, y, start, refiner=refiner), eqx.is_array)
+
+    found = list(products(jax.make_jaxpr(refined)(arrays).jaxpr))
+    assert len(found) >= 3
+    highest = (jax.lax.Precision.HIGHEST,) * 2
+    assert {equation.params["precision"] for equation in found} == {highest}
+
+
 @pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_signs_of_eigenvectors_do_not_matter(pair, refiner):
     x, y, start, _ = pair

@@ -20,7 +20,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.threads import one_blas_thread
 
 # Sizes are rounded up to a multiple of an eighth of the power of two below them, and of the search's block:
-# at most an eighth of a padded shape is padding, and all shapes from 4000 to 16 000 vertices share 16 sizes.
+# at most an eighth of a padded shape is padding, and all shapes from 4000 to 16 000 vertices share 17 sizes.
 _SUBDIVISION = 8
 _SMALLEST_STEP = 128
 # More pairs side by side than this gained nothing on any device measured (scripts/benchmark_batches.py).

@@ -220,5 +220,5 @@ def wavelet_energy(
     return QuadraticEnergy(
         product((weights * fed).T, fed) * multiscale_kernel(responses_in, responses_in),
         product((weights * returned).T, fed) * multiscale_kernel(responses_out, responses_in),
-        jnp.sum(weights * returned**2, axis=0) @ frame_function(responses_out),
+        product(jnp.sum(weights * returned**2, axis=0), frame_function(responses_out)),
     )

@@ -6,6 +6,7 @@ import jax
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.core.functional_map import Convention
+from jaxsmw.core.products import product
 from jaxsmw.core.search import (
     Patches,
     approximate_nearest_neighbor,
@@ -34,8 +35,8 @@ def spectral_embeddings(
     **Returns:** One row per vertex of X (the queries), one per vertex of Y (the database).
     """
     if convention == "pullback":
-        return spectrum_x.eigenvectors, spectrum_y.eigenvectors @ functional_map.T
-    return spectrum_x.eigenvectors @ functional_map.T, spectrum_y.eigenvectors
+        return spectrum_x.eigenvectors, product(spectrum_y.eigenvectors, functional_map.T)
+    return product(spectrum_x.eigenvectors, functional_map.T), spectrum_y.eigenvectors
 
 
 def decode(
@@ -52,6 +53,8 @@ def decode(
     For each vertex of X the vertex of Y, masked ones excluded, that is nearest in `spectral_embeddings`;
     found faster where `search_patches` of the two shapes are given, or nearly always if approximately
     (`approximate_nearest_neighbor`).
+
+    **Returns:** One vertex of Y per vertex of X, (m,).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     if patches is not None:

@@ -165,6 +165,9 @@ class WaveletPreservation(Refiner):
       CPU but takes seconds longer to compile; `"auto"` does that on CPUs from 15 000 vertices.
       `"approximate"` misses a few in a thousand of a good map, more of a poor one
       (`approximate_nearest_neighbor`, needs FAISS).
+
+    **Raises:** `TypeError` for what is no bank or solution; `ValueError` for another choice; `ImportError` if
+    FAISS is to be used and not installed.
     """
 
     bank: FilterBank = Meyer()

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.filters import Meyer
+from jaxsmw.core.products import product
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -19,7 +20,7 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     """Heat kernel signature at log-spaced times (Sun, Ovsjanikov, Guibas 2009).
 
     Times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`, lambda_min the smallest positive
-    eigenvalue.
+    eigenvalue. NaN where none is positive.
     """
     smallest, largest = _positive_range(spectrum)
     times = 4 * jnp.log(10.0) / jnp.geomspace(largest, smallest, dimensions)
@@ -57,7 +58,7 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
 
 
 def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Float[Array, "n dimensions"]:
-    return spectrum.eigenvectors**2 @ (weights / jnp.sum(weights, axis=1, keepdims=True)).T
+    return product(spectrum.eigenvectors**2, (weights / jnp.sum(weights, axis=1, keepdims=True)).T)
 
 
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -26,6 +26,7 @@ from jaxsmw.core.functional_map import (
     project_matches,
     wavelet_energy,
 )
+from jaxsmw.core.products import product
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.spectrum import Spectrum
@@ -156,7 +157,7 @@ class NearestOrthogonal(Solution):
         """The polar factor, by a singular value decomposition."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
-        return left @ right, result
+        return product(left, right), result
 
 
 class LeastSquares(Solution):
@@ -245,10 +246,10 @@ class DescriptorPair(eqx.Module):
             dual = dual_eigenvectors(spectrum, "area")
 
             def multiply(f: Array, dual: Array = dual, phi: Array = spectrum.eigenvectors) -> Array:
-                return (dual * f[:, None]).T @ phi
+                return product((dual * f[:, None]).T, phi)
 
             # One at a time: side by side they would take d arrays of the eigenvectors' size.
-            sides.append((dual.T @ values, jax.lax.map(multiply, values.T) if operators else None))
+            sides.append((product(dual.T, values), jax.lax.map(multiply, values.T) if operators else None))
         (coefficients_x, operators_x), (coefficients_y, operators_y) = sides
         return cls(coefficients_x, coefficients_y, operators_x, operators_y)
 
@@ -395,14 +396,14 @@ class RegularizedLeastSquares(Solution):
                 )
             size = jnp.sum(f_out**2)
             weight = self.descriptor_preservation.astype(dtype) * k_out / size
-            columns += weight * QuadraticEnergy(f_in @ f_in.T, f_out @ f_in.T, size)
+            columns += weight * QuadraticEnergy(product(f_in, f_in.T), product(f_out, f_in.T), size)
 
         # The Cholesky factor has the same inner products as all the columns that were summed over, so it
         # can stand for them. A ridge below rounding lets it exist also where other terms have to decide.
         ridge = columns.rounding()
         factor = jnp.linalg.cholesky(columns.gram + ridge * jnp.eye(k_in, dtype=dtype))
         target = jsp.linalg.solve_triangular(factor, columns.cross.T, lower=True).T
-        terms = [lambda c: c @ factor - target]
+        terms = [lambda c: product(c, factor) - target]
         curvature = jnp.broadcast_to(jnp.diagonal(columns.gram)[None, :], (k_out, k_in))
         if self.laplacian_commutativity is not None:
             largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
@@ -413,15 +414,17 @@ class RegularizedLeastSquares(Solution):
         if self.orthogonality is not None:
             root = jnp.sqrt(self.orthogonality.astype(dtype))
             identity = jnp.eye(min(k_out, k_in), dtype=dtype)
-            terms.append(lambda c: root * ((c.T @ c if k_in <= k_out else c @ c.T) - identity))
+            terms.append(
+                lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity)
+            )
         if self.descriptors is not None and self.descriptor_commutativity is not None:
             operators: Any = self.descriptors.operators(convention)
             d_out, d_in = operators
             scale = jnp.sqrt(self.descriptor_commutativity.astype(dtype) * k_out / jnp.sum(d_out**2))
-            terms.append(lambda c: scale * (c[None] @ d_in - d_out @ c[None]))
+            terms.append(lambda c: scale * (product(c[None], d_in) - product(d_out, c[None])))
             diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
             squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
-            curvature = curvature + scale**2 * (squares - 2 * diagonal_out.T @ diagonal_in)
+            curvature = curvature + scale**2 * (squares - 2 * product(diagonal_out.T, diagonal_in))
 
         # In units in which the quadratic terms curve the same everywhere, conjugate gradients take few steps.
         determined = curvature > ridge
