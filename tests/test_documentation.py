@@ -5,14 +5,19 @@ The notebooks run when the site is built (`.ci/run`), which also checks names an
 
 import argparse
 import ast
+import importlib
+import inspect
+import pkgutil
 import re
 import shlex
 from pathlib import Path
+from typing import get_type_hints
 
 import jax
 import numpy as np
 import pytest
 
+import jaxsmw
 from jaxsmw import RESULTS, GroundTruth, creature_pair, geodesic_error, write_mesh
 from jaxsmw.cli import _parser
 
@@ -138,3 +143,17 @@ def test_links_lead_to_files(page):
         path = target.partition("#")[0]
         if path and not re.match(r"\w+:", path):
             assert ((ROOT / page).parent / path).exists(), f"{page} leads to {target}, which is not there"
+
+
+def test_annotations_mean_something():
+    """What annotations name is imported; where drawing has matplotlib's types, only for type checkers."""
+    resolved = 0
+    for module in pkgutil.walk_packages(jaxsmw.__path__, "jaxsmw."):
+        if module.name.startswith(("jaxsmw.report", "jaxsmw.cli", "jaxsmw.__main__")):
+            continue
+        for _, member in inspect.getmembers(importlib.import_module(module.name), inspect.isroutine):
+            function = inspect.unwrap(member)
+            if inspect.isfunction(function) and function.__module__ == module.name:
+                get_type_hints(function)
+                resolved += 1
+    assert resolved > 200
