@@ -7,6 +7,7 @@
   several ways to have them, and against a plain argmin over stored distances;
 - `eigenbasis`: 100 eigenpairs, exact and approximate, against SciPy's shift-invert `eigsh` with its defaults,
   in CPU time; with the approximate eigenvalues' errors;
+- `side_by_side_eigenbases`: those of both shapes in the time of one, in threads and by processes;
 - `stages`: what else the host does for one shape;
 - `command`: from starting Python to the map on the disk, with and without compiled programs from before;
 - `peers`: from two mesh files to the refined map, and refinement alone, against pyFM and geomfum where they
@@ -70,7 +71,7 @@ from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
 from jaxsmw.starts import initial_map
-from jaxsmw.threads import one_blas_thread
+from jaxsmw.threads import one_blas_thread, side_by_side
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
@@ -222,6 +223,55 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
             compared(seconds, "SciPy's eigsh"),
             {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
         )
+
+
+def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
+    """Of two shapes at once, in wall time: in threads, as `match` does, and by processes that wait for it."""
+    for size in options.sizes:
+        pair = creature_pair(vertices=size)
+        meshes = [pair.source, pair.target]
+        spawned = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(2, spawned, initializer=keep, initargs=(meshes,)) as pool:
+            keep(meshes)
+
+            def by_processes(pool=pool) -> object:
+                return list(pool.map(eigenbasis_in_one_thread, range(2)))
+
+            seconds = medians(
+                {
+                    "one": partial(eigenbasis_in_one_thread, 0),
+                    "both, in threads": lambda: side_by_side(eigenbasis_of, 0, 1),
+                    "both, by two processes": by_processes,
+                },
+                options.repeats,
+            )
+        m, n = (len(mesh.vertices) for mesh in meshes)
+        yield (
+            f"Eigenbases side by side, {m} and {n} vertices",
+            f"{EIGENVECTORS} eigenpairs, one BLAS thread each, wall time.",
+            compared(seconds, "one"),
+            {"vertices": [m, n], "seconds": seconds},
+        )
+
+
+kept_meshes: list[Mesh] = []
+"""Those of a process that computes eigenbases when told."""
+
+
+def keep(meshes: Sequence[Mesh]) -> None:
+    """What a process begins with."""
+    kept_meshes[:] = meshes
+
+
+def eigenbasis_of(number: int) -> None:
+    """Of one of the `kept_meshes`."""
+    eigenpairs(kept_meshes[number], EIGENVECTORS)
+
+
+def eigenbasis_in_one_thread(number: int) -> None:
+    """The same where nobody else has limited threads."""
+    with one_blas_thread():
+        eigenbasis_of(number)
 
 
 def stages(options: argparse.Namespace) -> Iterator[Part]:
@@ -639,7 +689,10 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     plt.close(figure)
 
 
-PARTS = {part.__name__: part for part in (refinement, eigenbasis, stages, command, peers, scale)}
+PARTS = {
+    part.__name__: part
+    for part in (refinement, eigenbasis, side_by_side_eigenbases, stages, command, peers, scale)
+}
 
 
 def main() -> None:
