@@ -257,6 +257,7 @@ def _parser() -> argparse.ArgumentParser:
     spectrum.add_argument("--figure", metavar="FILE", help="draw the filter bank over the eigenvalues")
     _add_eigenproblem(spectrum)
     _add_reading(spectrum, indices=False)
+    spectrum.set_defaults(page=None)
     _add_common(spectrum, _spectrum)
 
     render = commands.add_parser("render", help="draw a mesh, or a correspondence by its colours")
@@ -687,9 +688,7 @@ def _refuse_without_effect(options: argparse.Namespace, what_for: str, is_given:
 
 def _evaluate(options: argparse.Namespace) -> None:
     _refuse_without_effect(options, "--evaluation-samples", bool(options.evaluation_samples), "seed")
-    for output in filter(None, (options.output, options.figure, options.page)):
-        _keep_inputs(output, options.source, options.target, *options.map, *options.ground_truth)
-    _check_outputs(options)
+    _check_outputs(options, options.source, options.target, *options.map, *options.ground_truth)
     if options.page:
         from jaxsmw.report.figures import check_drawable
 
@@ -783,8 +782,10 @@ def _match_outputs(options: argparse.Namespace) -> list[str]:
     return paths
 
 
-def _check_outputs(options: argparse.Namespace) -> None:
-    """Refuse places that cannot be written to before there is anything to write."""
+def _check_outputs(options: argparse.Namespace, *inputs: str) -> None:
+    """Refuse what is read and places that cannot be written to before there is anything to write."""
+    for output in filter(None, (options.output, options.figure, options.page)):
+        _keep_inputs(output, *inputs)
     if options.output:
         check_writable(options.output)
     if options.figure:
@@ -813,9 +814,7 @@ def _errors(
 
 
 def _spectrum(options: argparse.Namespace) -> None:
-    for output in filter(None, (options.output, options.figure)):
-        _keep_inputs(output, options.mesh)
-    _check_outputs(options)
+    _check_outputs(options, options.mesh)
     if options.output:
         from jaxsmw.exchange import check_spectrum_path
 

@@ -36,7 +36,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
     try:
-        check_writable(path)
+        _check_target(path)
         temporary.touch(exist_ok=False)
         yield temporary
         os.replace(temporary, target)
@@ -55,6 +55,16 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
     `InputError` if there is no such directory, or it or the file in it may not be written to.
     """
+    _check_target(path)
+    try:  # permissions do not tell all
+        with tempfile.TemporaryFile(dir=Path(os.path.realpath(path)).parent):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _check_target(path: str | os.PathLike[str]) -> None:
+    """Refuse what no file can or may be put in place of."""
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise InputError(
@@ -65,11 +75,6 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise InputError(f"{path}: cannot be written because it is not a file: choose another name.")
     if target.exists() and not os.access(target, os.W_OK):
         raise InputError(f"{path}: is write-protected: choose another name or change permissions.")
-    try:  # permissions do not tell all
-        with tempfile.TemporaryFile(dir=target.parent):
-            pass
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def _unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
