@@ -759,6 +759,11 @@ def _match_outputs(options: argparse.Namespace) -> list[str]:
     points = options.surface_points
     if points and Path(points).suffix != ".baryc_gt":
         raise InputError(f"{points}: points are written as .baryc_gt; choose a name that ends in it.")
+    expected = options.expected_error
+    if expected and Path(expected).suffix in (".npy", ".mat"):
+        raise InputError(
+            f"{expected}: expected errors are written as text; choose another name, such as .txt."
+        )
     from jaxsmw.evaluation.ground_truth import check_map_name
 
     for path in filter(None, (options.output, options.one_to_one)):

@@ -648,6 +648,7 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --precision float16", "float16"),
         ("match {x} {y} --output {t}/m --evaluation-samples -3", "at least 1"),
         ("match {x} {y} --output {x}", "would be overwritten"),
+        ("match {x} {y} --output {t}/m --expected-error {t}/e.npy", "written as text"),
         (
             "match {x} {y} --output {p}/../{p.name}/truth.txt --ground-truth {p}/truth.txt",
             "would be overwritten",
