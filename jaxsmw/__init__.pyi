@@ -1,7 +1,4 @@
-from .core.batch import refine_pairs, stack
-from .core.compilation import compiler_options
-from .core.feature_regression import FeatureRegression
-from .core.filters import (
+from .core.banks.filters import (
     ControlPoints,
     CubicSpline,
     ExponentialWindow,
@@ -30,7 +27,8 @@ from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
-from .core.registration import Registration
+from .core.refiners.feature_regression import FeatureRegression
+from .core.refiners.registration import Registration
 from .core.results import RESULTS
 from .core.search import approximate_nearest_neighbor, nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -61,24 +59,26 @@ from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
 from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
-from .exchange import (
+from .geometry.assignment import one_to_one_map
+from .geometry.creature import CreaturePair, creature_pair
+from .geometry.eigenbasis import compute_spectrum
+from .geometry.geodesics import SurfacePoints, geodesic_distances
+from .geometry.mesh import Mesh, diagnose, make_mesh
+from .geometry.sampling import farthest_point_samples
+from .geometry.shot import shot_descriptors
+from .initial_maps.starts import initial_map
+from .io.exchange import (
     make_spectrum,
     read_functional_map,
     read_spectrum,
     write_functional_map,
     write_spectrum,
 )
-from .geometry.assignment import one_to_one_map
-from .geometry.creature import CreaturePair, creature_pair
-from .geometry.eigenbasis import compute_spectrum
-from .geometry.geodesics import SurfacePoints, geodesic_distances
-from .geometry.mesh import Mesh, diagnose, make_mesh
-from .geometry.mesh_files import read_mesh, write_mesh
-from .geometry.sampling import farthest_point_samples
-from .geometry.shot import shot_descriptors
+from .io.mesh_files import read_mesh, write_mesh
 from .matching import Correspondence, match, paired_spectra
 from .presets import PRESETS, Stage
-from .starts import initial_map
+from .runtime.batches import refine_pairs, stack
+from .runtime.compilation import compiler_options
 
 __version__: str
 __all__ = [

@@ -16,7 +16,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, units_of_length
 from jaxsmw.geometry.sampling import Samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
-from jaxsmw.threads import side_by_side
+from jaxsmw.runtime.threads import side_by_side
 
 
 class Compared(NamedTuple):

@@ -18,8 +18,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.core.batch import pad_rows, padded_size
-from jaxsmw.core.compilation import compile_ahead, compiled, release_programs
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.refinement import Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
@@ -31,14 +29,16 @@ from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
-from jaxsmw.geometry.faults import expected_error
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.initial_maps.starts import Start, initial_map, other_starts
 from jaxsmw.presets import SUSPICIOUS, Preset, Stage, chosen_stages, common_range, refine_in_stages
-from jaxsmw.starts import Start, initial_map, other_starts
-from jaxsmw.threads import one_blas_thread, side_by_side
+from jaxsmw.repair.faults import expected_error
+from jaxsmw.runtime.batches import pad_rows, padded_size
+from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
+from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 logger = logging.getLogger("jaxsmw")
 
@@ -59,7 +59,7 @@ class Correspondence:
     - `refinement`: the outcome of the last stage, with its history if asked for.
     - `iterations`: how many were done, in all stages.
     - `flaw`: how much the map stretches X and turns it inside out, 1 for isometries
-      (`jaxsmw.geometry.faults.flaw`); None where the preset does not look.
+      (`jaxsmw.repair.faults.flaw`); None where the preset does not look.
     - `suspicious`: whether limbs may be swapped, or the body turned round, by that.
     - `partial`: whether one shape is a part of the other.
     - `seconds`: wall time of each part. The first refinement of a size includes its compilation.
@@ -152,7 +152,7 @@ class Correspondence:
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """For every vertex of X how far its match may be from the truth, in square roots of Y's area.
 
-        No truth is needed: `jaxsmw.geometry.faults.expected_error` explains, the way back is what the last
+        No truth is needed: `jaxsmw.repair.faults.expected_error` explains, the way back is what the last
         stage finds. A vertex of X that no face uses gets that of the nearest one that a face does use.
         """
         with self._precision():
@@ -227,7 +227,7 @@ def match(
       begin with; an array (m,) of vertices of Y, or m `SurfacePoints`, for a map of your own;
       an array (l, 2) of landmarks, a vertex of X and one of Y in each row, for nearest neighbours in SHOT
       and in geodesic distance to the landmarks (a few, on both sides of the body). After `"shot"` presets
-      that mend try `jaxsmw.starts.other_starts`, too, if it looks as if limbs were still swapped.
+      that mend try `other_starts`, too, if it looks as if limbs were still swapped.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
       (Presets tell their refiners; tell one of your own, as in `Registration(partial=True)`.)

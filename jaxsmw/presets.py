@@ -13,18 +13,18 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int64
 
-from jaxsmw.core.batch import pad_rows
-from jaxsmw.core.coarse_to_fine import CoarseToFine
-from jaxsmw.core.compilation import compiled
-from jaxsmw.core.feature_regression import FeatureRegression, Regression
 from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreservation, refine
-from jaxsmw.core.registration import Registration
+from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression, Regression
+from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.faults import alike, distinct, flaw, reversed_orientation, torn_off
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.repair.faults import alike, distinct, flaw, reversed_orientation, torn_off
+from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.runtime.compilation import compiled
 
 logger = logging.getLogger("jaxsmw")
 
@@ -200,7 +200,7 @@ class Outcome(NamedTuple):
 
     - `refinements`: of each stage, up to the first that failed.
     - `initial_map`: the start that led there.
-    - `flaw`: `jaxsmw.geometry.faults.flaw` of the last map; None where no stage mends.
+    - `flaw`: `jaxsmw.repair.faults.flaw` of the last map; None where no stage mends.
     - `suspicious`: whether limbs may still be swapped, by that.
     """
 
@@ -235,7 +235,7 @@ def refine_in_stages(
 
     Symmetric limbs that a start has swapped stay swapped: each fits where the other belongs, but for its
     left and right, and for where it joins the body. If a stage mends, the outcome is looked at for both
-    (`jaxsmw.geometry.faults`), and let be if it looks right. Otherwise that stage and those after it are gone
+    (`jaxsmw.repair.faults`), and let be if it looks right. Otherwise that stage and those after it are gone
     through in rounds, each begun from a functional map in which the last one's faults had no say, one kind by
     turns; and at last, from the least doubtful outcome, with `mending` in its place. What that leads to is
     kept if it looks right, the less doubtful of both otherwise; and if that does not look right, other starts
@@ -296,7 +296,7 @@ def refine_in_stages(
 def doubt(outcome: Outcome) -> float:
     """How doubtful an outcome is beside others of the same two shapes: the less, the better.
 
-    The logarithm of its `jaxsmw.geometry.faults.flaw`, and the uncertainty of `FeatureRegression`, if that
+    The logarithm of its `jaxsmw.repair.faults.flaw`, and the uncertainty of `FeatureRegression`, if that
     was among the stages.
     """
     if not outcome.successful:

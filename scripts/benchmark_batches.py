@@ -23,10 +23,10 @@ from benchmark_speed import ITERATIONS, medians, random_spectrum
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsmw.core.batch import bytes_per_pair, refine_pairs, stack
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.report.summary import provenance
+from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
 

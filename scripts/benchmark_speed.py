@@ -53,25 +53,25 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refiner, Search, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.files import make_directory
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import Eigensolver, compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.initial_maps.starts import initial_map
+from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.matching import match, paired_spectra
 from jaxsmw.presets import PRESETS, Preset, Stage
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
-from jaxsmw.starts import initial_map
-from jaxsmw.threads import one_blas_thread, side_by_side
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.files import make_directory
+from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)

@@ -32,12 +32,12 @@ from tqdm import tqdm
 from jaxsmw import InputError, geodesic_error, match, read_mesh
 from jaxsmw.evaluation.benchmark import choose_pairs
 from jaxsmw.evaluation.datasets import DataPair, DataSet, open_data_set
-from jaxsmw.files import atomic_write
-from jaxsmw.geometry.faults import flaw, stretch
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.provenance import made_with
+from jaxsmw.repair.faults import flaw, stretch
 from jaxsmw.report.tables import markdown
+from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
 # What the preset does after its first stage, without looking for mirrored limbs.

@@ -27,8 +27,8 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
-from jaxsmw.files import atomic_write
 from jaxsmw.report.figures import draw_correspondence
+from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"

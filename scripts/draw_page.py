@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from jaxsmw.files import atomic_write
+from jaxsmw.runtime.files import atomic_write
 
 WIDTH, HEIGHT = 1280, 770
 

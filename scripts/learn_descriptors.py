@@ -70,8 +70,8 @@ from jaxsmw.core.products import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.files import atomic_write
 from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
 # Of the parts of the loss without labels that are no lengths.

@@ -59,10 +59,10 @@ from jaxsmw import (
     read_mesh,
     refine_softly,
 )
-from jaxsmw.core.filters import FilterBank, Power, Warped
+from jaxsmw.core.banks.filters import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.files import atomic_write
+from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6
 TEMPERATURE, LEARNING_RATE, FLOOR = 0.1, 0.3, 0.05

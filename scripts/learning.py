@@ -22,9 +22,9 @@ from jaxsmw import InputError, Mesh, Spectrum, WaveletPreservation, geodesic_err
 from jaxsmw.evaluation.datasets import DataPair, open_data_set
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.evaluation.journal import Journal, claimed_directory
-from jaxsmw.files import atomic_write, make_directory
-from jaxsmw.provenance import code_digest, commit, machine, made_with, measured_code, versions
 from jaxsmw.report.tables import markdown
+from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, measured_code, versions
 
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10

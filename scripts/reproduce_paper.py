@@ -36,12 +36,12 @@ from scipy.spatial import KDTree
 from jaxsmw import InputError
 from jaxsmw.evaluation.benchmark import Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
-from jaxsmw.evaluation.opponents import METHODS, Method, Published, suited_methods
+from jaxsmw.evaluation.opponents.opponents import METHODS, Method, Published, suited_methods
 from jaxsmw.evaluation.workers import open_executor
-from jaxsmw.files import atomic_write, make_directory
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.report.tables import MethodSummary, markdown, write_tables
+from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")
 # How many pairs of each set fig9 takes of those that the other experiments take.

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core import batch
-from jaxsmw.core.batch import bytes_per_pair, padded_size, refine_pairs, stack
-from jaxsmw.core.filters import CubicSpline
+from jaxsmw.core.banks.filters import CubicSpline
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
+from jaxsmw.runtime import batches as batch
+from jaxsmw.runtime.batches import bytes_per_pair, padded_size, refine_pairs, stack
 
 SIZES = 150, 170, 260, 300
 PAIRS = [(0, 1), (1, 0), (2, 3), (0, 3), (1, 1), (0, 1), (3, 2)]
@@ -194,7 +194,7 @@ if int(processes) > 1:
     jax.distributed.initialize(address, int(processes), int(process))
 import numpy as np
 from test_batch import PAIRS, make_problem
-from jaxsmw.core.batch import refine_pairs
+from jaxsmw.runtime.batches import refine_pairs
 spectra, starts = make_problem()
 assert len(jax.devices()) == 4, jax.devices()
 found = dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))

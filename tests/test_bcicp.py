@@ -10,9 +10,9 @@ from synthetic import bumpy_mesh, grid_mesh
 import jaxsmw
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation import bcicp as steps
-from jaxsmw.evaluation.bcicp import bcicp
 from jaxsmw.evaluation.datasets import open_data_set
+from jaxsmw.evaluation.opponents import bcicp as steps
+from jaxsmw.evaluation.opponents.bcicp import bcicp
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 
 K = 20

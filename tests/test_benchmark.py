@@ -23,17 +23,17 @@ from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError
-from jaxsmw.cli import main
+from jaxsmw.cli.main import main
 from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation import benchmark
 from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
 from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents import METHODS, Method, PreparedPair, find_methods
+from jaxsmw.evaluation.opponents.opponents import METHODS, Method, PreparedPair, find_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.mesh_files import write_mesh
-from jaxsmw.provenance import measured_code
+from jaxsmw.io.mesh_files import write_mesh
 from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
+from jaxsmw.runtime.provenance import measured_code
 
 
 @pytest.fixture(scope="module")

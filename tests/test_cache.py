@@ -14,9 +14,9 @@ import pytest
 from synthetic import sphere_mesh
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.cache import cached, keep_programs
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.mesh_files import write_mesh
+from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.runtime.cache import cached, keep_programs
 
 INPUT = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}

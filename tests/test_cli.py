@@ -16,12 +16,12 @@ import scipy.io
 import trimesh
 from synthetic import bumpy_mesh, grid_mesh
 
-from jaxsmw.cli import _BANKS, _NOT_TIGHT, main
-from jaxsmw.core import filters
+from jaxsmw.cli.main import _BANKS, _NOT_TIGHT, main
+from jaxsmw.core.banks import filters
 from jaxsmw.core.frames import frame_bounds
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.report.texture import TEXTURE_FILES
 
 SMALL = ["--eigenvectors", "20", "--filters", "4"]
@@ -71,8 +71,8 @@ def mean_error(line: str) -> float:
 
 def test_help_of_every_command_without_loading_jax():
     code = (
-        "import sys, jaxsmw.cli\n"
-        "try: jaxsmw.cli.main(['--help'])\n"
+        "import sys, jaxsmw.cli.main\n"
+        "try: jaxsmw.cli.main.main(['--help'])\n"
         "finally: assert 'jax' not in sys.modules and 'scipy' not in sys.modules"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -716,7 +716,7 @@ def test_an_interrupted_run_ends_soon_and_leaves_nothing_behind(pair, tmp_path):
     # A test run in the background ignores the signal, and so would its children.
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from jaxsmw.cli import main; main(sys.argv[1:])"
+        "from jaxsmw.cli.main import main; main(sys.argv[1:])"
     )
     command = [
         sys.executable, "-c", program, "match", pair / "x.off", pair / "y.ply",

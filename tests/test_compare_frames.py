@@ -23,7 +23,7 @@ from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
 import jaxsmw
-from jaxsmw.core.filters import CubicSpline, Gabor, Meyer
+from jaxsmw.core.banks.filters import CubicSpline, Gabor, Meyer
 from jaxsmw.core.frames import tighten
 from jaxsmw.core.functional_map import multiscale_kernel
 from jaxsmw.core.refinement import WaveletPreservation
@@ -32,8 +32,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.journal import Journal, claimed_directory
 from jaxsmw.evaluation.metrics import geodesic_error
-from jaxsmw.provenance import code_digest
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
+from jaxsmw.runtime.provenance import code_digest
 
 SCRIPTS = Path(compare_frames.__file__).parent
 FILTERS = 4

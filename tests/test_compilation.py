@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxsmw import compiler_options, nearest_neighbor
-from jaxsmw.core import compilation
-from jaxsmw.core.compilation import compile_ahead, compiled, release_programs
+from jaxsmw.runtime import compilation
+from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
 
 
 @pytest.fixture

@@ -10,7 +10,12 @@ from scipy.spatial.distance import cdist
 
 from jaxsmw import decode, encode
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.cpd import DriftRecovery, coherent_point_drift, kernel_factor, recover_by_drift
+from jaxsmw.evaluation.opponents.cpd import (
+    DriftRecovery,
+    coherent_point_drift,
+    kernel_factor,
+    recover_by_drift,
+)
 
 
 def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):

@@ -14,8 +14,8 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh
-from jaxsmw.threads import side_by_side
+from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.runtime.threads import side_by_side
 
 
 @pytest.fixture(autouse=True)

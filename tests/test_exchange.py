@@ -136,7 +136,7 @@ def test_what_is_no_mesh_is_told(given, fault):
 
 def test_the_package_imports_none_of_them():
     code = (
-        "import jaxsmw, jaxsmw.exchange, jaxsmw.matching, sys;"
+        "import jaxsmw, jaxsmw.io.exchange, jaxsmw.matching, sys;"
         "print([name for name in ('pyFM', 'geomfum', 'trimesh', 'pyvista', 'torch', 'potpourri3d') "
         "if name in sys.modules])"
     )

@@ -5,9 +5,9 @@ import pytest
 from synthetic import body_with_arms, sphere_mesh
 
 from jaxsmw import creature_pair
-from jaxsmw.geometry.extremities import extremities, likely_pairings
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.repair.extremities import extremities, likely_pairings
 
 
 @pytest.fixture(scope="module")

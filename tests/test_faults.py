@@ -8,9 +8,9 @@ from synthetic import body_with_arms, bumpy_mesh
 
 from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.faults import alike, expected_error, flaw, reversed_orientation, stretch, torn_off
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import spread_edges
+from jaxsmw.repair.faults import alike, expected_error, flaw, reversed_orientation, stretch, torn_off
 
 
 @pytest.fixture(scope="module")

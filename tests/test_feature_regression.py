@@ -9,8 +9,8 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum
 
-from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 

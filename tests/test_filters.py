@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from pygsp import filters as pygsp_filters
 from pygsp import graphs as pygsp_graphs
 
-from jaxsmw.core.filters import (
+from jaxsmw.core.banks.filters import (
     ControlPoints,
     CubicSpline,
     ExponentialWindow,

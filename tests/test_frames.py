@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxsmw.core.filters import (
+from jaxsmw.core.banks.filters import (
     CubicSpline,
     FilterBank,
     Gabor,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.filters import Meyer
+from jaxsmw.core.banks.filters import Meyer
 from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
     QuadraticEnergy,

@@ -16,11 +16,10 @@ from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw import descriptors, matching, presets
-from jaxsmw import threads as threads_module
 from jaxsmw.core import refinement
-from jaxsmw.core.feature_regression import FeatureRegression
-from jaxsmw.core.filters import Meyer
+from jaxsmw.core.banks.filters import Meyer
 from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
@@ -29,9 +28,10 @@ from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.initial_maps.starts import initial_map, other_starts
 from jaxsmw.matching import match, paired_spectra
 from jaxsmw.presets import Stage, chosen_stages
-from jaxsmw.starts import initial_map, other_starts
+from jaxsmw.runtime import threads as threads_module
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
 OPTIONS = {"preset": STAGE}

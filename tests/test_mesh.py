@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_directory, check_writable
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, diagnose, make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 OCTAHEDRON = make_mesh(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],

@@ -10,8 +10,8 @@ from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents import METHODS, PreparedPair, Refined, Start, ZoomOut
-from jaxsmw.evaluation.peers import installed_peers
+from jaxsmw.evaluation.opponents.opponents import METHODS, PreparedPair, Refined, Start, ZoomOut
+from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 
 M, N, K = 200, 180, 40

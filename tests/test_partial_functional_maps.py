@@ -11,18 +11,22 @@ import pytest
 from synthetic import grid_mesh, random_spectrum
 
 import jaxsmw
-from jaxsmw.core.compilation import compiled
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation import partial_functional_maps as steps
 from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.evaluation.opponents import METHODS, PreparedPair, suited_methods
-from jaxsmw.evaluation.partial_functional_maps import PartialMap, SurfaceGradient, partial_functional_map
+from jaxsmw.evaluation.opponents import partial_functional_maps as steps
+from jaxsmw.evaluation.opponents.opponents import METHODS, PreparedPair, suited_methods
+from jaxsmw.evaluation.opponents.partial_functional_maps import (
+    PartialMap,
+    SurfaceGradient,
+    partial_functional_map,
+)
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import paired_spectra
+from jaxsmw.runtime.compilation import compiled
 
 K, D = 40, 8
 

@@ -9,11 +9,11 @@ from scipy.spatial import KDTree
 from synthetic import body_with_arms
 
 from jaxsmw import presets
-from jaxsmw.core.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.faults import flaw
 from jaxsmw.matching import match
 from jaxsmw.presets import Stage, refine_in_stages
+from jaxsmw.repair.faults import flaw
 from jaxsmw.report.summary import summarize
 
 STAGE = Stage(FeatureRegression((20, 20, 40, 40)), 40, iterations=4)

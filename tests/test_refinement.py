@@ -12,11 +12,11 @@ import pytest
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.feature_regression import FeatureRegression
-from jaxsmw.core.filters import CubicSpline, FilterBank, Meyer
+from jaxsmw.core.banks.filters import CubicSpline, FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum

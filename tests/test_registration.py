@@ -10,9 +10,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.refinement import WaveletPreservation, refine
-from jaxsmw.core.registration import Registration, _nearest_rotations
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration, _nearest_rotations
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair

@@ -24,14 +24,14 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from synthetic import grid_mesh, random_spectrum, sphere_mesh
 
-from jaxsmw.core.filters import Meyer
+from jaxsmw.core.banks.filters import Meyer
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.mesh_files import read_mesh
+from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.report import colors, figures, rendering
 from jaxsmw.report import page as page_module
 from jaxsmw.report.figures import (

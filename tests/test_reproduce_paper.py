@@ -15,9 +15,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import reproduce_paper
 
 from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents import METHODS
+from jaxsmw.evaluation.opponents.opponents import METHODS
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.mesh_files import read_mesh, write_mesh
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsmw.core.banks.filters import FilterBank, sample_bank
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.filters import FilterBank, sample_bank
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:

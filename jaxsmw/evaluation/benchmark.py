@@ -21,8 +21,6 @@ import numpy as np
 from jaxtyping import Array, Int, Int64
 from tqdm import tqdm
 
-from jaxsmw.core.batch import pad_rows, padded_size
-from jaxsmw.core.compilation import release_programs
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
@@ -34,7 +32,7 @@ from jaxsmw.evaluation.datasets import DataPair, DataSet, read_pairs
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.journal import Journal, Row, claimed_directory
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
-from jaxsmw.evaluation.opponents import (
+from jaxsmw.evaluation.opponents.opponents import (
     FIRST_EIGENVECTORS,
     MOST_EIGENVECTORS,
     MOST_SAMPLES,
@@ -45,16 +43,18 @@ from jaxsmw.evaluation.opponents import (
     read_published_map,
 )
 from jaxsmw.evaluation.workers import run_tasks
-from jaxsmw.geometry.cache import recomputing
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.mesh_files import read_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.initial_maps.starts import Start, initial_map, other_starts
+from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.matching import paired_spectra
-from jaxsmw.provenance import code_digest, commit, machine, measured_code, versions
-from jaxsmw.starts import Start, initial_map, other_starts
-from jaxsmw.threads import one_blas_thread
+from jaxsmw.runtime.batches import pad_rows, padded_size
+from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.compilation import release_programs
+from jaxsmw.runtime.provenance import code_digest, commit, machine, measured_code, versions
+from jaxsmw.runtime.threads import one_blas_thread
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
 """Where correspondence quality curves are kept, in square roots of the area."""
@@ -195,7 +195,7 @@ def run_benchmark(
 
     - `data_set`, `pairs`: what to match, of which data set.
     - `output`: a directory that exists; gets `results.csv`, `shapes.csv` and `provenance.json`.
-    - `methods`: by the names that they get in tables; for example `jaxsmw.evaluation.opponents.METHODS`.
+    - `methods`: by the names that they get in tables; for example `METHODS`.
     - `settings`: must be those of results that are there already.
     - `executor`: what works.
 

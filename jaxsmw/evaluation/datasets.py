@@ -18,7 +18,7 @@ import numpy as np
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth, IndexBase, read_ground_truth
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.mesh_files import MESH_SUFFIXES
+from jaxsmw.io.mesh_files import MESH_SUFFIXES
 
 
 @dataclass(frozen=True)

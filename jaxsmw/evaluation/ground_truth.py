@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.runtime.files import atomic_write
 
 IndexBase = Literal[0, 1]
 

@@ -15,7 +15,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
+from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
 

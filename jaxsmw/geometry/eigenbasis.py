@@ -17,11 +17,11 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.coarsening import coarsen
 from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.threads import one_blas_thread
+from jaxsmw.runtime.cache import cached
+from jaxsmw.runtime.threads import one_blas_thread
 
 # On a surface of area 1, where the first non-zero eigenvalue of a body lies between 1 and 30.
 _SHIFT = -1e-2
@@ -53,7 +53,7 @@ def compute_spectrum(
     fewer dimensions (`jaxsmw.geometry.coarsening`): orthonormal to rounding all the same, in a time nearly
     proportional to the number of vertices. That wants triangles of about one size and shape; where it shows
     that they are not, the exact method takes over with a warning. Results are kept on disk
-    (`jaxsmw.geometry.cache`).
+    (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 

@@ -23,8 +23,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.runtime.cache import cached
 
 GeodesicMethod = Literal["strips", "exact"]
 
@@ -226,7 +226,7 @@ def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
 def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     """The graph of a mesh's edges and of straight lines between vertices through strips of triangles.
 
-    Kept on disk (`jaxsmw.geometry.cache`), and for the last few meshes in memory.
+    Kept on disk (`jaxsmw.runtime.cache`), and for the last few meshes in memory.
 
     **Arguments:**
 

@@ -10,9 +10,9 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.cache import cached
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples
+from jaxsmw.runtime.cache import cached
 
 _AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` counts on the twos
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
@@ -38,7 +38,7 @@ def shot_descriptors(
     Invariant to rotation, translation and scale, but not to reflection, so that it tells left from right.
     Renumbering vertices renumbers descriptors. Normals are turned outwards first (by the sign of the
     enclosed volume), so that an inside-out mesh gives the same. Results are kept on disk
-    (`jaxsmw.geometry.cache`).
+    (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 

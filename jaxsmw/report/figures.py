@@ -13,11 +13,11 @@ from jaxtyping import Array, Float, Float64, Int
 
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_writable
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import PLAIN, error_colors, position_colors
 from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
 from jaxsmw.report.rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
+from jaxsmw.runtime.files import atomic_write, check_writable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,12 +21,12 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.presets import common_range
 from jaxsmw.report.colors import PLAIN, error_colors, position_colors, signed_colors
 from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
 from jaxsmw.report.rendering import ELEVATION, Axis, choose_azimuth, stand_pair
+from jaxsmw.runtime.files import atomic_write
 
 # Of both shapes together a page holds so many values of eigenvectors, a byte each and a third more in
 # base64: as many eigenvectors as the paper has up to 60 000 vertices, and beyond 300 000 none.

@@ -16,18 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from jaxsmw.core.compilation import compiled
-from jaxsmw.core.filters import FilterBank
+from jaxsmw.core.banks.filters import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
-from jaxsmw.files import atomic_write, make_directory
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence, paired_spectra
 from jaxsmw.presets import SUSPICIOUS
-from jaxsmw.provenance import machine, versions
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -38,6 +35,9 @@ from jaxsmw.report.figures import (
 from jaxsmw.report.inputs import check_map
 from jaxsmw.report.page import ShownMap, eigenvectors_on_page, write_page
 from jaxsmw.report.rendering import Axis
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.provenance import machine, versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,9 +13,9 @@ from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings
 from jaxsmw.evaluation.datasets import DataSet
 from jaxsmw.evaluation.intervals import CONFIDENCE, Interval, mean_interval
 from jaxsmw.evaluation.journal import Row
-from jaxsmw.evaluation.opponents import Method
-from jaxsmw.files import atomic_write
+from jaxsmw.evaluation.opponents.opponents import Method
 from jaxsmw.report.figures import draw_quality_curves, save_figure
+from jaxsmw.runtime.files import atomic_write
 
 REFERENCE = "mwp"
 """The method from which the differences of all others are taken."""

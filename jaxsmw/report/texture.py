@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.image import imsave
 
-from jaxsmw.files import atomic_write
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.runtime.files import atomic_write
 
 TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
 """What `write_textured_pair` writes."""

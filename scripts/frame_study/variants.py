@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import brentq
 
-from jaxsmw.core.filters import (
+from jaxsmw.core.banks.filters import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
-from jaxsmw.geometry.mat_files import (
+from jaxsmw.geometry.mesh import Mesh, to_host
+from jaxsmw.io.mat_files import (
     FUNCTIONAL_MAP,
     find_structs,
     is_mat_file,
@@ -28,7 +28,7 @@ from jaxsmw.geometry.mat_files import (
     read_variables,
     write_variables,
 )
-from jaxsmw.geometry.mesh import Mesh, to_host
+from jaxsmw.runtime.files import atomic_write
 
 # A shape of another library, told by its attributes, and a matrix that may be sparse; see `make_spectrum`.
 SpectrumLike: TypeAlias = Any

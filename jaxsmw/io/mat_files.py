@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
+from jaxsmw.runtime.files import atomic_write
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
 

@@ -21,7 +21,7 @@ import numpy as np
 import platformdirs
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
+from jaxsmw.runtime.files import atomic_write
 
 # Part of every key: count it up when what is stored under the same inputs changes.
 _FORMAT = 4

@@ -19,9 +19,9 @@ from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write
-from jaxsmw.geometry.mat_files import find_structs, parse_variables
 from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
+from jaxsmw.io.mat_files import find_structs, parse_variables
+from jaxsmw.runtime.files import atomic_write
 
 # Reading takes up to fifteen times a file's size in memory; text of this size has ten million vertices.
 LARGEST_FILE = 2**30

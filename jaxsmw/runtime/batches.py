@@ -14,10 +14,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Shaped
 
-from jaxsmw.core.compilation import compiled
 from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.threads import one_blas_thread
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.threads import one_blas_thread
 
 # Sizes are rounded up to a multiple of an eighth of the power of two below them, and of the search's block:
 # at most an eighth of a padded shape is padding, and all shapes from 4000 to 16 000 vertices share 17 sizes.

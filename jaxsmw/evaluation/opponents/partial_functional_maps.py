@@ -59,7 +59,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.core.batch import pad_rows, padded_size
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.pointwise_map import decode
@@ -67,8 +66,9 @@ from jaxsmw.core.products import product
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.bcicp import check_spectrum
+from jaxsmw.evaluation.opponents.bcicp import check_spectrum
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.runtime.batches import pad_rows, padded_size
 
 FIDELITY = 60.0
 """What the fidelity term counts beside mu_1 to mu_3, its column norms being averaged."""

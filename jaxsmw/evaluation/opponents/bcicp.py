@@ -31,11 +31,11 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
-from jaxsmw.core.compilation import compiled
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.runtime.compilation import compiled
 
 # Neighbours whose images are farther apart than this, in square roots of the area, are torn: a few edges of
 # a mesh of thousands of vertices, and little against a limb. On a coarse mesh, than two edges.

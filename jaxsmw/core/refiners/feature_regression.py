@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.coarse_to_fine import CoarseToFine, check_descriptors, doubted
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
 from jaxsmw.core.refinement import Problem, Samples
+from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine, check_descriptors, doubted
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum

@@ -13,12 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.core.batch import pad_rows, padded_size
-from jaxsmw.core.compilation import compiled
-from jaxsmw.core.feature_regression import FeatureRegression
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -26,14 +24,16 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import Compared, compared, paired_shot
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.extremities import extremities, likely_pairings
-from jaxsmw.geometry.faults import alike, distinct, flaw
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, extend_to_unused, units_of_length
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.presets import Outcome, Stage, doubt, fitting, run_stage
-from jaxsmw.threads import side_by_side
+from jaxsmw.repair.extremities import extremities, likely_pairings
+from jaxsmw.repair.faults import alike, distinct, flaw
+from jaxsmw.runtime.batches import pad_rows, padded_size
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.threads import side_by_side
 
 Start = Literal["shot", "wks", "hks", "wavelet", "functional"]
 

@@ -14,9 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Int64
 
-from jaxsmw.core.batch import pad_rows
-from jaxsmw.core.compilation import compiled
-from jaxsmw.core.filters import Identity
+from jaxsmw.core.banks.filters import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
@@ -24,13 +22,15 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.bcicp import bcicp
-from jaxsmw.evaluation.cpd import DriftRecovery
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
-from jaxsmw.evaluation.partial_functional_maps import SurfaceGradient, partial_functional_map
+from jaxsmw.evaluation.opponents.bcicp import bcicp
+from jaxsmw.evaluation.opponents.cpd import DriftRecovery
+from jaxsmw.evaluation.opponents.partial_functional_maps import SurfaceGradient, partial_functional_map
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.presets import PRESETS, Preset, Stage, chosen_stages, refine_in_stages
+from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.runtime.compilation import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ def _at(
 
 @dataclass(frozen=True)
 class BCICP(Method):
-    """Bijective and continuous ICP; see `jaxsmw.evaluation.bcicp`."""
+    """Bijective and continuous ICP; see `jaxsmw.evaluation.opponents.bcicp`."""
 
     reference: str
     number_of_eigenvectors: int = 50
@@ -286,7 +286,7 @@ class BCICP(Method):
 
 @dataclass(frozen=True)
 class PartialFunctionalMaps(Method):
-    """Of a part X and a whole Y; see `jaxsmw.evaluation.partial_functional_maps`."""
+    """Of a part X and a whole Y; see `jaxsmw.evaluation.opponents.partial_functional_maps`."""
 
     reference: str
     number_of_eigenvectors: int = 100
@@ -344,7 +344,7 @@ MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.valu
 
 def known_methods() -> dict[str, Method]:
     """Ours, and those of other libraries that are installed."""
-    from jaxsmw.evaluation.peers import installed_peers
+    from jaxsmw.evaluation.opponents.peers import installed_peers
 
     return METHODS | installed_peers()
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from jaxsmw.errors import InputError
-from jaxsmw.files import atomic_write, check_directory, check_writable, make_directory
+from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory
 
 if TYPE_CHECKING:
-    from jaxsmw.core.filters import FilterBank
+    from jaxsmw.core.banks.filters import FilterBank
     from jaxsmw.core.solutions import Solution
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
-            from jaxsmw.geometry.cache import keep_programs
+            from jaxsmw.runtime.cache import keep_programs
 
             keep_programs()
             options.run(options)
@@ -466,7 +466,7 @@ def _benchmark(options: argparse.Namespace) -> None:
             f"benchmarks need {error.name}, which is not installed: pip install 'jaxsmw[benchmark]'"
         ) from error
     from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents import find_methods, suited_methods
+    from jaxsmw.evaluation.opponents.opponents import find_methods, suited_methods
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.tables import markdown_table, write_tables
 
@@ -493,7 +493,7 @@ def _demo(options: argparse.Namespace) -> None:
     check_drawable()
     from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
     from jaxsmw.geometry.creature import creature_pair
-    from jaxsmw.geometry.mesh_files import write_mesh
+    from jaxsmw.io.mesh_files import write_mesh
 
     check_directory(options.output)
     logging.getLogger("jaxsmw").info("making the creature ...")
@@ -821,7 +821,7 @@ def _errors(
 def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options, options.mesh)
     if options.output:
-        from jaxsmw.exchange import check_spectrum_path
+        from jaxsmw.io.exchange import check_spectrum_path
 
         check_spectrum_path(options.output)
     if not options.figure and (options.filters is not None or options.bank is not None):
@@ -830,7 +830,7 @@ def _spectrum(options: argparse.Namespace) -> None:
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
     from jaxsmw.geometry.mesh import diagnose
-    from jaxsmw.geometry.mesh_files import read_mesh
+    from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
@@ -844,7 +844,7 @@ def _spectrum(options: argparse.Namespace) -> None:
     if options.output:
         import jax
 
-        from jaxsmw.exchange import write_spectrum
+        from jaxsmw.io.exchange import write_spectrum
 
         with jax.enable_x64(True):
             write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
@@ -890,7 +890,7 @@ def _render(options: argparse.Namespace) -> None:
 
 def _read(path: str, options: argparse.Namespace) -> Mesh:
     from jaxsmw.geometry.mesh import diagnose
-    from jaxsmw.geometry.mesh_files import read_mesh
+    from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(path, weld=options.weld)
     if not options.quiet:
@@ -918,7 +918,7 @@ def _read_maps(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> dict[
 
 def _index_base(path: str, options: argparse.Namespace) -> Any:
     """What a file counts from, where its form leaves it open; where nobody said it, the user is told."""
-    from jaxsmw.geometry.mat_files import is_mat_file
+    from jaxsmw.io.mat_files import is_mat_file
 
     if options.index_base is None and is_mat_file(path):
         _say(f"note: {path} is read as MATLAB counts, from 1; if it counts from 0, add --index-base 0.")
@@ -941,7 +941,7 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
 
 
 def _bank(options: argparse.Namespace) -> FilterBank:
-    from jaxsmw.core import filters
+    from jaxsmw.core.banks import filters
 
     name = options.bank or _DEFAULT_BANK
     kind = getattr(filters, _BANKS[name])

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 _PACKAGES = ("jaxsmw", "jax", "jaxlib", "numpy", "scipy", "libigl")
-_LIBRARY = Path(__file__).parent
+_LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
@@ -50,7 +50,7 @@ def made_with() -> str:
 
 def measured_code() -> list[Path]:
     """The library's modules on which numbers depend: all but command line and drawing."""
-    left_out = ("report", "cli.py", "__main__.py")
+    left_out = ("report", "cli", "__main__.py")
     return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]
 
 

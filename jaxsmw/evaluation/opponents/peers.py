@@ -18,7 +18,7 @@ from jaxtyping import Array, Float64, Int, Int64
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents import (
+from jaxsmw.evaluation.opponents.opponents import (
     FIRST_EIGENVECTORS,
     LAST_EIGENVECTORS,
     ZOOMOUT_STEP,
