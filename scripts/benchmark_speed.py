@@ -53,7 +53,9 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.refinement import Refiner, Search, WaveletPreservation, refine
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import Search, WaveletPreservation
+from jaxsmw.core.refinement import refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import Eigensolver, compute_spectrum, eigenpairs

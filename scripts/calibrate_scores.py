@@ -77,7 +77,7 @@ def measure(
 def looks(found: Correspondence) -> dict[str, float]:
     """Scores of a map, the smaller the better."""
     meshes, pointwise_map = (found.mesh_x, found.mesh_y), found.pointwise_map
-    regression = match(*meshes, init=pointwise_map, preset=AS_IT_STARTS[0]).refinement.updated
+    regression = match(*meshes, init=pointwise_map, preset=AS_IT_STARTS[0]).refinement.state
     return {
         "stretch": stretch(*meshes, pointwise_map, found.spectrum_x),
         "uncertainty of the regression": float(regression.uncertainty),

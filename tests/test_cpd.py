@@ -180,7 +180,7 @@ def test_refiner_recovers_by_drift(pair):
     """Both half-steps that `refine` repeats."""
     _, x, y = pair
     refiner = DriftRecovery(rank=LOW_RANK, drift_iterations=4)
-    problem = refiner.prepare(x, y)
+    problem = refiner.prepare(Problem(x, y))
     start = jnp.asarray(np.where(np.arange(M) % 3 > 0, ORDER, 0), jnp.int32)
     functional_map, _ = refiner.update(problem, start, None)
     np.testing.assert_allclose(functional_map, encode(start, x, y), atol=1e-12)

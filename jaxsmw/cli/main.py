@@ -599,7 +599,7 @@ def _preset(options: argparse.Namespace) -> Any:
             f"--{option}: changes the paper's method, which --preset {options.preset} is not: leave one of "
             "them out."
         )
-    from jaxsmw.core.refinement import WaveletPreservation
+    from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.presets import Stage
 
     chosen = {name: getattr(options, name) for name in changes}

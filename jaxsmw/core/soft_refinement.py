@@ -13,7 +13,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.core.checks import check_choice, check_kind, counts_iterations
-from jaxsmw.core.refinement import WaveletPreservation, check_spectra, checked, diagnose
+from jaxsmw.core.refinement import check_spectra, checked, diagnose
+from jaxsmw.core.refiner import Problem, State
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
@@ -105,17 +107,17 @@ def refine_softly(
         check_kind("initial map", matches, np.ndarray, jax.Array)
         if matches.shape[0] != m or matches.ndim != 1 + sparse:
             raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
-    problem = refiner.prepare(spectrum_x, spectrum_y)
-    start, result = refiner.update(problem, pointwise_map, None)
-    start_went = checked(start, start, result)
+    prepared = refiner.prepare(Problem(spectrum_x, spectrum_y))
+    first, result = refiner.update(prepared, pointwise_map, None)
+    start, start_went = first.functional_map, checked(first, result)
 
     def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
-        points = refiner.embeddings(problem, functional_map)
+        points = refiner.embeddings(prepared, State(functional_map))
         return recovery(*points, *_areas(spectrum_x, spectrum_y))
 
     def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        following, how = refiner.update(problem, recover(functional_map), functional_map)
-        return following, checked(following, following, how)
+        following, how = refiner.update(prepared, recover(functional_map), State(functional_map))
+        return following.functional_map, checked(following, how)
 
     if differentiation == "implicit":
         last, done, converged = _fixed_point(lambda c: step(c)[0], start, iterations, tolerance)

@@ -62,7 +62,7 @@ def extremities(mesh: Mesh) -> Extremities:
     return Extremities(nodes[ends], distances / unit, remoteness[ends] / unit)
 
 
-def likely_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
+def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
     """Ways to pair the ends of two bodies, the likeliest first: which of X's and which of Y's in each row.
 
     All ends of the body with fewer of them have a partner. The smaller the squared differences of distances

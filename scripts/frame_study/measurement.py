@@ -27,7 +27,8 @@ from frame_study.variants import (
 )
 from jaxsmw import read_mesh
 from jaxsmw.core.banks.filters import FilterBank, Meyer
-from jaxsmw.core.refinement import Problem, Refinement, Refiner, refine
+from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
+from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
@@ -314,25 +315,23 @@ def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list
 
 
 @eqx.filter_jit
-def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Problem:
-    return method.prepare(spectrum_x, spectrum_y)
+def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Prepared:
+    return method.prepare(Problem(spectrum_x, spectrum_y))
 
 
 @eqx.filter_jit
 def _update(
     method: Refiner,
-    problem: Problem,
+    prepared: Prepared,
     pointwise_map: Int32[Array, " m"],
-    previous: Float[Array, "k_out k_in"] | None,
-) -> Float[Array, "k_out k_in"]:
-    return method.update(problem, pointwise_map, previous)[0]
+    previous: State | None,
+) -> State:
+    return method.update(prepared, pointwise_map, previous)[0]
 
 
 @eqx.filter_jit
-def _search(
-    method: Refiner, problem: Problem, functional_map: Float[Array, "k_out k_in"]
-) -> Int32[Array, " m"]:
-    return method.recover(problem, functional_map)
+def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, " m"]:
+    return method.recover(prepared, state)
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
@@ -344,11 +343,11 @@ def measure_times(data: Path, names: list[PairName], wanted: list[Variant], sett
         pair = load_pair(data, name, settings)
         for variant in wanted:
             method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
-            problem = _prepare(method, *pair.spectra)
-            first = _update(method, problem, pair.start, None)
-            following = _search(method, problem, first)
-            candidates[variant] = partial(_update, method, problem, following, first)
-        candidates[SEARCH] = partial(_search, method, problem, first)
+            prepared = _prepare(method, *pair.spectra)
+            first = _update(method, prepared, pair.start, None)
+            following = _search(method, prepared, first)
+            candidates[variant] = partial(_update, method, prepared, following, first)
+        candidates[SEARCH] = partial(_search, method, prepared, first)
         rows += [
             {**name._asdict(), **variant._asdict(), "milliseconds": f"{1e3 * seconds:.4f}"}
             for variant, seconds in medians(candidates, _TIMED_RUNS).items()

@@ -38,7 +38,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.banks.filters import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.products import product
-from jaxsmw.core.refinement import Problem, WaveletPreservation
+from jaxsmw.core.refiner import State
+from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 
@@ -191,12 +192,12 @@ class DriftRecovery(WaveletPreservation):
                 f"DriftRecovery moves Phi_Y C^T: its convention is pullback, not {self.convention}"
             )
 
-    def recover(self, problem: Problem, functional_map: Float[Array, "k_x k_y"]) -> Int32[Array, " m"]:
+    def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
         """See `recover_by_drift`."""
         return recover_by_drift(
-            functional_map,
-            problem.spectrum_x,
-            problem.spectrum_y,
+            state.functional_map,
+            prepared.spectrum_x,
+            prepared.spectrum_y,
             rank=self.rank,
             iterations=self.drift_iterations,
         )
