@@ -152,9 +152,10 @@ def test_functional_map_figure() -> None:
     axes = figure.axes[0]
     assert np.array_equal(axes.images[0].get_array(), matrix)
     assert axes.images[0].get_clim() == (-2, 2)
-    assert (axes.get_ylabel(), axes.get_xlabel()) == ("eigenfunction of X", "eigenfunction of Y")
+    labels = "eigenfunction of X (source)", "eigenfunction of Y (target)"
+    assert (axes.get_ylabel(), axes.get_xlabel()) == labels
     pushed = draw_functional_map(matrix, convention="pushforward").axes[0]
-    assert (pushed.get_ylabel(), pushed.get_xlabel()) == ("eigenfunction of Y", "eigenfunction of X")
+    assert (pushed.get_ylabel(), pushed.get_xlabel()) == labels[::-1]
     # Zero is white. The largest entries are clearly red and blue.
     middle = axes.images[0].to_rgba(matrix)[..., :3]
     assert middle[0, 4].min() > 0.95

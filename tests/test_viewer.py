@@ -249,6 +249,7 @@ def test_colorings(page: OpenPage) -> None:
     page.choose("error-0")
     error = {side: page.view(side) for side in "xy"}
     assert page.find(".errors").text.split("\n") == ["0", "0.1 and above (fraction of √area)", "unknown"]
+    assert page.find("#unknown").size["height"] < 2 * page.find(".errors span").size["height"]
     assert page.state["mode"] == "error-0" and page.find(".scale").is_displayed()
     # The page interpolates on another grid: colours differ by one step of the scale at most.
     values = np.linspace(0, 0.2, len(NUMBER))
@@ -727,7 +728,7 @@ def test_every_control_is_reached_and_worked_by_keys(comparison: OpenPage) -> No
     assert unnamed == 0
 
 
-@pytest.mark.parametrize("mode", ["transfer", "wavelets", "eigenfunctions"])
+@pytest.mark.parametrize("mode", ["transfer", "error-0", "wavelets", "eigenfunctions"])
 def test_a_phone_of_360_pixels(browser: Any, comparison_file: Path, mode: str) -> None:
     feature = {"name": "prefers-reduced-motion", "value": "reduce"}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})

@@ -133,7 +133,9 @@ def draw_functional_map(
     axes = figure.add_subplot()
     limit = np.abs(matrix).max() or 1.0
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-    rows, columns = ("X", "Y") if convention == "pullback" else ("Y", "X")
+    rows, columns = ("X (source)", "Y (target)")
+    if convention == "pushforward":
+        rows, columns = columns, rows
     axes.set_ylabel(f"eigenfunction of {rows}")
     axes.set_xlabel(f"eigenfunction of {columns}")
     axes.xaxis.set_label_position("top")
@@ -197,7 +199,7 @@ def draw_filters(
     )
     axes.set_xlim(grid[0], grid[-1])
     axes.set_ylim(bottom=min(0.0, curves.min()))
-    axes.set_xlabel("λ")
+    axes.set_xlabel("eigenvalue λ")
     axes.set_ylabel("response")
     figure.legend(loc="outside right center", frameon=False, fontsize=8, labelcolor=_INK)
     _style(axes, grid=True)
