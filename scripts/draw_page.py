@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxsmw.runtime.files import atomic_write
 
-WIDTH, HEIGHT = 1280, 770
+WIDTH, HEIGHT = 1280, 850
 
 
 def main() -> None:

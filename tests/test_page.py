@@ -45,7 +45,7 @@ def test_bad_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
             show(TALL, TALL, good, errors={"Error": np.zeros(n)}, error_limit=limit)
 
 
-def test_page_holds_the_data_and_nothing_from_elsewhere(tmp_path: Path) -> None:
+def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
     errors = np.linspace(0, 0.1, len(number))
     named = {"Error": errors, "Expected <error>": errors / 2}
@@ -94,7 +94,7 @@ def test_the_scale_of_errors_is_the_same_for_all_maps(tmp_path: Path, errors: tu
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_pages_without_what_they_need_are_refused() -> None:
+def test_incomplete_pages_are_refused() -> None:
     n = len(TALL.vertices)
     with pytest.raises(InputError, match="no map"):
         write_page(os.devnull, TALL, TALL, {}, title="")

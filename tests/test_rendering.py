@@ -70,7 +70,7 @@ def test_a_picture_depends_on_the_surface_only() -> None:
     other, number = renumbered(mesh)
     order = np.argsort(number)
     assert np.abs(picture(other, color[order]) - expected).max() <= 1
-    # Inside out it is lit the same.
+    # A mesh that is inside out has the same light.
     inside_out = replace(mesh, faces=mesh.faces[:, ::-1])
     assert np.abs(picture(inside_out, color) - expected).max() <= 1
 
@@ -87,10 +87,10 @@ def test_large_and_many_triangles_go_through_any_chunk(monkeypatch: pytest.Monke
     assert (pictures[0][..., 3] == 255).sum() == pytest.approx(100**2 * np.cos(rendering.ELEVATION), rel=0.03)
 
 
-def test_what_reaches_beyond_the_picture_is_cut_off() -> None:
+def test_bodies_larger_than_the_picture_are_cut_off() -> None:
     color = uniform(SPHERE, 0, 1, 0)
     large = render(SPHERE, color, azimuth=0.0, scale=400.0, width=300, height=300)
     small = render(SPHERE, color, azimuth=0.0, scale=400.0, width=100, height=60)
-    # Ambient occlusion apart, of which a convex body has none inside.
+    # Only ambient occlusion may differ; a convex body has it near its outline only.
     assert np.abs(large[120:180, 100:200].astype(int) - small).max() <= 12
     assert np.all(small[..., 3] == 255)

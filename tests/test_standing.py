@@ -29,7 +29,7 @@ def test_stand_turns_the_named_axis_up(up: Any) -> None:
     assert np.allclose(used.min(axis=0), -used.max(axis=0))
 
 
-# Up in each convention, from coordinates with x across the body, y up and z forward.
+# Rotations from y-up coordinates (x across the body, y up, z forward) to each convention.
 FROM_Y_UP = {
     "y": np.eye(3),
     "z": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
@@ -38,7 +38,7 @@ FROM_Y_UP = {
 
 
 def in_convention(mesh: Mesh, up: str) -> Mesh:
-    """A body of a y-up file as files of another convention have it."""
+    """The body of a y-up file, turned as in files of another convention."""
     return replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[up].T)
 
 
@@ -106,7 +106,7 @@ def test_stand_makes_faces_agree() -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_stand_refuses_what_it_cannot_show() -> None:
+def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
     with pytest.raises(InputError, match="nothing to draw"):
         stand(replace(TALL, vertices=0 * TALL.vertices))
     with pytest.raises(InputError, match="choose one of x, y, z"):

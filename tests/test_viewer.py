@@ -66,7 +66,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 class OpenPage:
-    """One page in the browser, seen and used as by a person."""
+    """One page in the browser, with the actions of a user."""
 
     def __init__(self, browser: Any, path: Path, *, width: int = 840, height: int = 600) -> None:
         self.browser, self.path = browser, path
@@ -203,7 +203,7 @@ def test_clicks_on_the_source(page: OpenPage) -> None:
         assert page.readout.startswith(f"Source vertex {vertex} → target vertex {target} · error")
         assert ("error unknown" in page.readout) == (vertex == visible_vertices()[1])
         assert f" · expected error {0.2 * (1 - vertex / (len(NUMBER) - 1)):.4f}" in page.readout
-    # The mark is visible at the vertex of the map.
+    # The mark is visible at the matched vertex.
     x, y = page.place("y", target)
     box = page.find("#canvas-y").rect
     mark = page.view("y")[int(y - box["y"]), int(x - box["x"])]
@@ -212,7 +212,7 @@ def test_clicks_on_the_source(page: OpenPage) -> None:
     assert 0 < differ(before["y"], page.view("y")) < 0.01
 
 
-def test_clicks_on_the_target_show_where_it_comes_from(page: OpenPage) -> None:
+def test_clicks_on_the_target_show_its_source_vertices(page: OpenPage) -> None:
     seen = visible_vertices()
     crowded, deserted, ordinary = NUMBER[seen[[0, 5, 9]]].tolist()
     for vertex, text in (
@@ -471,7 +471,7 @@ def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, 
     assert comparison.state["filter"] == FILTERS - 1
     assert comparison.find("#filter-name").text == f"wavelet {FILTERS - 1} of {FILTERS - 1} (narrowest)"
     assert all(differ(a, b) > 0.02 for a, b in pairwise(views))
-    # For a target vertex, the wavelet on the source is around the vertex that is mapped to it.
+    # If a target vertex is picked, the wavelet on the source is around the vertex that is mapped there.
     target = int(NUMBER[first])
     comparison.point_at(*comparison.place("y", target), click=True)
     exact, bound = wavelets(spectra[0], first)
@@ -751,7 +751,7 @@ def test_a_phone_of_360_pixels(browser: Any, comparison_file: Path, mode: str) -
     vertex = int(visible_vertices()[0])
     page.point_at(*page.place("x", vertex), click=True)
     assert page.state["source"] == [vertex] and page.state["target"] == [int(NUMBER[vertex])]
-    # Nothing moves by itself.
+    # Nothing is animated.
     assert page.run("return document.getAnimations().length") == 0
     assert browser.get_log("browser") == []
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

@@ -27,12 +27,12 @@ _STAND = {
 
 # The conventions in use: y up in computer graphics, z up in engineering, y down in computer vision.
 _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
-# A body is slender along y if its spread along z is below this multiple of its spread along y. People in y-up
-# files have at most 0.42; animals in z-up files are long along y and have 0.32 (a leap) to 1.2.
+# A body is slender along y if its spread along z is at most this multiple of its spread along y. Standing
+# people in y-up files have at most 0.42. Animals in z-up files are long along y, but all except two that leap
+# or crouch have at least 0.47.
 _SLENDER = 0.45
-# How much better another axis must score than the usual one: y for a body that is slender along y, else z.
-# People with raised arms and one foot on the ground score up to 0.20 upside down; sitting and lying animals
-# up to 0.10 on a wrong axis.
+# How much better another axis must score than the usual axis. People who raise their arms and stand on one
+# foot score up to 0.18 more upside down. Bodies that sit or leap score up to 0.09 more on a wrong axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
 # Beyond these values more stability says nothing. In square roots of the area.

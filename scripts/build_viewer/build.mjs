@@ -18,7 +18,7 @@ await build({
   target: "es2022",
   charset: "ascii",
   legalComments: "none",
-  // Every page carries a copy of three.js and therefore its licence. The digest tells a bundle from an old one.
+  // Every page carries a copy of three.js and therefore its licence. A test compares the digest with the source.
   banner: { js: `/* Built from viewer.js with SHA-256 ${digest}.\nContains three.js:\n\n${license.trim()}\n*/` },
 });
 writeFileSync(new URL("THREE-LICENSE", assets), license);

@@ -42,7 +42,7 @@ const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
 const decode = (text, Type) => new Type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
 
-// Light intensities, which three.js interpolates and shades, of screen colours in bytes.
+// The light intensity of each byte of a screen colour. three.js interpolates and shades light intensities.
 const LINEAR = Float32Array.from({ length: 256 }, (_, byte) => new Color().setRGB(byte / 255, 0, 0, SRGBColorSpace).r);
 
 const maps = data.maps.map(({ name, map, errors, functional }) => ({
@@ -145,7 +145,7 @@ class Body {
     return this.#areas;
   }
 
-  /** Marks vertices, and no others. */
+  /** Marks these vertices and removes all other marks. */
   mark(indices) {
     this.marked = indices;
     for (const mark of this.marks) {
@@ -246,7 +246,7 @@ function draw() {
   });
 }
 
-// ---- What is shown
+// ---- State
 
 const sides = ["x", "y"];
 const state = {
@@ -318,7 +318,7 @@ function shownEntry() {
   const { functional } = maps[state.map];
   if (!entry || !functional) return null;
   const [row, column] = entry;
-  // The entry may have been chosen in a larger matrix, that of another map.
+  // The entry may come from another map with a larger matrix.
   if (column >= functional.columns || row * functional.columns >= functional.values.length) return null;
   const [x, y] = functional.pushforward ? [column, row] : [row, column];
   const known = bases && x < bases.x.k && y < bases.y.k;
@@ -344,7 +344,7 @@ const errorName = (mode) => data.error_names[Number(mode.split("-")[1])];
 const onErrorScale = (value) => Math.round(255 * Math.min(value / data.limit, 1)) || 0;
 const onSignedScale = (limit) => (value) => 127 + Math.round(127 * Math.max(-1, Math.min(1, value / limit)));
 
-/** The mode that the bodies are in: "eigenfunctions" while an entry of the functional map is chosen. */
+/** What the bodies show: eigenfunctions while an entry of the functional map is chosen, else the chosen mode. */
 const shownMode = () => (shownEntry()?.known ? "eigenfunctions" : state.mode);
 
 /** Makes buttons, explanation and legends agree with what the bodies show. */
@@ -463,7 +463,7 @@ const pin = (side, vertex) => pick(side, vertex, true);
 function chooseMode(mode) {
   if (mode === "eigenfunctions") {
     chooseEntry(lastEntry);
-    if (!shownEntry()?.known) chooseEntry([0, 0]); // the matrix of this map is smaller
+    if (!shownEntry()?.known) chooseEntry([0, 0]); // this map or this page lacks the last entry
   } else {
     state.mode = mode;
     chooseEntry(null);
@@ -611,7 +611,7 @@ function onKey(body, event) {
   event.preventDefault();
 }
 
-// ---- What the user does
+// ---- Mouse, touch and keys
 
 for (const [side, body] of Object.entries(bodies)) {
   const { canvas, controls } = body;
@@ -690,7 +690,7 @@ byId("vertex").addEventListener("change", ({ target }) => {
   else if (target.reportValidity()) pin("x", target.valueAsNumber);
 });
 
-// On a narrow screen wide bodies are shown one above the other, tall bodies side by side.
+// Narrow screens show wide bodies one above the other, and tall bodies side by side.
 document.body.dataset.shape = data.wide ? "wide" : "tall";
 
 const observer = new ResizeObserver(() => {

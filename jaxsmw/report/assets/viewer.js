@@ -1,4 +1,4 @@
-/* Built from viewer.js with SHA-256 6212be9b0acf44da102258f1ee0169a8ef6db43bafe91368b832b90102b45e1c.
+/* Built from viewer.js with SHA-256 c83d8a2f46ca2f0f86464bfcfdb17fdf4b3a056a110dbb88c6b8831440a2dc90.
 Contains three.js:
 
 The MIT License
