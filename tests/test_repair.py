@@ -125,7 +125,9 @@ def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, ide
 def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     mesh, _ = body
     preset = Preset((STAGE,), REPAIR)
-    with pytest.warns(UserWarning, match="limbs may be swapped, or the body may be upside down"):
+    with pytest.warns(
+        UserWarning, match=r"limbs may be swapped or mirrored.* mirrors 100% of the source and cuts off 0%"
+    ):
         found = match(mesh, mesh, preset=preset, init=mirrored)
     assert found.suspicious and found.distortion > 1.3
     facts = summarize(found, {}, found.expected_error())

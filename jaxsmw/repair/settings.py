@@ -11,6 +11,8 @@ class ScoreSettings:
 
     **Attributes:**
 
+    - `vertices_per_eigenvector`: energies are measured in at most one eigenvector per this number of
+      vertices. On coarse meshes further eigenvectors would measure the distances between vertices.
     - `discontinuity_distance`, `discontinuity_ratio`: an edge is discontinuous if its ends are matched
       farther apart than this distance, and than this multiple of the edge's own length. (Matches of
       neighbours are 0.03 apart on bodies of 5000 vertices.)
@@ -23,6 +25,7 @@ class ScoreSettings:
       less than this share of the area.
     """
 
+    vertices_per_eigenvector: int = 10
     discontinuity_distance: float = 0.1
     discontinuity_ratio: float = 3.0
     orientation_eigenvectors: int = 50

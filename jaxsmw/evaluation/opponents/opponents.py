@@ -17,9 +17,9 @@ from jaxtyping import Array, Int, Int64
 from jaxsmw.core.banks.filters import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
+from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.refinement import refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
