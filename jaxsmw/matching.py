@@ -333,7 +333,7 @@ def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down: the map has "
         f"distortion {outcome.distortion:.3f}, mirrors {mirrored:.0%} of the source and cuts off "
-        f"{cut_off:.0%}. Right maps have distortion up to {repair.suspicious} (more between non-isometric shapes, with "
-        "topological noise, or for a mirror image). Look at the map (--report, in Python "
+        f"{cut_off:.0%}. Right maps have distortion up to {repair.suspicious} (more between non-isometric "
+        "shapes, with topological noise, or for a mirror image). Look at the map (--report, in Python "
         f"jaxsmw.report.summary.write_report), and if it is wrong, {cure}"
     )

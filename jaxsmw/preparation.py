@@ -88,7 +88,9 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """A map of X's vertices on the device, padded like X."""
-        return jax.device_put(pad_rows(pointwise_map, program_size(self.pair.mesh_x)))
+        # The type of every later map, so that one program serves all stages.
+        padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
+        return jax.device_put(padded)
 
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """The padded spectra as a stage sees them."""

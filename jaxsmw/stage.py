@@ -187,7 +187,7 @@ class Stage:
             samples = None
             if self.number_of_samples is not None:
                 samples = (jnp.zeros(self.number_of_samples, int),) * 2
-            return self._arguments(*self.view(x, y), jnp.zeros(number_x, int), samples)
+            return self._arguments(*self.view(x, y), jnp.zeros(number_x, jnp.int32), samples)
 
         return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
 

@@ -169,5 +169,6 @@ class _CoarseRefinement:
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
         """The outcome of the regression, not yet judged; unsuccessful if numbers went wrong."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
-        first = jax.device_put(pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask)))
+        padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
+        first = jax.device_put(padded.astype(np.int32))
         return Outcome([self.stage.run(self.spectrum_x, self.spectrum_y, first, self.samples)], first)
