@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxsmw.repair.faults import flaw, stretch
 from jaxtyping import Float64
 from scipy.stats import spearmanr
 from tqdm import tqdm
@@ -34,7 +35,6 @@ from jaxsmw.evaluation.benchmark import choose_pairs
 from jaxsmw.evaluation.datasets import DataPair, DataSet, open_data_set
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.faults import flaw, stretch
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with

@@ -56,13 +56,14 @@ from jaxsmw import (
     Filtering,
     Mesh,
     Meyer,
+    Pair,
     Spectrum,
     WaveletPreservation,
     WaveletPreservationLayer,
     compute_spectrum,
     farthest_point_samples,
-    initial_map,
     nearest_neighbor,
+    prepare,
     read_mesh,
     shot_descriptors,
 )
@@ -309,8 +310,8 @@ def of_pair(pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
     spectra = x.describe(None), y.describe(None)
-    whole = (compute_spectrum(mesh, EIGENVECTORS) for mesh in (mesh_x, mesh_y))
-    starts = {REFERENCE: initial_map(mesh_x, mesh_y, *whole)}
+    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
+    starts = {REFERENCE: prepared.initial_map}
     for name, network in networks.items():
         starts[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
     maps = {f"{name}{START}": found for name, found in starts.items()}

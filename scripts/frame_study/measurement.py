@@ -27,8 +27,8 @@ from frame_study.variants import (
 )
 from jaxsmw import read_mesh
 from jaxsmw.core.banks.filters import FilterBank, Meyer
-from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
@@ -38,7 +38,8 @@ from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching import initial_map
+from jaxsmw.pair import Pair as MeshPair
+from jaxsmw.preparation import prepare
 
 DATA_SETS = ("faust_r", "tosca_r")
 # Shapes are padded to a multiple of this, so that one compiled program serves a whole data set.
@@ -119,9 +120,8 @@ def load_pair(data: Path, name: PairName, settings: Settings) -> Pair:
     """Read a pair and compute what all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
-    spectra = compute_spectrum(mesh_x, k), compute_spectrum(mesh_y, k)
-    start = initial_map(mesh_x, mesh_y, *spectra)
-    padded = pad(spectra[0]), pad(spectra[1])
+    prepared = prepare(MeshPair(mesh_x, mesh_y), number_of_eigenvectors=k)
+    start, padded = prepared.initial_map, (pad(prepared.spectrum_x), pad(prepared.spectrum_y))
     rows = np.random.default_rng(settings.seed).permutation(len(truth.source_vertices))
     rows = rows[: settings.evaluated_points]
     sources, targets = truth.source_vertices[rows], np.asarray(truth.targets)[rows]

@@ -34,7 +34,6 @@ from jaxsmw.core.banks.filters import (
 )
 from jaxsmw.core.frames import frame_bounds, frame_function, tighten
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
-from jaxsmw.core.refiner import Problem
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import (
