@@ -176,7 +176,7 @@ class Shape(NamedTuple):
     positions: Float[Array, "s 3"]
 
 
-class Pair(NamedTuple):
+class TrainingPair(NamedTuple):
     """Two shapes, and where in Y the samples of X belong."""
 
     x: Shape
@@ -202,11 +202,11 @@ def source(file: Path) -> Source:
 
 
 @cache
-def prepared(pair: DataPair) -> Pair:
+def prepared(pair: DataPair) -> TrainingPair:
     """A pair as training takes it."""
     x, y = map(source, pair.meshes)
     truth = pair.ground_truth(x.mesh, y.mesh).everywhere(x.mesh)[x.samples]
-    return Pair(x.shape, y.shape, jnp.asarray(places(y.mesh)[truth], float))
+    return TrainingPair(x.shape, y.shape, jnp.asarray(places(y.mesh)[truth], float))
 
 
 def described(mesh: Mesh) -> Spectrum:
@@ -236,7 +236,7 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
     return Matched(by_descriptors, found.soft_map, found.functional_map, energy / LAYER_EIGENVECTORS)
 
 
-def distance_to_truth(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
+def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """The loss with labels: how far from the truth the layer takes points, and descriptors by themselves."""
     found = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
@@ -246,7 +246,7 @@ def distance_to_truth(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""
     return by_layer + by_descriptors / 2
 
 
-def inconsistency(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
+def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """The loss without.
 
     What of wavelets is lost, how far functional maps there and back are from undoing each other, and how far
@@ -266,7 +266,7 @@ def inconsistency(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
     return WEIGHT * (there.energy + back.energy + bijectivity) + by_layer + by_descriptors / 2
 
 
-LOSSES: dict[str, Callable[[DescriptorNetwork, Pair], Float[Array, ""]]] = {
+LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]] = {
     "labels": distance_to_truth,
     "cycles": inconsistency,
 }

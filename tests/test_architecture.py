@@ -48,8 +48,7 @@ def test_rooms_import_only_from_rooms_below():
         f"{module} imports {other}"
         for module, others in imports().items()
         for other in others
-        if (room := module.split(".")[0]) in ROOMS
-        and ROOMS.index(other.split(".")[0]) > ROOMS.index(room)
+        if (room := module.split(".")[0]) in ROOMS and ROOMS.index(other.split(".")[0]) > ROOMS.index(room)
     ]
     assert not upwards
 
