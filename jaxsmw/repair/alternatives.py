@@ -115,7 +115,7 @@ def _by_extremities(
     """Maps by pairings of extremities; `spectrum_x`, of all of X, serves for the scores."""
     pair = sampled.pair
     refinement = _CoarseRefinement(sampled, settings)
-    ends = side_by_side(lambda side: extremities(side.mesh), *sampled.sides)
+    ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
     distances = [
         distance_features(side, of_side.vertices, unit)
         for side, of_side, unit in zip(sampled.sides, ends, pair.units_of_length, strict=True)

@@ -55,6 +55,22 @@ class ExpectedErrorSettings:
 
 
 @dataclass(frozen=True)
+class ExtremitySettings:
+    """The numbers of `jaxsmw.repair.extremities`. Lengths are in square roots of the area.
+
+    **Attributes:**
+
+    - `samples`: this number of evenly spread points represents the surface.
+    - `distance`: no two extremities are closer to each other.
+    - `most`: the largest number of extremities. More have too many pairings.
+    """
+
+    samples: int = 200
+    distance: float = 0.35
+    most: int = 6
+
+
+@dataclass(frozen=True)
 class RepairSettings:
     """When a map counts as wrong, and how it is repaired. `docs/research_log.md` has the tables named here.
 
@@ -85,6 +101,7 @@ class RepairSettings:
       initial maps from pairings of extremities.
     - `extremity_pairings`: the number of pairings that are tried.
     - `extremity_maps`: the number of pairings that become alternative initial maps.
+    - `extremities`: the numbers by which extremities are found.
     - `scores`: the numbers of the scores.
     """
 
@@ -107,4 +124,5 @@ class RepairSettings:
     extremity_samples: int = 500
     extremity_pairings: int = 16
     extremity_maps: int = 2
+    extremities: ExtremitySettings = ExtremitySettings()
     scores: ScoreSettings = ScoreSettings()
