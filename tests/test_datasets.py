@@ -195,6 +195,17 @@ def test_missing_files_are_named(tmp_path, case):
     assert "\n" not in str(caught.value)
 
 
+def test_unreadable_directories_are_named(tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(
+        InputError, match=rf"{tmp_path}: cannot be read \(Permission denied\): check its perm"
+    ):
+        open_data_set(tmp_path)
+
+
 def test_the_mesh_folder_is_not_the_data_set(tmp_path):
     remeshed(tmp_path)
     shutil.copytree(tmp_path / "off", tmp_path / "shapes")

@@ -68,7 +68,9 @@ class TestReading:
             truth = read_ground_truth(path, part, Y)
         assert truth.source_vertices.tolist() == sorted(X.faces[0]) and len(truth.targets) == 3
         (left_out,) = set(range(4)) - set(X.faces[0].tolist())
-        with pytest.raises(InputError, match="no face of part uses: give the truth of this mesh"):
+        with pytest.raises(
+            InputError, match="no face of part references: give the ground truth of this mesh"
+        ):
             read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
 
     def test_two_columns(self, write):
@@ -224,7 +226,7 @@ class TestBadFiles:
         ("name", "content", "message"),
         [
             ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
-            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a truth with one per line"),
+            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a file with one per line"),
             ("t.txt", "1 2\n3\n", "line 2: has 1 number where 2 should be"),
             (
                 "t.txt",

@@ -421,6 +421,7 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     return open_layout
 
 
+# The function of each layout returns the pairs of a directory, or None if the directory has another layout.
 _LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
     "a remeshed set": _remeshed,
     "SHREC'19 humans": _shrec19,

@@ -25,7 +25,7 @@ Columns = Mapping[str, Callable[[str], Any]]
 
 
 class Journal:
-    """A CSV file that grows by whole rows; rows once appended stay.
+    """A CSV file that grows by whole rows; appended rows stay.
 
     If a process was killed while it wrote a line, the unfinished line is cut off when the file is opened
     again.
@@ -34,8 +34,8 @@ class Journal:
 
     - `path`: the file, which need not exist yet.
     - `key`: the columns that identify a row. If two rows have the same key, the first row counts.
-    - `columns`: the columns that the file must have, and what their values must look like; by default any
-      columns that include the key.
+    - `columns`: the columns that the file must have, each with the function that checks its values; by
+      default any columns that include the key.
 
     **Raises:** `InputError` if the file is not such a table. The file is then left as it is.
     """

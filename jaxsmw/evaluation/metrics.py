@@ -97,8 +97,8 @@ class GeodesicError:
     def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
         """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
 
-        The curve has a step at each error e, so its mean height is exactly the mean of `max(0, 1 -
-        e/largest)`. A perfect map has 1.
+        The curve has a step at each error e, so its mean height is exactly the mean of
+        `max(0, 1 - e/largest)`. A perfect map has 1.
 
         **Raises:** `InputError` if the threshold is not positive.
         """
@@ -157,6 +157,8 @@ def geodesic_error(
 
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Returns the share of the target's area that belongs to vertices in the image of a map.
+
+    The coverage needs no ground truth.
 
     **Arguments:**
 

@@ -231,9 +231,13 @@ def _bijective_step(
     """Spectral ICP of both directions and of both cycles, in one search (bijective ICP).
 
     The functional maps of both directions and of the cycles X -> Y -> X and Y -> X -> Y are each replaced by
-    the nearest orthogonal matrix. For y = T(x), C_XY and `C_XX^T C_XY` both require `Phi_X(x) = Phi_Y(y)
-    C^T`, while C_YX and `C_YY^T C_YX` both require `Phi_X(x) C^T = Phi_Y(y)`. The second matrix of each pair
-    is the first, rotated so that its cycle closes: `C_XX = C_XY C_YX` should be the identity.
+    the nearest orthogonal matrix. For y = T(x),
+
+        Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
+        Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
+
+    The second matrix in each line is the first, rotated so that its cycle closes: `C_XX = C_XY C_YX` should
+    be the identity.
 
     One search over the four embeddings side by side gives the new map X -> Y. The same point sets with
     exchanged roles give the new map Y -> X. The equal weights and the form of the cycle conditions are our

@@ -1,4 +1,4 @@
-"""The initial map without any refinement: what all other methods start from."""
+"""The initial map without any refinement; all other methods start from the same map."""
 
 from __future__ import annotations
 
