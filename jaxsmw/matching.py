@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -30,7 +30,6 @@ from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
-from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
@@ -260,14 +259,7 @@ def match(
     seconds = dict(prepared.seconds)
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
-        alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
-        if chosen.repair is not None and isinstance(init, str) and init == "shot":
-            alternatives = alternative_initial_maps(
-                pair, prepared.spectrum_x, prepared.spectrum_y, chosen.repair
-            )
-        outcome = refine_in_stages(
-            prepared, chosen.stages, chosen.repair, alternatives=alternatives, history=history
-        )
+        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
         jax.block_until_ready(outcome.refinements[-1])
     return _correspondence(prepared, chosen, outcome, seconds)
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxsmw.repair.faults import flaw, stretch
 from jaxtyping import Float64
 from scipy.stats import spearmanr
 from tqdm import tqdm
@@ -35,7 +36,6 @@ from jaxsmw import InputError, geodesic_error, match, read_mesh
 from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_data_set
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.faults import flaw, stretch
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
@@ -84,7 +84,7 @@ def measure(
 def scores_of(found: Correspondence) -> dict[str, float]:
     """Returns the scores of a map by name; lower is better."""
     meshes, pointwise_map = (found.mesh_x, found.mesh_y), found.pointwise_map
-    regression = match(*meshes, init=pointwise_map, preset=WITHOUT_REPAIR[0]).refinement.updated
+    regression = match(*meshes, init=pointwise_map, preset=WITHOUT_REPAIR[0]).refinement.state
     return {
         "Dirichlet energy ratio": stretch(*meshes, pointwise_map, found.spectrum_x),
         "uncertainty of the regression": float(regression.uncertainty),

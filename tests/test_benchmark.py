@@ -30,7 +30,7 @@ from jaxsmw.evaluation import measurement
 from jaxsmw.evaluation.benchmark import Results, run_benchmark
 from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
 from jaxsmw.evaluation.measurement import CURVE, FIGURES, Settings
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
@@ -508,7 +508,7 @@ def test_times_are_without_compilation(monkeypatch):
     monkeypatch.setattr(measurement, "_LONG", 0.5)
     monkeypatch.setattr(measurement, "_warm", {"short"})
     spectrum = random_spectrum(30, 5, seed=0)
-    pair = PreparedPair(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
+    pair = MethodInput(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
     for name, seconds, runs in (("short", 0.0, 2), ("long", 0.6, 1)):
         method = Slow(seconds)
         with measurement._CompilationClock() as compilation:

@@ -183,7 +183,7 @@ def test_refiner_recovers_by_drift(pair):
     """`DriftRecovery` encodes by least squares and recovers by drift."""
     _, x, y = pair
     refiner = DriftRecovery(rank=LOW_RANK, drift_iterations=4)
-    problem = refiner.prepare(x, y)
+    problem = refiner.prepare(Problem(x, y))
     initial_map = jnp.asarray(np.where(np.arange(M) % 3 > 0, ORDER, 0), jnp.int32)
     functional_map, _ = refiner.update(problem, initial_map, None)
     np.testing.assert_allclose(functional_map, encode(initial_map, x, y), atol=1e-12)

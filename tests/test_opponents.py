@@ -10,7 +10,7 @@ from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.base import PreparedPair
+from jaxsmw.evaluation.opponents.base import MethodInput
 from jaxsmw.evaluation.opponents.initial_map import Unrefined
 from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.evaluation.opponents.presets import Refined
@@ -22,11 +22,11 @@ M, N, K = 200, 180, 40
 
 
 @pytest.fixture
-def pair() -> PreparedPair:
+def pair() -> MethodInput:
     generator = np.random.default_rng(0)
     x, y = random_spectrum(M, K, seed=1), random_spectrum(N, K, seed=2)
     samples = tuple(jnp.asarray(generator.choice(n, 80, replace=False)) for n in (M, N))
-    return PreparedPair(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
+    return MethodInput(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
 
 
 def nearest(queries, database) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_all_methods_repair_a_noisy_initial_map():
     x = x.place(y.positions[order], y.normals[order])
     initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
-    pair = PreparedPair(
+    pair = MethodInput(
         x, y, jnp.asarray(initial_map), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
     )
     for name, method in METHODS.items():
@@ -108,7 +108,7 @@ def test_other_libraries_run_the_same_zoomout():
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
     initial_map = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
     samples = (jnp.arange(200), jnp.arange(200))
-    expected, _ = METHODS["zoomout"](PreparedPair(x, y, initial_map, samples))
+    expected, _ = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
     # An unreferenced vertex at the beginning, and padding at the end.
     x, y = (
         Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
@@ -116,7 +116,7 @@ def test_other_libraries_run_the_same_zoomout():
     )
     shifted = jnp.roll(jnp.pad(initial_map + 1, (0, 20)), 1)
     for name, peer in peers.items():
-        found, result = peer(PreparedPair(x, y, shifted, samples))
+        found, result = peer(MethodInput(x, y, shifted, samples))
         assert result == RESULTS.successful
         found = np.asarray(found)[1:301] - 1
         assert np.mean(found != order) < 0.02

@@ -17,7 +17,7 @@ from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.opponents import partial_functional_maps as steps
-from jaxsmw.evaluation.opponents.base import PreparedPair
+from jaxsmw.evaluation.opponents.base import MethodInput
 from jaxsmw.evaluation.opponents.partial_functional_maps import (
     PartialMap,
     SurfaceGradient,
@@ -226,7 +226,7 @@ def test_the_method_uses_the_prepared_pair(case):
     x, y = case.x.describe(case.x.descriptors[:, :4]), case.y.describe(case.y.descriptors[:, :4])
     samples = jnp.arange(50), jnp.arange(50)
     meshes = case.partial, case.full
-    pair = PreparedPair(case.x, case.y, jnp.asarray(case.initial_map), samples, meshes=meshes, partial=True)
+    pair = MethodInput(case.x, case.y, jnp.asarray(case.initial_map), samples, meshes=meshes, partial=True)
     method = replace(METHODS["pfm"], number_of_eigenvectors=K, number_of_descriptors=4, iterations=1)
     mapped, result = method(pair)
     expected = case.matched(x, y, case.initial_map, iterations=1)

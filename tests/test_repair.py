@@ -57,7 +57,7 @@ def identity(body):
 def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), **options):
     """The share of the area with a wrong match, and the outcome."""
     mesh, spectrum = body
-    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, "shot", initial_map)
+    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, initial_map, initial_map)
     found = refine_in_stages(prepared, stages, repair, **options)
     assert found.successful
     n = len(mesh.vertices)

@@ -20,13 +20,13 @@ from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
 from jaxsmw.evaluation.preparation import prepare_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.initial_maps.starts import Start
+from jaxsmw.initial_maps import INITIAL_MAPS
 from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.provenance import machine
@@ -110,14 +110,14 @@ class Settings:
         # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
         if not self.is_descriptor and not os.path.isdir(self.init):
             raise InputError(
-                f"{self.init!r} is not an initial map: choose from {', '.join(get_args(Start))}, or give a "
+                f"{self.init!r} is not an initial map: choose from {', '.join(INITIAL_MAPS)}, or give a "
                 "directory with maps X_Y.map."
             )
 
     @property
     def is_descriptor(self) -> bool:
         """Whether the initial maps are computed from a descriptor."""
-        return self.init in get_args(Start)
+        return self.init in INITIAL_MAPS
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Checks that every pair has an initial map.
@@ -197,7 +197,7 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
     return rows
 
 
-def _timed(name: str, method: Method, pair: PreparedPair) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
+def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
     """Runs a method; returns map, result and seconds without compilation (NaN for published maps)."""
     for _ in range(2):
         with _CompilationClock() as compilation, one_blas_thread():

@@ -87,20 +87,17 @@ def _in_both_directions(
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
     backward = nearest_map(reversed_, features_y, features_x)
-    reverse_weight = spectrum_x.eigenvalues.dtype.type(weight)
-    found = compiled(_decode_mean)(
-        *jax.device_put((forward, backward, reverse_weight)), spectrum_x, spectrum_y
-    )
+    on_device = jax.device_put((forward, backward, spectrum_x.eigenvalues.dtype.type(weight)))
+    found = compiled(_decode_mean)(on_device, spectrum_x, spectrum_y)
     return np.asarray(found).astype(np.int64)
 
 
 def _decode_mean(
-    forward: Int[Array, " m"],
-    backward: Int[Array, " n"],
-    reverse_weight: Float[Array, ""],
+    maps_and_weight: tuple[Int[Array, " m"], Int[Array, " n"], Float[Array, ""]],
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
 ) -> Int[Array, " m"]:
+    forward, backward, reverse_weight = maps_and_weight
     responses = WaveletPreservation().problem(spectrum_x, spectrum_y).responses
     of_forward = encode(forward, spectrum_x, spectrum_y)
     of_backward = encode(backward, spectrum_y, spectrum_x).T

@@ -1,6 +1,6 @@
 """The methods that `jaxsmw benchmark` compares with each other, one file for each.
 
-- `base`: what a method is given (`PreparedPair`) and what a method is (`Method`).
+- `base`: what a method is given (`MethodInput`) and what a method is (`Method`).
 - `initial_map`, `presets`, `published_maps`: no refinement, this library's own methods, and maps in files.
 - `spectral_icp`, `zoomout`, `bcicp`, `cpd`, `partial_functional_maps`: methods by other authors, rewritten
   here.

@@ -6,24 +6,28 @@ All methods work on the same prepared pair: the same spectra, the same initial m
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from jaxtyping import Array, Int
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, Int64
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.presets import Stage
+from jaxsmw.preparation import PreparedPair
+from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000
 """The number of samples of each shape in a prepared pair; no method uses more."""
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPair:
+class MethodInput:
     """The input of a method: two shapes X and Y, prepared once for all methods.
 
     **Attributes:**
@@ -36,7 +40,7 @@ class PreparedPair:
     - `names`: the names of X and Y, for methods that read maps from files.
     - `partial`: whether one shape is a partial shape of the other. The two spectra then agree only below the
       smaller of their largest eigenvalues.
-    - `alternative_initial_maps`: computes further initial maps, one by one, for methods that try several.
+    - `prepared`: the pair as `jaxsmw.match` prepares it, for methods that run a preset.
     """
 
     spectrum_x: Spectrum
@@ -47,7 +51,33 @@ class PreparedPair:
     meshes: tuple[Mesh, Mesh] | None = None
     names: tuple[str, str] = ("X", "Y")
     partial: bool = False
-    alternative_initial_maps: Callable[[], Iterable[Int[Array, " m"]]] = tuple
+    prepared: PreparedPair | None = None
+
+    @classmethod
+    def of(
+        cls,
+        prepared: PreparedPair,
+        names: tuple[str, str],
+        reverse_initial_map: Int64[np.ndarray, " n"] | None = None,
+    ) -> MethodInput:
+        """The input of all methods for a pair that `jaxsmw.preparation.prepare` prepared, with samples."""
+        assert prepared.samples is not None
+        spectrum_x, spectrum_y = prepared.padded
+        reverse = None
+        if reverse_initial_map is not None:
+            padded = pad_rows(reverse_initial_map, spectrum_y.mask.shape[0])
+            reverse = jnp.asarray(padded, jnp.int32)
+        return cls(
+            spectrum_x,
+            spectrum_y,
+            prepared.padded_map(prepared.initial_map),
+            prepared.samples,
+            reverse,
+            prepared.pair.meshes,
+            names,
+            prepared.pair.partial,
+            prepared,
+        )
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """Returns both spectra cut to the sizes of a stage; for a partial pair, to their common range."""
@@ -71,7 +101,7 @@ class Method(abc.ABC):
     - `reference`: the publication and the settings, as published with the results.
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
-    - `both_directions`: whether the method needs `PreparedPair.reverse_initial_map`.
+    - `both_directions`: whether the method needs `MethodInput.reverse_initial_map`.
     - `full_only`: whether the method is undefined on partial pairs.
     - `partial_only`: whether the method is undefined on pairs of full shapes.
     """
@@ -84,7 +114,7 @@ class Method(abc.ABC):
     partial_only: bool = False
 
     @abc.abstractmethod
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """Returns the map X -> Y (m,), 0-based vertices of Y, and a code that says how the method ended."""
 
     def check(self, pairs: Sequence[DataPair]) -> None:

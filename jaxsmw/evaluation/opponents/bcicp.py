@@ -39,7 +39,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair, check_spectrum
+from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
@@ -342,7 +342,7 @@ class BijectiveContinuousICP(Method):
     both_directions: bool = True
     full_only: bool = True
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         assert pair.meshes is not None and pair.reverse_initial_map is not None
         initial_maps = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Array, Int
 
 from jaxsmw.core.results import RESULTS
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Unrefined(Method):
     reference: str = "nearest neighbours of the descriptors: the initial map of all other methods"
     number_of_eigenvectors: int = 1
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         return pair.initial_map, RESULTS.successful  # type: ignore[return-value]
 

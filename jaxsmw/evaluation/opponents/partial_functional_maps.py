@@ -74,7 +74,7 @@ from jaxsmw.core.products import product
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair, check_spectrum
+from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.presets import Stage
 from jaxsmw.runtime.batches import pad_rows, padded_size
@@ -384,7 +384,7 @@ class PartialFunctionalMaps(Method):
     iterations: int = 5
     partial_only: bool = True
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         assert pair.meshes is not None
         spectra = pair.seen_in(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float64, Int, Int64
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVECTORS, ZOOMOUT_STEP
 
 
@@ -37,7 +37,7 @@ class Peer(Method):
     full_only = True
     package: str
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])

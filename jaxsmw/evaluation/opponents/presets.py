@@ -12,10 +12,14 @@ from dataclasses import dataclass, field
 
 from jaxtyping import Array, Int
 
-from jaxsmw.core.refinement import Refiner, WaveletPreservation
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
-from jaxsmw.presets import PRESETS, Preset, Stage, chosen_stages, refine_in_stages
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.preparation import fewest_vertices
+from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -28,54 +32,41 @@ class Refined(Method):
     iterations: int = 3
     number_of_samples: int | None = None
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
-        return _refined(
-            pair,
-            Stage(
-                self.refiner,
-                self.number_of_eigenvectors,
-                iterations=self.iterations,
-                number_of_samples=self.number_of_samples,
-            ),
+        stage = Stage(
+            self.refiner,
+            number_of_eigenvectors=self.number_of_eigenvectors,
+            iterations=self.iterations,
+            number_of_samples=self.number_of_samples,
         )
+        found = stage.run(*pair.seen_in(stage), pair.initial_map, pair.samples, partial=pair.partial)
+        return found.pointwise_map, found.result
 
 
 @dataclass(frozen=True)
 class Chosen(Method):
-    """Refines the initial map with one of `jaxsmw.PRESETS`."""
+    """Refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does."""
 
     reference: str
-    preset: Preset
+    preset: PresetName
 
     @property
     def number_of_eigenvectors(self) -> int:  # type: ignore[override]
         """The largest number of eigenvectors of any stage."""
-        return max(stage.number_of_eigenvectors for stage in PRESETS[self.preset])
+        return PRESETS[self.preset].number_of_eigenvectors
 
     @property
     def number_of_descriptors(self) -> int:  # type: ignore[override]
         """The largest number of descriptors of any stage."""
-        return max(stage.number_of_descriptors for stage in PRESETS[self.preset])
+        return PRESETS[self.preset].number_of_descriptors
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
-        fewest = min(int(spectrum.mask.sum()) for spectrum in (pair.spectrum_x, pair.spectrum_y))
-        return _refined(pair, *chosen_stages(self.preset, fewest, partial=pair.partial))
-
-
-def _refined(pair: PreparedPair, *stages: Stage) -> tuple[Int[Array, " m"], RESULTS]:
-    spectra = [pair.seen_in(stage) for stage in stages]
-    outcome = refine_in_stages(
-        spectra,
-        pair.initial_map,
-        stages,
-        pair.samples,
-        meshes=pair.meshes,
-        partial=pair.partial,
-        other_starts=pair.alternative_initial_maps(),
-    )
-    return outcome.pointwise_map, outcome.refinements[-1].result
+        assert pair.prepared is not None
+        preset = PRESETS[self.preset].fitted(fewest_vertices(pair.prepared.pair))
+        outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
+        return outcome.pointwise_map, outcome.refinements[-1].result
 
 
 MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")

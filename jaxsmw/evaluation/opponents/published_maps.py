@@ -14,7 +14,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import read_pointwise_map
-from jaxsmw.evaluation.opponents.base import Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.batches import pad_rows
 
@@ -31,7 +31,7 @@ class PublishedMaps(Method):
         """The name of the directory."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         assert pair.meshes is not None
         pointwise_map = read_published_map(self.directory, pair.names, pair.meshes)

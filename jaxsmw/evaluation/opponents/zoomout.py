@@ -17,11 +17,12 @@ from jaxtyping import Array, Int
 from jaxsmw.core.banks.filters import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, Method, PreparedPair
+from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, Method, MethodInput
 from jaxsmw.runtime.compilation import compiled
 
 FIRST_EIGENVECTORS, ZOOMOUT_STEP, LAST_EIGENVECTORS = 20, 5, 120
@@ -45,7 +46,7 @@ class ZoomOut(Method):
     number_of_eigenvectors: int = LAST_EIGENVECTORS
     number_of_samples: int | None = None
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         pointwise_map, refiner = pair.initial_map, _UNFILTERED
         samples_x, samples_y = pair.sampled(self.number_of_samples)
