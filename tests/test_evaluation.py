@@ -264,9 +264,9 @@ class TestBadFiles:
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
     def test_files_that_cannot_be_read_or_written(self, tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="missing: does not exist"):
             read_pointwise_map(tmp_path / "missing", X, Y)
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read_ground_truth(tmp_path, X, Y)
         with pytest.raises(InputError, match="cannot be written"):
             write_pointwise_map(tmp_path / "missing" / "a.map", [0])

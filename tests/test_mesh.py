@@ -5,7 +5,6 @@ import errno
 import itertools
 import os
 import struct
-import threading
 import tracemalloc
 from collections import Counter
 from pathlib import Path
@@ -22,7 +21,6 @@ from hypothesis.extra import numpy as hnp
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, diagnose, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 OCTAHEDRON = make_mesh(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
@@ -883,84 +881,6 @@ def test_bad_targets_write_nothing(tmp_path, name):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-# ------------------------------------------------------------------------------------- atomic_write
-
-
-def test_the_file_appears_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "result.npz"
-    with atomic_write(str(path)) as temporary:
-        assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary.read_bytes() == b""
-        temporary.write_bytes(b"one")
-        assert not path.exists()
-    assert path.read_bytes() == b"one"
-
-    def fail() -> None:
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(b"half of")
-            raise KeyError("in the middle")
-
-    with pytest.raises(KeyError):
-        fail()
-    assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
-
-
-def test_trouble_of_the_system_is_one_sentence(tmp_path):
-    def fill() -> None:
-        with atomic_write(tmp_path / "a.txt"):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(InputError, match=r"a\.txt: cannot be written \(No space left on device\)"):
-        fill()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["x" * 300, "missing/a.txt", "/dev/null", ".", "/"])
-def test_places_that_cannot_be_written(tmp_path, name):
-    with pytest.raises(InputError, match=r"cannot be written"), atomic_write(tmp_path / name) as temporary:
-        temporary.write_text("x")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_write_protection_is_respected(tmp_path, monkeypatch):
-    path = tmp_path / "kept.txt"
-    path.write_text("old")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind the superuser
-    with pytest.raises(InputError, match="write-protected"), atomic_write(path) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "old"
-
-
-def test_permissions_are_those_of_any_new_file(tmp_path):
-    (tmp_path / "plain").touch()
-    with atomic_write(tmp_path / "atomic"):
-        pass
-    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_links_are_followed(tmp_path):
-    (tmp_path / "store").mkdir()
-    (tmp_path / "link.txt").symlink_to(tmp_path / "store" / "real.txt")
-    with atomic_write(tmp_path / "link.txt") as temporary:
-        temporary.write_text("x")
-    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "store" / "real.txt").read_text() == "x"
-
-
-def test_many_writers_of_one_file_leave_one_whole_file(tmp_path):
-    path = tmp_path / "shared.txt"
-
-    def write(letter: str) -> None:
-        with atomic_write(path) as temporary:
-            temporary.write_text(letter * 100_000)
-
-    threads = [threading.Thread(target=write, args=(letter,)) for letter in "abcdefgh"]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert path.stat().st_size == 100_000 and len(set(path.read_text())) == 1
-    assert list(tmp_path.iterdir()) == [path]
-
-
 # -------------------------------------------------------------------------------------- real shapes
 
 
@@ -1011,28 +931,3 @@ def test_real_shape_round_trip(shared, tmp_path):
     for name in ("w.off", "w.ply"):
         write_mesh(tmp_path / name, mesh)
         assert same_mesh(read_mesh(tmp_path / name), mesh)
-
-
-def test_check_writable_tells_before_the_work_what_atomic_write_would_tell_after(tmp_path):
-    check_writable(tmp_path / "new.txt")
-    (tmp_path / "old.txt").write_text("x")
-    check_writable(tmp_path / "old.txt")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["old.txt"]
-    # Nobody can create files in /proc, whatever permissions say.
-    for path in (
-        tmp_path,
-        tmp_path / "no" / "such.txt",
-        *([Path("/proc/x")] if Path("/proc").exists() else []),
-    ):
-        with pytest.raises(InputError, match="cannot be written"):
-            check_writable(path)
-
-
-def test_check_directory_tells_before_the_work_and_leaves_nothing(tmp_path):
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "kept").mkdir()
-    check_directory(tmp_path / "new" / "one")
-    check_directory(tmp_path / "kept")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "kept"]
-    with pytest.raises(InputError, match="cannot be made a directory"):
-        check_directory(tmp_path / "file" / "one")

@@ -25,7 +25,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, count_of
 from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 IndexBase = Literal[0, 1]
 
@@ -280,17 +280,9 @@ class _Table:
             self.values = np.array(self._words, dtype=np.float64)
         self.rows, self.columns = self.values.shape
 
-    def _bytes(self) -> bytes:
-        try:
-            return self.path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be read ({error.strerror}): check the path and its permissions."
-            ) from error
-
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """An array of NumPy's; of one column a list or a row will do, too."""
-        data = io.BytesIO(self._bytes())
+        data = io.BytesIO(read_bytes(self.path))
         try:
             array = np.lib.format.read_array(data, allow_pickle=False)
         except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
@@ -309,7 +301,7 @@ class _Table:
         """The numbers as they are written."""
         path = self.path
         try:
-            text = self._bytes().decode("utf-8-sig")
+            text = read_bytes(self.path).decode("utf-8-sig")
         except UnicodeDecodeError:
             text = "\0"
         if "\0" in text:

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
 
@@ -53,12 +53,7 @@ def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     **Raises:** `InputError` that names the file.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}): check the path and its permissions."
-        ) from error
+    data = read_bytes(path, largest=None)
     try:
         return parse_variables(data)
     except InputError as error:

@@ -21,10 +21,7 @@ from numpy.typing import ArrayLike
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
 from jaxsmw.io.mat_files import find_structs, parse_variables
-from jaxsmw.runtime.files import atomic_write
-
-# Reading takes up to fifteen times a file's size in memory; text of this size has ten million vertices.
-LARGEST_FILE = 2**30
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
@@ -52,23 +49,13 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     end, or when `make_mesh` refuses what is in it.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            fault = "is not a regular file" if path.exists() else "does not exist"
-            raise InputError(f"{path}: {fault}: give the path of a mesh file.")
-        parse = _PARSERS.get(path.suffix.lower())
-        if parse is None:
-            raise InputError(
-                f"{path}: the suffix {path.suffix!r} is not that of a known mesh format: convert the mesh to "
-                f"one of {', '.join(_PARSERS)}."
-            )
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path}: is larger than {LARGEST_FILE >> 30} GiB: decimate the mesh first.")
-        data = path.read_bytes()
-    except OSError as error:
+    data = read_bytes(path)
+    parse = _PARSERS.get(path.suffix.lower())
+    if parse is None:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}): check the path and its permissions."
-        ) from error
+            f"{path}: the suffix {path.suffix!r} is not that of a known mesh format: convert the mesh to "
+            f"one of {', '.join(_PARSERS)}."
+        )
     try:
         polygons = parse(data)
         faces = _fans(polygons.corners, polygons.sizes)
