@@ -21,7 +21,7 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh, make_spectrum
-from jaxsmw.evaluation.ground_truth import read_landmarks
+from jaxsmw.io.map_files import read_landmarks
 
 K = 12
 
@@ -136,7 +136,7 @@ def test_what_is_no_mesh_is_told(given, fault):
 
 def test_the_package_imports_none_of_them():
     code = (
-        "import jaxsmw, jaxsmw.io.exchange, jaxsmw.matching, sys;"
+        "import jaxsmw, jaxsmw.io.spectra, jaxsmw.matching, sys;"
         "print([name for name in ('pyFM', 'geomfum', 'trimesh', 'pyvista', 'torch', 'potpourri3d') "
         "if name in sys.modules])"
     )
@@ -359,10 +359,10 @@ def test_maps_as_arrays(tmp_path, bodies):
         (np.zeros(0, int), "holds int64 of shape .0,.: give"),
         (np.zeros((1, 0), int), "holds int64 of shape .1, 0.: give"),
         (np.array(["a", "b"]), "holds <U1 of shape"),
-        (np.array([None, 1]), "is no array that NumPy saved"),
+        (np.array([None, 1]), "is not an array that NumPy saved"),
         (np.zeros(3, complex), "holds complex128 of shape"),
         (np.zeros(3), "has 3 rows, but one is needed"),
-        (None, "is no array that NumPy saved"),
+        (None, "is not an array that NumPy saved"),
     ],
 )
 def test_hostile_arrays(tmp_path, bodies, contents, fault):
@@ -383,7 +383,7 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
     started = b"\x93NUMPY\x01\x00"
     for data in (archive, *(started + len(h).to_bytes(2, "little") + h for h in (huge, b"(" * 3000, b""))):
         path.write_bytes(data)
-        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is no array that NumPy saved"):
+        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is not an array that NumPy saved"):
             jaxsmw.read_pointwise_map(path, *bodies)
     path.unlink()
     with pytest.raises(jaxsmw.InputError, match=r"map\.npy: does not exist: check the path"):
@@ -479,8 +479,6 @@ def test_pointwise_maps_of_other_matlab_code(bodies, pointwise_map, tmp_path, sh
 
 
 def test_pairs_of_vertices_in_mat_files(bodies, pointwise_map, tmp_path):
-    from jaxsmw.evaluation.ground_truth import read_landmarks
-
     x, y = bodies
     pairs = np.stack([np.arange(9), pointwise_map[:9]], axis=1)
     path = mat_file(tmp_path / "pairs.mat", pairs=pairs + 1)

@@ -23,11 +23,11 @@ from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.evaluation.opponents.bcicp import bcicp
 from jaxsmw.evaluation.opponents.cpd import DriftRecovery
 from jaxsmw.evaluation.opponents.partial_functional_maps import SurfaceGradient, partial_functional_map
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.map_files import read_pointwise_map
 from jaxsmw.presets import PRESETS, Preset, Stage, chosen_stages, refine_in_stages
 from jaxsmw.runtime.batches import pad_rows
 from jaxsmw.runtime.compilation import compiled
