@@ -6,6 +6,7 @@ brings all of them.
 
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -238,6 +239,9 @@ BAD_SPECTRA = {
     "transposed": ((VALUES, VECTORS.T, AREAS), "do not fit each other"),
     "too many eigenvalues": ((np.arange(4.0), VECTORS, AREAS), "do not fit each other"),
     "too few areas": ((VALUES, VECTORS, AREAS[:-1]), "do not fit each other"),
+    "a sparse mass matrix of another size": ((VALUES, VECTORS, sp.eye_array(7)), "do not fit each other"),
+    "a sparse mass matrix that would fill the memory": (
+        (VALUES, VECTORS, sp.csc_array(([1.0], [0], [0, 1]), shape=(2**40, 1))), "do not fit each other"),
     "a matrix of eigenvalues": ((np.diag(VALUES), VECTORS, AREAS), "do not fit each other"),
     "complex": ((VALUES * 1j, VECTORS, AREAS), "eigenvalues are no numeric array"),
     "words": ((["a", "b", "c"], VECTORS, AREAS), "eigenvalues are no numeric array"),
@@ -541,6 +545,12 @@ BAD_VARIABLES = {
     "no variable": ("pointwise map", {}, "is empty"),
     "words": ("pointwise map", {"T12": "one two"}, "no list of numbers"),
     "complex": ("functional map", {"C21": np.eye(3) * 1j}, "no matrix"),
+    "complex eigenvectors": ("spectrum", {**BASIS, "A": np.ones(8), "evecs": np.eye(8, 3) * (1 + 1j)}, "eigenvectors are no numeric array"),
+    "complex areas": ("spectrum", {**BASIS, "A": sp.diags_array(np.full(8, 1 + 1j)).tocsc()}, "vertex areas are no numeric array"),
+    "complex coordinates": ("mesh", {"surface": {**SURFACE, "Y": SURFACE["Y"] + 1j}}, "surface.Y is not an array of real numbers"),
+    "complex positions": ("mesh", {"VERT": np.eye(4, 3) + 1j, "TRIV": SURFACE["TRIV"]}, "VERT is not an array of real numbers"),
+    "complex faces": ("mesh", {"surface": {**SURFACE, "TRIV": SURFACE["TRIV"] + 1j}}, "surface.TRIV is not an array of real numbers"),
+    "words for coordinates": ("mesh", {"surface": {**SURFACE, "X": "abcd"}}, "surface.X is not an array of real numbers"),
     "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): compute more eigenvectors"),
     "infinite": ("functional map", {"C21": np.full((3, 3), np.inf)}, "not finite"),
     "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "call the one that is meant C21"),
@@ -571,6 +581,15 @@ def test_bad_variables_end_in_one_sentence(bodies, spectra, tmp_path, reader, va
 def test_missing_files_are_told(bodies, spectra, tmp_path, reader):
     with pytest.raises(InputError, match=r"nowhere\.mat: "):
         READERS[reader](tmp_path / "nowhere.mat", bodies, spectra)
+
+
+def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for number in range(3):
+            archive.writestr(f"{number}.npy", bytes(400_000_000))
+    assert (tmp_path / "bomb.npz").stat().st_size < 10_000_000
+    with pytest.raises(InputError, match=r"bomb\.npz: would take more than 1 GiB of memory"):
+        jaxsmw.read_spectrum(tmp_path / "bomb.npz")
 
 
 def test_what_cannot_be_written_is_told(bodies, spectra, tmp_path):

@@ -20,6 +20,7 @@ from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError
 
 from jaxsmw.errors import InputError
+from jaxsmw.io.mat_format import unpacked
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
@@ -35,12 +36,11 @@ def parse_variables(data: bytes) -> dict[str, Any]:
 
     **Raises:** `InputError`, without the file's name, if it is none, damaged, or in format 7.3.
     """
-    if data.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise InputError("is in MATLAB's format 7.3, which is not read: save it there with save(..., '-v7').")
     try:
-        # SciPy answers damaged files with whatever goes wrong first.
-        variables = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
-    except Exception:
+        variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
+    except InputError:
+        raise
+    except Exception:  # SciPy answers damaged files with whatever goes wrong first
         raise InputError(
             "is damaged or no file of MATLAB's: save it again, with save(..., '-v7') there or "
             "scipy.io.savemat here."
@@ -88,7 +88,7 @@ def read_matrix(
     **Raises:** `InputError` that names the file and what it holds instead.
     """
     variables = read_variables(path)
-    matrices = {key: value for key, value in variables.items() if _is_real(value)}
+    matrices = {key: value for key, value in variables.items() if is_real(value)}
     if columns == 1:
         matrices = {key: value for key, value in matrices.items() if value.ndim == 1}
     elif columns is not None:
@@ -109,7 +109,7 @@ def read_matrix(
     return matrix[:, None] if matrix.ndim == 1 else matrix
 
 
-def _is_real(value: Any) -> bool:
+def is_real(value: Any) -> bool:
     return (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "iuf"

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
-from jaxsmw.io.mat_files import find_structs, parse_variables
+from jaxsmw.io.mat_files import find_structs, is_real, parse_variables
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
 
@@ -395,18 +395,24 @@ def _parse_mat(data: bytes) -> _Polygons:
         raise InputError(
             f"holds {len(structs)} shapes, {', '.join(structs)}: save each in a file of its own."
         )
-    try:
-        (surface,) = structs.values()
-        columns = [surface[axis] for axis in "XYZ"] if "X" in surface else surface["VERT"].T
-        vertices = np.stack(list(columns), axis=-1).astype(np.float64)
+    name, surface = next(iter(structs.items()), ("", {}))
+    columns = ("X", "Y", "Z") if "X" in surface else ("VERT",)
+    given = [field for field in ("TRIV", *columns) if field in surface]
+    for field in given:
+        if not is_real(surface[field]):  # a conversion to float64 would drop imaginary parts
+            raise InputError(
+                f"{f'{name}.{field}'.lstrip('.')} is not an array of real numbers: save real coordinates and "
+                "vertex indices."
+            )
+    vertices = faces = np.empty(0)
+    if len(given) == 1 + len(columns) and len({len(surface[field]) for field in columns}) == 1:
+        vertices = np.column_stack([surface[field] for field in columns]).astype(np.float64)
         faces = surface["TRIV"].astype(np.float64)
-        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-            raise ValueError
-    except (ValueError, KeyError, TypeError, AttributeError):
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(
             "holds no struct 'surface' with X, Y, Z (or VERT) and TRIV, as the TOSCA shapes do: save it so, "
             "or export the mesh as OFF or PLY."
-        ) from None
+        )
     return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
 
 

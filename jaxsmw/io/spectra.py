@@ -28,7 +28,7 @@ from jaxsmw.io.mat_files import (
     read_variables,
     write_variables,
 )
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
 
 # A shape of another library, told by its attributes, and a matrix that may be sparse; see `make_spectrum`.
 SpectrumLike: TypeAlias = Any
@@ -70,14 +70,8 @@ def make_spectrum(
     """
     if eigenvectors is None and vertex_areas is None:
         eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
-    values, vectors, areas = (
-        _real(array, what, name)
-        for array, what in (
-            (eigenvalues, "eigenvalues"),
-            (eigenvectors, "eigenvectors"),
-            (_lumped(vertex_areas), "vertex areas"),
-        )
-    )
+    values, vectors = _real(eigenvalues, "eigenvalues", name), _real(eigenvectors, "eigenvectors", name)
+    areas = _real(_lumped(vertex_areas, vectors.shape, name), "vertex areas", name)
     k, n = values.size, areas.size
     if values.ndim != 1 or areas.ndim != 1 or vectors.shape != (n, k) or not 1 <= k <= n:
         raise InputError(
@@ -122,13 +116,22 @@ def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
     )
 
 
-def _lumped(areas: Any) -> Any:
-    """Areas as a list, also from a mass matrix: the sums of its rows."""
+def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
+    """Vertex areas as a list, also from a mass matrix: the sums of its rows.
+
+    `shape` is that of the eigenvectors, (n, k).
+    """
     areas = to_host(areas)
     if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # of PyTorch
         matrix = areas.to_sparse_coo().coalesce()
         areas = sp.coo_array((np.asarray(matrix.values()), np.asarray(matrix.indices())), shape=matrix.shape)
     if sp.issparse(areas) or np.ndim(areas) == 2:
+        # A sparse matrix of a hostile file can have so many rows that their sums would fill the memory.
+        if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
+            raise InputError(
+                f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
+                "other: for n vertices give an (n, n) matrix."
+            )
         return np.asarray(areas.sum(axis=1)).ravel()
     return areas
 
@@ -170,12 +173,18 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if Path(path).suffix != ".npz":
         raise InputError(f"{path}: spectra are read from .npz and .mat: give one of these.")
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
+    limit = largest_contents(size_of_file(path))
     try:
         with np.load(path, allow_pickle=False) as file:
+            if sum(member.file_size for member in file.zip.infolist()) > limit:
+                raise InputError(
+                    f"{path}: would take more than 1 GiB of memory and more than four times its own size: "
+                    "write it again, with nothing but a spectrum in it."
+                )
             arrays = [file[field] for field in fields]
-    except FileNotFoundError:
-        raise InputError(f"{path}: does not exist: check the path.") from None
-    except Exception:  # NumPy, too, answers damaged files with whatever goes wrong first
+    except InputError:
+        raise
+    except Exception:  # NumPy answers damaged files with whatever goes wrong first
         raise InputError(f"{path}: is damaged or lacks one of {', '.join(fields)}: write it again.") from None
     return make_spectrum(*arrays, name=name)
 

@@ -19,6 +19,16 @@ ten million vertices.
 """
 
 
+def largest_contents(size_of_file: int) -> int:
+    """The size up to which the contents of a compressed file are plausible, in bytes.
+
+    Contents may always take 1 GiB, as a mesh of ten million vertices does. Larger contents are eigenvectors,
+    which hardly compress: four times the size of their file is generous. A hostile file unpacks to a thousand
+    times its size.
+    """
+    return max(2**30, 4 * size_of_file)
+
+
 def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FILE) -> bytes:
     """Read a whole file.
 
@@ -31,21 +41,35 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
 
     **Raises:** `InputError` if the file does not exist, is not a regular file, is too large or unreadable.
     """
+    size = size_of_file(path)
+    if largest is not None and size > largest:
+        raise InputError(
+            f"{path}: is larger than {largest >> 30} GiB, the limit for reading: decimate the mesh."
+        )
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def size_of_file(path: str | os.PathLike[str]) -> int:
+    """The size of a regular file in bytes.
+
+    **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be looked at.
+    """
     try:
         status = os.stat(path)
-        if stat.S_ISREG(status.st_mode) and (largest is None or status.st_size <= largest):
-            return Path(path).read_bytes()
     except FileNotFoundError:
         raise InputError(f"{path}: does not exist: check the path.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise InputError(
-            f"{path}: cannot be read ({_reason(error)}): check the path and its permissions."
-        ) from error
+        raise _unreadable(path, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a regular file: give the path of a file.")
-    raise InputError(
-        f"{path}: is larger than {(largest or 0) >> 30} GiB, the limit for reading: decimate the mesh."
-    )
+    return status.st_size
+
+
+def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
+    return InputError(f"{path}: cannot be read ({_reason(error)}): check the path and its permissions.")
 
 
 @contextmanager
