@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
 from jaxsmw.io.mat_files import find_structs, is_real, parse_variables
+from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
 
@@ -112,10 +113,8 @@ def _numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines colum
 
 
 def _starts_with_numbers(line: str, columns: int) -> bool:
-    try:
-        return len([float(word) for word in line.split()[:columns]]) == columns
-    except ValueError:
-        return False
+    words = line.split()[:columns]
+    return len(words) == columns and all(is_number(word, finite=False) for word in words)
 
 
 def _excerpt(line: str) -> str:
@@ -262,10 +261,16 @@ def _parse_ply(data: bytes) -> _Polygons:
     body = data[last.end() :]
     if encoding == "ascii":
         # Text becomes a binary body in which every number is a float64.
+        words = body.split()
         try:
-            body = np.array(body.split(), dtype=np.float64).tobytes()
+            if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
+                raise ValueError
+            body = np.array(words, dtype=np.float64).tobytes()
         except ValueError:
-            raise InputError("has a word where a number should be: export it again.") from None
+            culprit = next(w for w in words if not is_number(w.decode("latin-1"), finite=False))
+            raise InputError(
+                f"{_excerpt(culprit.decode('latin-1'))} stands where a number should be: export it again."
+            ) from None
 
     tables, offset = {}, 0
     for name, (count, properties) in elements.items():
@@ -291,12 +296,13 @@ def _parse_ply(data: bytes) -> _Polygons:
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
     """The encoding, and for each element the number of rows and the properties."""
-    formats = [line.split()[1] for line in lines if re.match(r"format\s+\S", line)]
-    if len(formats) != 1 or formats[0] not in _PLY_BYTE_ORDERS:
+    formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
+    if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
         raise InputError(
-            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)}: export it again."
+            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)} in version 1.0: "
+            "export it again."
         )
-    encoding = formats[0]
+    encoding = formats[0][0]
 
     def number(name: str) -> np.dtype:
         return np.dtype(np.float64 if encoding == "ascii" else _PLY_BYTE_ORDERS[encoding] + _PLY_TYPES[name])
