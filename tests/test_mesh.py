@@ -81,6 +81,10 @@ def test_arrays_are_copied_and_stored_row_by_row():
     assert mesh.vertices.flags.c_contiguous and mesh.faces.flags.c_contiguous
 
 
+# A sheet with more edges than the square.
+BUMPS = bumpy_grid(4).vertices.tolist()
+BUMP_FACES = (bumpy_grid(4).faces + 4).tolist()
+
 BAD_ARRAYS = {
     "no vertices": ([], SQUARE_FACES, "no vertices"),
     "no faces": (SQUARE, [], "no faces"),
@@ -112,6 +116,22 @@ BAD_ARRAYS = {
     "too large": (np.array(SQUARE) * 1e200, SQUARE_FACES, "another unit"),
     "beyond the largest float apart": ((np.array(SQUARE) * 2.0 - 1) * 1.7e308, SQUARE_FACES, "another unit"),
     "too small": (np.array(SQUARE) * 1e-200, SQUARE_FACES, "another unit"),
+    "a corner far away": (
+        [*SQUARE[:3], [0, -1e30, 0], *BUMPS],
+        [*SQUARE_FACES, *BUMP_FACES],
+        "vertex 3 (counted from 0) lies 9e+29 median edge lengths from the origin",
+    ),
+    "an unreferenced vertex far away": (
+        [*SQUARE, [0, 0, 1e13]],
+        SQUARE_FACES,
+        "vertex 4 (counted from 0) lies 1e+13 median edge lengths from the origin",
+    ),
+    "a corner far from all others": (
+        [*SQUARE[:3], [0, -1e7, 0], *BUMPS],
+        [*SQUARE_FACES, *BUMP_FACES],
+        "vertex 3 (counted from 0) lies 9e+06 median edge lengths from the middle",
+    ),
+    "far from the origin": (np.array(SQUARE) + 1e13, SQUARE_FACES, "move the mesh to the origin"),
 }
 
 
@@ -123,6 +143,14 @@ def test_bad_arrays_end_in_one_sentence(vertices, faces, fault, weld):
     message = str(caught.value)
     assert message.startswith("my body: ") and fault in message
     assert "\n" not in message and message.endswith(".")
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1, 1e20])
+def test_what_float64_resolves_is_taken(scale):
+    """Far from the origin, in any unit, and with a far corner."""
+    for vertices in (np.array(SQUARE) + 1e11, [*SQUARE, [1e11, 0, 0]], [*SQUARE[:3], [0, 1e5, 0]]):
+        mesh = make_mesh(np.array(vertices) * scale, SQUARE_FACES)
+        np.testing.assert_array_equal(mesh.vertices, np.array(vertices) * scale)
 
 
 def test_cleaning_drops_faces_and_keeps_vertices():
@@ -825,7 +853,7 @@ COORDINATES = st.one_of(
 @given(vertices=hnp.arrays(np.float64, st.tuples(st.integers(3, 8), st.just(3)), elements=COORDINATES))
 @settings(max_examples=100, deadline=None)
 def test_what_is_written_is_read_bit_for_bit(scratch, vertices):
-    vertices = np.concatenate([vertices, SQUARE])
+    vertices = np.concatenate([vertices, np.array(SQUARE) * 1e45])
     faces = np.array(SQUARE_FACES) + len(vertices) - 4
     faces = np.concatenate([faces, [[0, 1, 2]]])
     for suffix in (".off", ".ply"):

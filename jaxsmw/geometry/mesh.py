@@ -25,8 +25,13 @@ MeshLike: TypeAlias = Any
 # of coordinates that lie a few sizes of the body away from the origin, well below any triangle on purpose.
 DEGENERATE_HEIGHT = 1e-10
 
-# Between these sizes squares of areas, which come up in descriptors, neither overflow nor vanish.
-SMALLEST_SIZE, LARGEST_SIZE = 1e-60, 1e60
+# The coordinates that can be computed with; any others are damaged, or in a useless unit.
+# Between these extents of a mesh, squares of areas (which occur in descriptors) neither overflow nor vanish.
+SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
+# In median edge lengths. So far from the origin float64 rounds positions by 1e-4 of an edge. So far from the
+# middle of a mesh float32, in which maps are refined, rounds positions by 0.1 of an edge. (The meshes of the
+# data sets reach to 1e4.)
+LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,27 +315,16 @@ def make_mesh(
 
     **Raises:**
 
-    `InputError` for arrays of another shape or type, coordinates that are not finite, a size beyond
-    1e-60 … 1e60, indices out of range, no faces, no area, or something that is no triangle mesh.
+    `InputError` for arrays of another shape or type, coordinates that are not finite, an extent outside
+    1e-60 … 1e60, a vertex more than 1e12 median edge lengths from the origin or (on a face) 1e6 from the
+    middle of the mesh, indices out of range, no faces, no area, or an object that is not a triangle mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
     position = _numeric(vertices, "vertices", name)
     with np.errstate(over="ignore"):  # from a wider float type; the infinity is reported
         position = np.array(position, dtype=np.float64, order="C")
-    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
-    if len(lost):
-        raise InputError(
-            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
-            "with a coordinate that is not a finite number: repair the positions."
-        )
-    with np.errstate(over="ignore"):
-        size = float(np.ptp(position, axis=0).max())
-    if size > LARGEST_SIZE or 0 < size < SMALLEST_SIZE:
-        raise InputError(
-            f"{name}: the mesh measures {size:.0e} across, which is beyond what can be computed with: "
-            "choose another unit."
-        )
+    _check_extent(position, name)
     triangles = _indices(_numeric(faces, "faces", name), len(position), name)
     notes = list(notes)
 
@@ -355,6 +349,7 @@ def make_mesh(
             f"{name}: no triangle has an area, their corners coincide or lie on a line: "
             "check the positions and the faces."
         )
+    _check_resolution(mesh)
     rim = np.unique(mesh.boundary_edges)
     twin = lowest_twins(position[rim])
     seam = int((np.bincount(twin, minlength=len(rim))[twin] > 1).sum())
@@ -367,6 +362,42 @@ def make_mesh(
     if unused:
         notes.append(f"{count_of(unused, 'vertex')} of {len(position)} in no face.")
     return replace(mesh, notes=tuple(notes))
+
+
+def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
+    """Refuse coordinates that are not finite, and a mesh too large or too small for float64."""
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if len(lost):
+        raise InputError(
+            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
+            "with a coordinate that is not a finite number: repair the positions."
+        )
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(position, axis=0).max())
+    if extent > LARGEST_EXTENT or 0 < extent < SMALLEST_EXTENT:
+        raise InputError(
+            f"{name}: the mesh measures {extent:.0e} across, which is beyond what can be computed with: "
+            "choose another unit."
+        )
+
+
+def _check_resolution(mesh: Mesh) -> None:
+    """Refuse positions that floating-point numbers cannot tell from those of their neighbors."""
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    median = np.median(lengths[lengths > 0])
+    used = np.flatnonzero(mesh.used_vertices)
+    middle = np.median(mesh.vertices[used], axis=0)
+    for vertices, center, limit, place in (
+        (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
+        (used, middle, LARGEST_DISTANCE, "middle of the mesh"),
+    ):
+        distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
+        if distances.max() > limit:
+            raise InputError(
+                f"{mesh.name}: vertex {vertices[distances.argmax()]} (counted from 0) lies "
+                f"{distances.max():.0e} median edge lengths from the {place}, where numbers are too coarse "
+                "for its triangles: repair the position, or move the mesh to the origin."
+            )
 
 
 def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
