@@ -513,6 +513,19 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
     assert len(mesh.notes) == 1 and "4 vertices, numbered by first appearance" in mesh.notes[0]
 
 
+def test_welding_says_when_it_changes_nothing(saved):
+    """As for STL files, whose corners are merged in any case."""
+    path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
+    plain, welded = read_mesh(path), read_mesh(path, weld=True)
+    assert same_mesh(plain, welded) and diagnose(plain).components == 1
+    assert welded.notes == (
+        *plain.notes,
+        "Welding changed nothing: no two vertices of faces have the same position.",
+    )
+    twins = make_mesh([*SQUARE, SQUARE[0]], SQUARE_FACES, weld=True)
+    assert twins.faces.tolist() == SQUARE_FACES and "Welding changed nothing" in twins.notes[0]
+
+
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl"])
 def test_files_of_another_program(tmp_path, suffix):
     mesh = bumpy_grid(9)

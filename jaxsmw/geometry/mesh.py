@@ -332,7 +332,11 @@ def make_mesh(
         twin = lowest_twins(position)
         welded = int((twin[triangles] != triangles).any(axis=1).sum())
         triangles = twin[triangles]
-        notes.append(f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one.")
+        notes.append(
+            f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one."
+            if welded
+            else "Welding changed nothing: no two vertices of faces have the same position."
+        )
     ordered = np.sort(triangles, axis=1)
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeating.any():
