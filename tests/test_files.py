@@ -29,7 +29,7 @@ def test_the_file_appears_whole_or_not_at_all(tmp_path):
     assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
 
 
-def test_trouble_of_the_system_is_one_sentence(tmp_path):
+def test_system_errors_become_one_sentence(tmp_path):
     def fill() -> None:
         with atomic_write(tmp_path / "a.txt"):
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -40,7 +40,7 @@ def test_trouble_of_the_system_is_one_sentence(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "missing/a.txt", "/dev/null", ".", "/"])
-def test_places_that_cannot_be_written(tmp_path, name):
+def test_unwritable_places(tmp_path, name):
     with pytest.raises(InputError, match=r"cannot be written"), atomic_write(tmp_path / name) as temporary:
         temporary.write_text("x")
     assert list(tmp_path.iterdir()) == []
@@ -86,12 +86,12 @@ def test_many_writers_of_one_file_leave_one_whole_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_check_writable_tells_before_the_work_what_atomic_write_would_tell_after(tmp_path):
+def test_check_writable_raises_what_atomic_write_would_raise_later(tmp_path):
     check_writable(tmp_path / "new.txt")
     (tmp_path / "old.txt").write_text("x")
     check_writable(tmp_path / "old.txt")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["old.txt"]
-    # Nobody can create files in /proc, whatever permissions say.
+    # Nobody can create files in /proc, although its permissions allow it.
     for path in (
         tmp_path,
         tmp_path / "no" / "such.txt",
@@ -156,7 +156,7 @@ def test_read_bytes(tmp_path):
             read_bytes(path)
 
 
-def test_check_directory_tells_before_the_work_and_leaves_nothing(tmp_path):
+def test_check_directory_raises_before_the_work_and_leaves_nothing(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "kept").mkdir()
     check_directory(tmp_path / "new" / "one")
