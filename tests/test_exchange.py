@@ -114,16 +114,16 @@ def test_match_accepts_meshes_of_other_libraries(bodies, spectra, pointwise_map)
 
 
 NOT_MESHES = {
-    "a number": (3, "int is no triangle mesh"),
-    "vertices alone": (np.zeros((4, 3)), "ndarray is no triangle mesh"),
-    "a point cloud": (SimpleNamespace(vertices=np.zeros((4, 3)), faces=None), "no faces beside vertices"),
+    "a number": (3, "int is not a triangle mesh"),
+    "vertices alone": (np.zeros((4, 3)), "ndarray is not a triangle mesh"),
+    "a point cloud": (SimpleNamespace(vertices=np.zeros((4, 3)), faces=None), "lacks vertices or faces"),
     "polygons": (
-        SimpleNamespace(points=np.eye(4, 3), faces=np.array([4, 0, 1, 2, 3])), "not all its faces are triangles"),
+        SimpleNamespace(points=np.eye(4, 3), faces=np.array([4, 0, 1, 2, 3])), "not all faces are triangles"),
     "triangles and a polygon": (
         SimpleNamespace(points=np.eye(5, 3), faces=np.array([3, 0, 1, 2, 7, 0, 1, 2, 3, 4, 0, 1])),
-        "not all its faces are triangles"),
-    "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is no triangle mesh"),
-    "a path": ("body.off", "is the name of a file: read it with jaxsmw.read_mesh first"),
+        "not all faces are triangles"),
+    "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is not a triangle mesh"),
+    "a path": ("body.off", "is a file name: read the file with jaxsmw.read_mesh first"),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Meshes: checking and cleaning, properties, every file format in and out, and files that lie."""
+"""Meshes: checks and cleaning, properties, every file format in both directions, and hostile files."""
 
 import dataclasses
 import errno
@@ -49,7 +49,7 @@ def same_mesh(a: Mesh, b: Mesh) -> bool:
 
 @pytest.fixture
 def saved(tmp_path):
-    """Write a file and give its path."""
+    """Write a file and return its path."""
 
     def save(name: str, content: str | bytes) -> Path:
         path = tmp_path / name
@@ -66,7 +66,7 @@ def saved(tmp_path):
     "vertex_type", [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.int64]
 )
 @pytest.mark.parametrize("face_type", [np.int8, np.uint8, np.int32, np.uint64, np.float32])
-def test_any_numeric_type_is_taken(vertex_type, face_type):
+def test_all_numeric_types_are_accepted(vertex_type, face_type):
     mesh = make_mesh(np.array(SQUARE, vertex_type), np.array(SQUARE_FACES, face_type))
     assert mesh.vertices.dtype == np.float64 and mesh.vertices.tolist() == SQUARE
     assert mesh.faces.dtype == np.int64 and mesh.faces.tolist() == SQUARE_FACES
@@ -146,8 +146,8 @@ def test_bad_arrays_end_in_one_sentence(vertices, faces, fault, weld):
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1, 1e20])
-def test_what_float64_resolves_is_taken(scale):
-    """Far from the origin, in any unit, and with a far corner."""
+def test_distant_vertices_are_accepted_within_the_limits(scale):
+    """Far from the origin, with a distant unreferenced vertex, and with a distant corner, in any unit."""
     for vertices in (np.array(SQUARE) + 1e11, [*SQUARE, [1e11, 0, 0]], [*SQUARE[:3], [0, 1e5, 0]]):
         mesh = make_mesh(np.array(vertices) * scale, SQUARE_FACES)
         np.testing.assert_array_equal(mesh.vertices, np.array(vertices) * scale)
@@ -162,12 +162,12 @@ def test_cleaning_drops_faces_and_keeps_vertices():
         "From afar.",
         "1 face with a repeated vertex dropped.",
         "3 faces with the vertices of an earlier face dropped.",
-        "1 vertex of 5 in no face.",
+        "1 unreferenced vertex (in no face) of 5.",
     )
 
 
 def unwelded(mesh: Mesh) -> Mesh:
-    """The same surface with three vertices for each face."""
+    """The same surface with three separate vertices for each face."""
     return make_mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
 
 
@@ -181,19 +181,19 @@ def test_welding_closes_a_seam_without_renumbering():
     assert np.array_equal(welded.vertices[welded.faces], seam.vertices[seam.faces])
     found = diagnose(welded)
     assert (found.components, found.boundary_edges, found.unused_vertices) == (1, 0, 18)
-    # The lowest-numbered of the twins is the one that stays in use.
+    # Faces use the lowest-numbered of the vertices at the same position.
     for i in np.flatnonzero(welded.used_vertices):
         assert i == (seam.vertices == seam.vertices[i]).all(axis=1).argmax()
     assert any("Welding changed" in note for note in welded.notes)
     assert not any("--weld" in note for note in welded.notes)
 
 
-def test_welding_takes_only_equal_positions_and_both_zeros_are_equal():
+def test_welding_joins_only_equal_positions_and_both_zeros_are_equal():
     vertices = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [1 + 1e-15, 0, 0], [0, -1, 0]]
     assert make_mesh(vertices, [[0, 1, 2], [3, 5, 4]], weld=True).faces.tolist() == [[0, 1, 2], [0, 5, 4]]
 
 
-def test_no_seam_is_reported_where_twins_are_not_both_on_a_boundary():
+def test_no_seam_is_reported_away_from_boundaries():
     vertices = np.concatenate([OCTAHEDRON.vertices, OCTAHEDRON.vertices])
     mesh = make_mesh(vertices, np.concatenate([OCTAHEDRON.faces, OCTAHEDRON.faces + 6]))
     assert mesh.notes == ()
@@ -241,12 +241,12 @@ def test_octahedron_in_closed_form():
 
 
 def test_normals_are_zero_where_they_cancel():
-    # Both sides of a triangle, the other side in two pieces so that rounding leaves a little.
+    # Both sides of a triangle; the other side consists of two triangles, so that rounding leaves a residue.
     corners = np.array(
         [[0.1, 0.2, 0.3], [1, 0, 0.5], [0, 1, 0.7], [1, 0, 0.5], [0, 1, 0.7], [0.3, 0.7, 0.64]]
     )
     mesh = make_mesh(corners, [[0, 1, 2], [0, 5, 3], [0, 4, 5]])
-    assert mesh._area_vectors.sum(axis=0).any(), "else this tests nothing"
+    assert mesh._area_vectors.sum(axis=0).any(), "otherwise the test is trivial"
     assert (mesh.vertex_normals[0] == 0).all()
     assert np.allclose(np.linalg.norm(mesh.vertex_normals[1:], axis=1), 1)
 
@@ -289,7 +289,7 @@ DIAGNOSES = {
 
 
 @pytest.mark.parametrize(("faces", "expected"), DIAGNOSES.values(), ids=DIAGNOSES)
-def test_what_is_unusual_is_counted(faces, expected):
+def test_peculiarities_are_counted(faces, expected):
     found = dataclasses.asdict(diagnose(make_mesh(POINTS, faces)))
     usual = dict(
         vertices=12, faces=len(faces), components=1, boundary_edges=0, boundary_loops=1, nonmanifold_edges=0,
@@ -299,15 +299,15 @@ def test_what_is_unusual_is_counted(faces, expected):
     assert found == usual | expected
 
 
-def test_sentences_name_each_finding_once():
+def test_each_finding_has_one_sentence():
     vertices = np.concatenate([POINTS, [POINTS[0] * 0.5 + POINTS[1] * 0.5]])
     faces = [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 7], [5, 6, 8], [5, 9, 10], [0, 1, 12]]
     sentences = diagnose(make_mesh(vertices, faces)).sentences()
     for sentence, part in zip(
         sentences,
-        ["13 vertices, 7 faces, 2 connected components, open.", "1 vertex in no face",
+        ["13 vertices, 7 faces, 2 connected components, open.", "1 unreferenced vertex (in no face): never",
          "15 boundary edges in 2 loops", "1 non-manifold edge (", "1 non-manifold vertex:",
-         "1 edge between faces of opposite orientation", "1 face without area"],
+         "1 edge between faces of opposite orientation", "1 degenerate triangle without area"],
         strict=True,
     ):  # fmt: skip
         assert sentence.startswith(part) and sentence.endswith(".") and "\n" not in sentence
@@ -323,7 +323,7 @@ def test_degenerate_faces_are_relative_and_at_any_scale():
 
 @given(seed=st.integers(0, 2**32 - 1), log_scale=st.floats(-20, 20))
 @settings(max_examples=30, deadline=None)
-def test_renumbering_moving_and_scaling(seed, log_scale):
+def test_properties_are_invariant_to_renumbering_motion_and_scale(seed, log_scale):
     random = np.random.default_rng(seed)
     mesh = make_mesh(
         random.normal(size=(30, 3)), np.stack([random.choice(30, 3, replace=False) for _ in range(40)])
@@ -444,7 +444,7 @@ SQUARE_FILES = {
 
 
 @pytest.mark.parametrize("name", SQUARE_FILES)
-def test_every_way_to_write_a_square(saved, name):
+def test_all_files_of_a_square_give_the_same_mesh(saved, name):
     mesh = read_mesh(saved(name.replace("\\", ""), SQUARE_FILES[name]))
     assert mesh.vertices.tolist() == SQUARE and mesh.faces.tolist() == SQUARE_FACES
     assert (mesh.notes != ()) == ("quad" in name)
@@ -514,7 +514,7 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
 
 
 def test_welding_says_when_it_changes_nothing(saved):
-    """As for STL files, whose corners are merged in any case."""
+    """For example in STL files, whose corners the reader merges."""
     path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
     plain, welded = read_mesh(path), read_mesh(path, weld=True)
     assert same_mesh(plain, welded) and diagnose(plain).components == 1
@@ -733,7 +733,7 @@ HOSTILE = {
 def test_hostile_files_end_in_one_sentence(saved, name):
     content, fault = HOSTILE[name]
     path = saved(name, content)
-    if fault is None:  # strange, and yet all there
+    if fault is None:  # the file is strange but complete
         assert read_mesh(path).faces.tolist() == [[0, 1, 2]]
         return
     tracemalloc.start()
@@ -750,7 +750,7 @@ def test_hostile_files_end_in_one_sentence(saved, name):
     assert peak < 4e6
 
 
-def test_paths_that_are_no_files(tmp_path):
+def test_paths_that_are_not_files(tmp_path):
     for path, fault in [
         (tmp_path / "missing.off", "does not exist"),
         (tmp_path / "no" / "such" / "directory.off", "does not exist"),
@@ -768,7 +768,7 @@ def test_paths_that_are_no_files(tmp_path):
         assert str(caught.value).startswith(f"{path}: ") and fault in str(caught.value)
 
 
-def test_a_pipe_is_not_waited_for(tmp_path):
+def test_a_pipe_is_refused_without_waiting(tmp_path):
     path = tmp_path / "pipe.off"
     os.mkfifo(path)
     with pytest.raises(InputError, match="not a regular file"):
@@ -789,7 +789,7 @@ def test_no_permission(saved, monkeypatch):
 def test_a_terabyte_is_not_read(tmp_path):
     path = tmp_path / "sparse.off"
     with path.open("wb") as file:
-        file.truncate(2**40)  # takes no space on the disk
+        file.truncate(2**40)  # a sparse file takes no space on the disk
     with pytest.raises(InputError, match=r"sparse\.off: is larger than 1 GiB"):
         read_mesh(path)
 
@@ -804,7 +804,7 @@ def scratch(tmp_path_factory) -> Path:
 
 
 def read_or_refuse(path: Path) -> None:
-    """Either a sound mesh or one sentence, whatever is in the file."""
+    """Read a file; the result must be a sound mesh or an error of one sentence."""
     try:
         mesh = read_mesh(path)
     except InputError as error:
@@ -820,7 +820,7 @@ def read_or_refuse(path: Path) -> None:
 
 @given(junk=st.binary(max_size=300), start=st.sampled_from(STARTS), suffix=st.sampled_from(SUFFIXES))
 @settings(max_examples=400, deadline=None)
-def test_junk_is_refused_politely(scratch, junk, start, suffix):
+def test_junk_is_refused_in_one_sentence(scratch, junk, start, suffix):
     path = scratch / f"junk{suffix}"
     path.write_bytes(start + junk)
     read_or_refuse(path)
@@ -865,7 +865,7 @@ COORDINATES = st.one_of(
 
 @given(vertices=hnp.arrays(np.float64, st.tuples(st.integers(3, 8), st.just(3)), elements=COORDINATES))
 @settings(max_examples=100, deadline=None)
-def test_what_is_written_is_read_bit_for_bit(scratch, vertices):
+def test_written_meshes_are_read_back_bit_for_bit(scratch, vertices):
     vertices = np.concatenate([vertices, np.array(SQUARE) * 1e45])
     faces = np.array(SQUARE_FACES) + len(vertices) - 4
     faces = np.concatenate([faces, [[0, 1, 2]]])
@@ -877,7 +877,7 @@ def test_what_is_written_is_read_bit_for_bit(scratch, vertices):
 
 
 @pytest.mark.parametrize("suffix", [".off", ".ply", ".OFF"])
-def test_other_programs_read_what_is_written(tmp_path, suffix):
+def test_another_program_reads_written_meshes(tmp_path, suffix):
     mesh = bumpy_grid(5)
     colors = np.random.default_rng(0).integers(0, 256, (25, 3), dtype=np.uint8)
     path = tmp_path / f"m{suffix}"
@@ -939,7 +939,7 @@ def test_bad_targets_write_nothing(tmp_path, name):
 
 
 def read_plainly(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The data sets' files, all of one kind, without any of the code under test."""
+    """Read an OFF file of the data sets without the code under test."""
     words = path.read_text().split()
     n, f = int(words[1]), int(words[2])
     numbers = np.array(words[4:], float)

@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
+from jaxsmw.geometry.mesh import Mesh, count_of, first_equal_rows, make_mesh
 from jaxsmw.io.mat_files import find_structs, is_real, parse_variables
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
@@ -221,7 +221,7 @@ def _parse_stl(data: bytes) -> _Polygons:
         )
     else:
         raise InputError("is neither a text nor a binary STL file: export the mesh again.")
-    appearance, faces = np.unique(lowest_twins(corners), return_inverse=True)
+    appearance, faces = np.unique(first_equal_rows(corners), return_inverse=True)
     note = (
         "STL files have no shared vertices: corners at the same position were merged into "
         f"{count_of(len(appearance), 'vertex')}, numbered by first appearance."
