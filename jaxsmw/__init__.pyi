@@ -59,7 +59,7 @@ from .core.triangles import nearest_point_on_triangles
 from .descriptors import describe
 from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
-from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
+from .evaluation.ground_truth import GroundTruth, read_ground_truth
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
 from .geometry.assignment import one_to_one_map
 from .geometry.creature import CreaturePair, creature_pair
@@ -69,14 +69,15 @@ from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
 from .initial_maps import initial_map
-from .io.exchange import (
+from .io.map_files import read_pointwise_map, write_pointwise_map
+from .io.mesh_files import read_mesh, write_mesh
+from .io.spectra import (
     make_spectrum,
     read_functional_map,
     read_spectrum,
     write_functional_map,
     write_spectrum,
 )
-from .io.mesh_files import read_mesh, write_mesh
 from .matching import Correspondence, match
 from .pair import Pair, paired_spectra
 from .preparation import PreparedPair, prepare

@@ -491,8 +491,9 @@ def _demo(options: argparse.Namespace) -> None:
     from jaxsmw.report.figures import check_drawable
 
     check_drawable()
-    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
+    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
     from jaxsmw.geometry.creature import creature_pair
+    from jaxsmw.io.map_files import write_pointwise_map
     from jaxsmw.io.mesh_files import write_mesh
 
     check_directory(options.output)
@@ -529,7 +530,8 @@ def _match(options: argparse.Namespace) -> None:
     files = options.output, options.surface_points, options.one_to_one, options.expected_error
     for path in filter(None, files):
         check_writable(path)
-    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth, write_pointwise_map
+    from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
+    from jaxsmw.io.map_files import write_pointwise_map
 
     mesh_x, mesh_y = _read(options.source, options), _read(options.target, options)
     if options.one_to_one:
@@ -600,7 +602,7 @@ def _preset(options: argparse.Namespace) -> Any:
             "them out."
         )
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-    from jaxsmw.presets import Stage
+    from jaxsmw.stage import Stage
 
     chosen = {name: getattr(options, name) for name in changes}
     solution = chosen.get("solution", "filtering")
@@ -764,7 +766,7 @@ def _match_outputs(options: argparse.Namespace) -> list[str]:
         raise InputError(
             f"{expected}: expected errors are written as text; choose another name, such as .txt."
         )
-    from jaxsmw.evaluation.ground_truth import check_map_name
+    from jaxsmw.io.map_files import check_map_name
 
     for path in filter(None, (options.output, options.one_to_one)):
         check_map_name(path)
@@ -821,7 +823,7 @@ def _errors(
 def _spectrum(options: argparse.Namespace) -> None:
     _check_outputs(options, options.mesh)
     if options.output:
-        from jaxsmw.io.exchange import check_spectrum_path
+        from jaxsmw.io.spectra import check_spectrum_path
 
         check_spectrum_path(options.output)
     if not options.figure and (options.filters is not None or options.bank is not None):
@@ -844,7 +846,7 @@ def _spectrum(options: argparse.Namespace) -> None:
     if options.output:
         import jax
 
-        from jaxsmw.io.exchange import write_spectrum
+        from jaxsmw.io.spectra import write_spectrum
 
         with jax.enable_x64(True):
             write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
@@ -908,7 +910,7 @@ def _read_truth(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Grou
 
 
 def _read_maps(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> dict[str, Any]:
-    from jaxsmw.evaluation.ground_truth import read_pointwise_map
+    from jaxsmw.io.map_files import read_pointwise_map
 
     return {
         path: read_pointwise_map(path, mesh_x, mesh_y, index_base=_index_base(path, options))
@@ -926,7 +928,7 @@ def _index_base(path: str, options: argparse.Namespace) -> Any:
 
 
 def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
-    from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
+    from jaxsmw.io.map_files import read_landmarks, read_pointwise_map
 
     kind, _, path = options.init.partition(":")
     if not path and kind in ("shot", "wks", "hks", "wavelet", "functional"):
