@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as partial_function
 from itertools import islice
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int64
 
+from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS, PresetName
 from jaxsmw.core.refinement import Refinement, Refiner, Samples, WaveletPreservation, refine
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression, Regression
@@ -49,9 +50,9 @@ class Stage:
     """
 
     refiner: Refiner = field(default_factory=WaveletPreservation)
-    number_of_eigenvectors: int = 100
+    number_of_eigenvectors: int = NUMBER_OF_EIGENVECTORS
     number_of_descriptors: int = 0
-    iterations: int = 3
+    iterations: int = ITERATIONS
     number_of_samples: int | None = None
     stop_when_unchanged: bool = False
     mending: Stage | None = None
@@ -145,7 +146,7 @@ def _registration(*levels: int) -> Stage:
     return Stage(Registration(levels), max(levels), 30, len(levels), 1000)
 
 
-Preset = Literal["fast", "paper", "accurate"]
+Preset = PresetName
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (Stage(number_of_samples=500),),
     "paper": (Stage(),),

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
+from jaxsmw.choices import ITERATIONS, Search
 from jaxsmw.core.banks.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import all_finite, check_choice, check_kind, counts_iterations
 from jaxsmw.core.functional_map import Convention
@@ -142,9 +143,6 @@ class Refinement(eqx.Module):
         return dataclasses.replace(self, pointwise_map=kept, history=history)
 
 
-Search = Literal["auto", "exhaustive", "patches", "approximate"]
-
-
 class WaveletPreservation(Refiner):
     """Multiscale spectral manifold wavelets preservation: Algorithm 1 of the MWP paper, with any frame.
 
@@ -254,7 +252,7 @@ def refine(
     pointwise_map: Int[Array, " m"],
     *,
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = 3,
+    iterations: int = ITERATIONS,
     samples_x: Int[Array, " s_x"] | None = None,
     samples_y: Int[Array, " s_y"] | None = None,
     stop_when_unchanged: bool = False,

@@ -14,20 +14,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, count_of
 from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.runtime.files import atomic_write
-
-IndexBase = Literal[0, 1]
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial as partial_function
 from itertools import islice
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import InitialMap
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.refinement import WaveletPreservation
@@ -35,7 +35,7 @@ from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.threads import side_by_side
 
-Start = Literal["shot", "wks", "hks", "wavelet", "functional"]
+Start = InitialMap
 
 _SIGNATURES = {
     "wks": wave_kernel_signature,
