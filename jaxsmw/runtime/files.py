@@ -6,7 +6,7 @@ import os
 import tempfile
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from jaxsmw.errors import InputError
@@ -35,6 +35,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))
     temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+    _unfinished.add(temporary)
     try:
         _check_target(path)
         temporary.touch(exist_ok=False)
@@ -46,6 +47,21 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         # Nothing is left to remove after success, nor where the directory itself was the trouble.
         if os.path.lexists(temporary):
             temporary.unlink()
+        _unfinished.discard(temporary)
+
+
+# The temporary files of the blocks that are open now.
+_unfinished: set[Path] = set()
+
+
+def remove_unfinished() -> None:
+    """Remove the temporary files of all open blocks of `atomic_write`.
+
+    For a process that ends within such a block, without leaving the block first.
+    """
+    for temporary in _unfinished.copy():
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -55,8 +71,9 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
     `InputError` if there is no such directory, or it or the file in it may not be written to.
     """
-    _check_target(path)
-    try:  # permissions do not tell all
+    try:
+        _check_target(path)
+        # Permissions do not tell all.
         with tempfile.TemporaryFile(dir=Path(os.path.realpath(path)).parent):
             pass
     except OSError as error:
@@ -91,7 +108,8 @@ def check_directory(path: str | os.PathLike[str]) -> None:
 
     `InputError` if it cannot be made or written to.
     """
-    missing = [place for place in (Path(path), *Path(path).parents) if not place.exists()]
+    # Unlike `Path.exists`, this test accepts any name; `make_directory` refuses a name that is too long.
+    missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
     make_directory(path)
     for place in missing:
         place.rmdir()
