@@ -1,7 +1,7 @@
 """The names that settings accept, and default sizes.
 
-The command line shows them in its help. This module imports nothing heavy, so that the help need not wait for
-JAX, NumPy and SciPy.
+The help of the command line shows these names. This module imports nothing heavy, so the help need not wait
+for JAX, NumPy and SciPy.
 """
 
 from typing import Literal
@@ -49,7 +49,7 @@ MethodName = Literal[
 ]
 """The methods of a benchmark; see `jaxsmw.evaluation.opponents.opponents.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""Further methods, each for those who have installed the library that it is from."""
+"""The methods of other libraries, for a benchmark where these libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

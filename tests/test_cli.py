@@ -333,14 +333,14 @@ def test_maps_for_and_from_matlab(run, pair, tmp_path):
     init = f"map:{tmp_path / 'truth.mat'}"
     for name in ("map.txt", "map.mat"):
         outcome = run("match", *meshes, *SMALL, "--init", init, "--output", tmp_path / name, "--quiet")
-        assert outcome.code == 0 and "counts, from 1" in outcome.errors
+        assert outcome.code == 0 and "is read with indices from 1, as usual in MATLAB" in outcome.errors
     found = scipy.io.loadmat(written)["T12"]
     np.testing.assert_array_equal(found[:, 0] - 1, np.loadtxt(tmp_path / "map.txt"))
-    # The map and the truth are both read as MATLAB counts, and a note says so for each.
+    # The map and the truth are both read with indices from 1, and a note says so for each.
     call = ("evaluate", *meshes, tmp_path / "truth.mat", "--ground-truth", tmp_path / "truth.mat", "--quiet")
     outcome = run(*call)
     assert outcome.code == 0 and mean_error(outcome.output) == 0
-    assert outcome.errors.count(f"note: {tmp_path / 'truth.mat'} is read as MATLAB counts, from 1") == 2
+    assert outcome.errors.count(f"note: {tmp_path / 'truth.mat'} is read with indices from 1") == 2
     from_0 = ("evaluate", *meshes, tmp_path / "from_0.mat", "--ground-truth", pair / "truth.txt", "--quiet")
     assert run(*from_0).code == 2
     outcome = run(*from_0, "--index-base", "0")
@@ -415,7 +415,7 @@ def test_the_expected_error_is_written(run, pair, tmp_path):
     assert run(*call, "--expected-error", tmp_path / "expected.txt").code == 0
     expected = np.loadtxt(tmp_path / "expected.txt")
     assert expected.shape == (642,) and expected.min() >= 0 and expected.mean() < 0.02
-    assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="another output as well")
+    assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="two outputs have this name")
 
 
 def test_the_report_is_no_place_for_the_map(run, pair, tmp_path):
@@ -424,7 +424,7 @@ def test_the_report_is_no_place_for_the_map(run, pair, tmp_path):
     for output in (tmp_path / "r" / "report.html", tmp_path / "new"):
         directory = tmp_path / "r" if output.name == "report.html" else output
         outcome = run(*call, "--output", output, "--report", directory)
-        assert_refused(outcome, naming="is another output as well")
+        assert_refused(outcome, naming="two outputs have this name")
     assert not (tmp_path / "new").exists() and not list((tmp_path / "r").iterdir())
 
 

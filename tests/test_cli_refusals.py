@@ -56,10 +56,10 @@ def test_benchmarks_without_their_libraries_are_refused(run, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("name", "fault"),
     [
-        ("points.txt", "ends in it"),
+        ("points.txt", "choose a name that ends in .baryc_gt"),
         ("missing/points.baryc_gt", "missing"),
         ("truth.baryc_gt", "is an input"),
-        ("errors.baryc_gt", "another output as well"),
+        ("errors.baryc_gt", "two outputs have this name"),
         ("start.baryc_gt", "is an input"),
     ],
 )
@@ -84,8 +84,8 @@ def test_one_to_one_map_that_does_not_exist_is_refused_at_once(run, pair, tmp_pa
 
 def test_outputs_of_one_name_are_refused(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "source.obj", *SMALL]
-    assert_refused(run(*call, "--one-to-one", tmp_path / "source.obj"), naming="another output as well")
-    assert_refused(run(*call, "--texture", tmp_path), naming="another output as well")
+    assert_refused(run(*call, "--one-to-one", tmp_path / "source.obj"), naming="two outputs have this name")
+    assert_refused(run(*call, "--texture", tmp_path), naming="two outputs have this name")
     (tmp_path / "target.obj").write_text("v 0 0 0\n")
     call = ["match", pair / "x.off", tmp_path / "target.obj", "--output", tmp_path / "map.txt", *SMALL]
     assert_refused(run(*call, "--texture", tmp_path), naming="is an input")
@@ -289,14 +289,14 @@ def test_two_outputs_of_evaluate_in_one_file_are_refused(run, pair, tmp_path, ou
     truth = pair / "truth.txt"
     call = ["evaluate", pair / "x.off", pair / "y.ply", truth, "--ground-truth", truth, "--quiet"]
     outcome = run(*call, *outputs.format(t=tmp_path).split())
-    assert_refused(outcome, naming="is another output as well")
+    assert_refused(outcome, naming="two outputs have this name")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "link.svg"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "fault"),
     [
-        ("spectrum {x} --output {t}/s.npz --figure {t}/../{t.name}/s.npz", "is another output as well"),
+        ("spectrum {x} --output {t}/s.npz --figure {t}/../{t.name}/s.npz", "two outputs have this name"),
         ("match {x} {y} --output {t}/m --report {t}/m/r", "lies in {t}/m, which is an output file"),
         ("demo --output {t}/d --init map:{t}/d/map.txt", "d/map.txt: is an input and would be overwritten"),
         ("benchmark {t} --pairs {t} --output {t}", "cannot be read as text"),
@@ -375,7 +375,7 @@ def test_huge_numbers(run, pair, tmp_path, arguments, number):
     text = "1" + "0" * 5000 if number > 10**40 else str(number)
     outcome = run(*words, text)
     assert_refused(outcome, naming=f"argument {words[-1]}: ")
-    fault = "is not a whole number" if number > 10**40 else f"{number}' is too large: give at most"
+    fault = "is not a whole number" if number > 10**40 else f"{number} is too large: give at most"
     assert fault in outcome.errors and len(outcome.errors) < 250
     assert list(tmp_path.iterdir()) == []
 

@@ -10,7 +10,7 @@ from typing import get_args
 from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian
 from jaxsmw.errors import InputError
 
-# JAX counts in 32 bits.
+# JAX counts with 32 bits.
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
@@ -18,26 +18,26 @@ MAP_FORMS = "one target vertex per line, or a .npy file, or a .mat file counted 
 
 
 def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int]:
-    """An argument type: a whole number between two limits."""
+    """Returns an argument type: the whole numbers between two limits."""
 
     def convert(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{_shown(text)} is not a whole number") from None
+            raise argparse.ArgumentTypeError(f"{_shortened(text)!r} is not a whole number") from None
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
         if value > most:
-            raise argparse.ArgumentTypeError(f"{_shown(text)} is too large: give at most {most}")
+            raise argparse.ArgumentTypeError(f"{_shortened(text)} is too large: give at most {most}")
         return value
 
     return convert
 
 
 def path(text: str) -> str:
-    """An argument type: the name of a file or directory that exists or could exist."""
+    """Argument type: the name of a file or directory, which need not exist."""
     if not text:
-        raise argparse.ArgumentTypeError("the name is empty: name a file or directory, or leave this out")
+        raise argparse.ArgumentTypeError("the name is empty: give the name of a file or directory")
     try:
         os.lstat(text)
     except (FileNotFoundError, NotADirectoryError):
@@ -45,14 +45,14 @@ def path(text: str) -> str:
     except (OSError, ValueError) as error:
         fault = getattr(error, "strerror", None) or error
         raise argparse.ArgumentTypeError(
-            f"{_shown(text)} cannot be used ({fault}): choose another name"
+            f"{_shortened(text)!r} cannot be used ({fault}): choose another name"
         ) from None
     return text
 
 
-def _shown(text: str) -> str:
-    """The text, shortened for a message."""
-    return repr(text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…")
+def _shortened(text: str) -> str:
+    """Returns the beginning of a long text, for a message."""
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +61,7 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
 
 
 def add_source_and_target(parser: argparse.ArgumentParser) -> None:
-    """Add the two meshes of a pair."""
+    """Add the source and the target mesh."""
     parser.add_argument(
         "source", type=path, metavar="SOURCE", help="source mesh: every vertex gets a match on the target"
     )
@@ -69,7 +69,7 @@ def add_source_and_target(parser: argparse.ArgumentParser) -> None:
 
 
 def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
-    """Add the options of eigenbases."""
+    """Add `--laplacian` and `--eigensolver`."""
     parser.add_argument(
         "--laplacian",
         choices=get_args(Laplacian),
@@ -88,12 +88,12 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
 
 
 def add_weld(parser: argparse.ArgumentParser) -> None:
-    """Add the option of reading meshes."""
+    """Add `--weld`."""
     parser.add_argument("--weld", action="store_true", help="merge vertices at exactly the same position")
 
 
 def add_index_base(parser: argparse.ArgumentParser) -> None:
-    """Add the option of reading maps, landmarks and ground truth."""
+    """Add `--index-base`."""
     parser.add_argument(
         "--index-base",
         type=int,
@@ -104,7 +104,7 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
 
 
 def add_partial(parser: argparse.ArgumentParser) -> None:
-    """Add the option of partial shapes."""
+    """Add `--partial`."""
     parser.add_argument(
         "--partial",
         action="store_true",
@@ -113,7 +113,7 @@ def add_partial(parser: argparse.ArgumentParser) -> None:
 
 
 def add_up(parser: argparse.ArgumentParser) -> None:
-    """Add the option of pictures."""
+    """Add `--up`."""
     parser.add_argument(
         "--up",
         choices=get_args(Axis),
@@ -128,9 +128,9 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
 
     - `needed`: the other option, for the message.
     - `is_given`: whether the other option is given.
-    - `names`: of the options, as attributes.
+    - `names`: the options, as attributes of `options`.
 
-    **Raises:** `InputError` for the first option that is given in vain.
+    **Raises:** `InputError` for the first option that has no effect.
     """
     for name in names:
         value = getattr(options, name)

@@ -11,7 +11,7 @@ from jaxsmw.errors import InputError
 if TYPE_CHECKING:
     from jaxsmw.core.banks.filters import FilterBank
 
-# The classes by their names; the first one is the paper's bank.
+# The class of each bank. The first bank is the paper's.
 BANKS = {
     "meyer": "Meyer",
     "simple-tight": "SimpleTight",
@@ -29,14 +29,14 @@ BANKS = {
     "identity": "Identity",
 }
 _PAPER_BANK = next(iter(BANKS))
-# Banks with this beginning follow the distribution of the eigenvalues.
+# Banks whose name begins so are warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# An eigenbasis seldom has more eigenvalues to tell apart.
+# Eigenbases have fewer eigenvalues, and a filter needs at least one.
 _MOST_FILTERS = 10_000
 
 
 def add_bank(parser: argparse._ActionsContainer) -> None:
-    """Add the options of the filter bank; None where an option is not given."""
+    """Add `--bank` and `--filters`; an option that is not given is None."""
     parser.add_argument(
         "--bank",
         choices=tuple(BANKS),
@@ -52,7 +52,7 @@ def add_bank(parser: argparse._ActionsContainer) -> None:
 
 
 def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
-    """The bank of a name, with a number of filters.
+    """Returns the named bank, by default the paper's, with a number of filters, by default the bank's own.
 
     **Raises:** `InputError` if the bank cannot have this number of filters.
     """
@@ -68,21 +68,21 @@ def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
         try:
             bank = kind(number_of_filters)
         except ValueError as error:
-            raise InputError(f"--filters {number_of_filters}: {error}; ask for more.") from error
+            raise InputError(f"--filters {number_of_filters}: {error}; give a larger number.") from error
     return filters.Warped(bank, filters.SpectralDistribution()) if name.startswith(_ADAPTED) else bank
 
 
 def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
-    """The frame bounds of a bank; None for a tight frame."""
+    """Returns the frame bounds of a bank, or None for a tight frame."""
     import equinox as eqx
     import jax.numpy as jnp
 
     from jaxsmw.core.frames import frame_bounds
 
-    # Eigenvalues of a surface are nearly evenly spaced. Compiled as one program instead of forty.
+    # Eigenvalues of a surface are nearly evenly spaced. One compiled program replaces forty small ones.
     lower, upper = map(float, eqx.filter_jit(frame_bounds)(bank, jnp.arange(101.0), over="interval"))
     return None if upper < _TIGHT * lower else (lower, upper)
 
 
-# The bounds of tight frames differ by rounding errors, those of the other banks by a third and more.
+# The bounds of tight frames differ by rounding errors; those of the other banks differ by a third or more.
 _TIGHT = 1.01

@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure what is missing of the pairs, then print and write the tables of all."""
+    """Match and measure the pairs that have no results yet, then write and print the tables of all pairs."""
     from jaxsmw.report.figures import check_drawable
 
     check_drawable()

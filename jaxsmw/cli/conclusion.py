@@ -24,7 +24,7 @@ def measure_match(
     stopwatch: Stopwatch,
     others: Mapping[str, Any],
 ) -> dict[str, GeodesicError]:
-    """The errors of the initial map, of others and of the refined map; empty without a ground truth."""
+    """Returns the errors of the initial, the other and the refined maps, by name; none without a truth."""
     if truth is None:
         return {}
     maps = {
@@ -45,7 +45,7 @@ def write_match_report(
     *,
     up: Any,
 ) -> None:
-    """Write the report of a match; the summary in the report has the options as settings."""
+    """Write the report of a match; its summary lists the options as settings."""
     from jaxsmw.report.summary import write_report
 
     report_progress("report ...")

@@ -1,4 +1,4 @@
-"""What a command says: results on standard output, everything else on standard error."""
+"""The output of commands: results go to standard output, all messages to standard error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def show(text: str) -> None:
 
 
 def flush_output() -> None:
-    """Write what standard output still holds back.
+    """Write the buffer of standard output.
 
     **Raises:** As `show`.
     """
@@ -38,7 +38,7 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python flushes once more at its end and would complain again.
+        # Python writes the buffer once more at its end, and would report the same error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise
@@ -49,8 +49,9 @@ def _writing_output() -> Iterator[None]:
 
 def say(message: str) -> None:
     """Print a message on standard error."""
-    with suppress(OSError):  # without a place for messages the work goes on
-        print(message, file=sys.stderr, flush=True)
+    if sys.stderr is not None:
+        with suppress(OSError):  # a lost message is no reason to stop the work
+            print(message, file=sys.stderr, flush=True)
 
 
 def report_progress(message: str) -> None:
@@ -78,18 +79,18 @@ class Stopwatch:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Measure a block as a step with a name; blocks with the same name are added up."""
+        """Measure a block as a step. The times of steps with the same name are added."""
         began = time.perf_counter()
         yield
         self.add({name: time.perf_counter() - began})
 
     def add(self, seconds: dict[str, float]) -> None:
-        """Add steps that were measured elsewhere, in seconds by name."""
+        """Add steps that were measured elsewhere: seconds by the name of the step."""
         for name, more in seconds.items():
             self._seconds[name] = self._seconds.get(name, 0.0) + more
 
     def summary(self) -> str:
-        """The time until now, and how it divides into steps; `other` is the time outside of all steps."""
+        """Returns the total time and the time of each step; `other` is the time outside of all steps."""
         total = time.perf_counter() - self._began
         steps = {**self._seconds, "other": total - sum(self._seconds.values())}
         return f"{total:.2f} s: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in steps.items())

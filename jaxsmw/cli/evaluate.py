@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the errors of all maps, and write what the options ask for."""
+    """Print the errors of all maps, and write the requested files."""
     check_evaluation(options)
     refuse_without(options, "--page", bool(options.page), "partial", "up")
     check_outputs(

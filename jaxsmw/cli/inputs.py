@@ -1,4 +1,4 @@
-"""Reading of the files that commands work on."""
+"""The files that commands read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
-    """Read a mesh, and say what is unusual about the mesh, except with `--quiet`."""
+    """Read a mesh; describe the mesh on standard error, except with `--quiet`."""
     from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(file, weld=weld)
@@ -29,7 +29,7 @@ def read_mesh_file(file: str, *, weld: bool) -> Mesh:
 
 
 def describe_mesh(mesh: Mesh) -> list[str]:
-    """Sentences about the file and the surface of a mesh."""
+    """Returns sentences about a mesh: notes from reading the file, size, and what is unusual."""
     from jaxsmw.geometry.mesh import diagnose
 
     return [*mesh.notes, *diagnose(mesh).sentences()]
@@ -49,7 +49,7 @@ def read_truth(
 def read_maps(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Read pointwise maps X -> Y, by their files; see `jaxsmw.read_pointwise_map`."""
+    """Read pointwise maps X -> Y; returns each by the name of its file. See `jaxsmw.read_pointwise_map`."""
     from jaxsmw.evaluation.ground_truth import read_pointwise_map
 
     maps = {}
@@ -60,7 +60,7 @@ def read_maps(
 
 
 def initial_map(text: str) -> str:
-    """An argument type: the name of an initial map, or `landmarks:FILE` or `map:FILE`."""
+    """Argument type: the name of an initial map, or `landmarks:FILE` or `map:FILE`."""
     kind, _, file = text.partition(":")
     if file and kind in _INITIAL_MAP_FILES:
         path(file)
@@ -74,12 +74,12 @@ _INITIAL_MAP_FILES = ("landmarks", "map")
 
 
 def initial_map_file(init: str) -> str | None:
-    """The file in the value of `--init`, if any."""
+    """Returns the file that `--init` names, or None."""
     return init.partition(":")[2] or None
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
-    """The value of `--init` as `jaxsmw.match` takes it: a name, or the contents of a file."""
+    """Returns the initial map for `jaxsmw.match`: a name, or the contents of the file that `--init` names."""
     from jaxsmw.evaluation.ground_truth import read_landmarks, read_pointwise_map
 
     kind, _, file = init.partition(":")
@@ -91,8 +91,11 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
-    """Say that a MATLAB file counts from 1, unless the user has said how it counts."""
+    """Say that indices in a MATLAB file begin at 1, unless `--index-base` is given."""
     from jaxsmw.io.mat_files import is_mat_file
 
     if index_base is None and is_mat_file(file):
-        say(f"note: {file} is read as MATLAB counts, from 1; if it counts from 0, add --index-base 0.")
+        say(
+            f"note: {file} is read with indices from 1, as usual in MATLAB; if its indices begin at 0, add "
+            "--index-base 0."
+        )

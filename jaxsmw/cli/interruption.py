@@ -1,9 +1,9 @@
-"""The end of the process on Ctrl-C: soon, at any moment, with one line and without unfinished files.
+"""The end of the process on Ctrl-C: at once, with one line, without unfinished files.
 
-Python's own way, an exception in whatever code happens to run, does not serve. Compiled code delays the
-exception until it returns. Callbacks of JAX print the exception and go on. Imports of extension modules turn
-it into other errors. Here the process ends at once instead, from its main thread or from a thread that waits
-for the signal.
+Python would raise `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the code
+returns to Python. Functions that run at a garbage collection swallow the exception, and imports of extension
+modules turn it into other errors. Here nothing is raised. A signal handler in the main thread ends the
+process; while the main thread runs compiled code, a second thread does.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-# The main thread ends the process as soon as it runs Python code; after this time the other thread does.
+# The main thread ends the process as soon as it runs Python code. The second thread acts after these seconds.
 _PATIENCE = 0.2
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
-# Held from the first interruption on.
+# The first interruption locks this for good.
 _ending = threading.Lock()
 
 
 def end_when_interrupted() -> None:
-    """End this process on SIGINT from now on, unless its parent had the signal ignored."""
+    """End this process on SIGINT from now on, unless its parent process ignores the signal for it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         return
     signal.signal(signal.SIGINT, _end)
@@ -37,18 +37,18 @@ def end_when_interrupted() -> None:
 
 
 def announce_consequence(consequence: str) -> None:
-    """Let the line say from now on what an interruption means for a command with a progress bar."""
+    """Set the line of a command with a progress bar: what an interruption means for the results."""
     global _message
-    # The cursor is behind the bar.
+    # The cursor stands behind the progress bar.
     _message = f"\njaxsmw: interrupted; {consequence}.\n"
 
 
 @contextmanager
 def quiet_children() -> Iterator[None]:
-    """Python processes that this thread starts in the block say nothing about an interruption.
+    """Keep the processes that this thread starts in the block from printing at an interruption.
 
-    A terminal sends SIGINT to them, too, but they inherit a blocked SIGINT. In this process another thread
-    takes the signal. The process that removes the semaphores of `multiprocessing` gives no warnings.
+    A terminal sends SIGINT to these processes as well, so they inherit a blocked SIGINT. Another thread of
+    this process receives the signal. The process that removes leaked semaphores does not warn of them.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
@@ -64,7 +64,7 @@ def _wait_for_signal(reading: int) -> None:
         pass  # another signal
     time.sleep(_PATIENCE)
     _end()
-    # The main thread was first, but does not get on, for example because nobody reads its message.
+    # The main thread was first but is stuck, for example because nobody reads its message.
     time.sleep(1)
     _die()
 
@@ -75,31 +75,31 @@ def _end(*_: Any) -> None:
     console = -1
     with suppress(OSError):  # standard error may be closed
         console = os.dup(2)
-        # Other threads go on for a moment. What they print would follow the one line.
+        # Other threads still run for a moment; their messages would surround the line.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
     _remove_unfinished_files()
     with suppress(OSError):  # nobody may read standard error
-        # A terminal shows "^C" where the cursor is.
+        # A terminal has just printed "^C".
         line = f"\n{_message.lstrip()}" if os.isatty(console) else _message
-        # Not `print`, which fails within another `print`.
+        # `print` would fail if it were interrupted by itself.
         os.write(console, line.encode(errors="surrogateescape"))
     _die()
 
 
 def _remove_unfinished_files() -> None:
-    with suppress(Exception):  # the module may be half loaded
+    with suppress(Exception):  # the module may not be loaded completely
         if files := sys.modules.get("jaxsmw.runtime.files"):
             files.remove_unfinished()
 
 
 def _die() -> None:
-    """Die of SIGINT: a shell ends its loop only if the process in the loop dies of the signal."""
+    """Die of SIGINT: a shell ends its loop only if the interrupted command dies of the signal."""
     with suppress(Exception):
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        else:  # here `signal.signal` refuses to work
+        else:  # `signal.signal` works in the main thread only
             import ctypes
 
             ctypes.pythonapi.PyOS_setsig(signal.SIGINT, signal.SIG_DFL)

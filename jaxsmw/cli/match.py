@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes and write what the options ask for."""
+    """Match two meshes, write the requested files, and print errors and times."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse now what would fail after minutes of work, and load the libraries."""
+    """Refuse options and outputs that would fail after minutes of work, and load the libraries."""
     init_file = initial_map_file(options.init)
     check_preset(options)
     check_evaluation(options)
@@ -116,10 +116,12 @@ def _check(options: argparse.Namespace) -> None:
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
     points, expected = options.surface_points, options.expected_error
     if points and Path(points).suffix != ".baryc_gt":
-        raise InputError(f"{points}: points are written as .baryc_gt; choose a name that ends in it.")
+        raise InputError(
+            f"{points}: surface points are written as .baryc_gt: choose a name that ends in .baryc_gt."
+        )
     if expected and Path(expected).suffix in (".npy", ".mat"):
         raise InputError(
-            f"{expected}: expected errors are written as text; choose another name, such as .txt."
+            f"{expected}: expected errors are written as text: choose another name, such as one in .txt."
         )
     from jaxsmw.evaluation.ground_truth import check_map_name
 
@@ -130,11 +132,11 @@ def _check(options: argparse.Namespace) -> None:
         files=[options.output, points, options.one_to_one, expected],
         directories=_directories(options),
     )
-    import jaxsmw.matching  # noqa: F401 (the loading is measured)
+    import jaxsmw.matching  # noqa: F401 (imported here for the stopwatch)
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """The directories to write, with the names of their files."""
+    """Returns the requested directories with the names of their files."""
     directories: list[tuple[str, tuple[str, ...]]] = []
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
@@ -154,7 +156,7 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Any]:
-    """Write all files but those of the report; return the maps besides the refined one, by their names."""
+    """Write all files but the report; returns the maps besides the refined one, by name."""
     from jaxsmw.evaluation.ground_truth import write_pointwise_map
 
     others: dict[str, Any] = {}
@@ -184,7 +186,7 @@ def _write_files(
 
 
 def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: Any) -> None:
-    """Write what is made from points on the surface."""
+    """Write the surface points and the texture."""
     if options.surface_points:
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
 

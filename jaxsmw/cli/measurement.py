@@ -30,7 +30,7 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
 
 
 def add_evaluation(parser: argparse.ArgumentParser) -> None:
-    """Add the options of geodesic errors; None where an option is not given."""
+    """Add the options of geodesic errors; an option that is not given is None."""
     parser.add_argument(
         "--evaluation-samples",
         metavar="N",
@@ -60,7 +60,7 @@ def check_evaluation(options: argparse.Namespace) -> None:
 
 
 def evaluation_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """The given options of `add_evaluation` as `jaxsmw.geodesic_error` takes them."""
+    """Returns the given options of `add_evaluation` as arguments of `jaxsmw.geodesic_error`."""
     settings = {
         "method": options.geodesics,
         "number_of_samples": options.evaluation_samples,
@@ -72,7 +72,7 @@ def evaluation_settings(options: argparse.Namespace) -> dict[str, Any]:
 def measure_errors(
     mesh_y: Mesh, maps: Mapping[str, Any], truth: GroundTruth, settings: Mapping[str, Any]
 ) -> dict[str, GeodesicError]:
-    """The geodesic errors of maps, by the maps' names; `settings` are those of `evaluation_settings`."""
+    """Returns the geodesic error of each map, by name; `settings` are those of `evaluation_settings`."""
     from jaxsmw.evaluation.metrics import geodesic_error
 
     report_progress("geodesic errors ...")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jaxsmw.matching import Correspondence
     from jaxsmw.presets import Stage
 
-# The solutions by their names, with their arguments; the first one is the paper's.
+# The class and the arguments of each solution. The first solution is the paper's.
 _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "filtering": ("Filtering", ()),
     "least-squares": ("LeastSquares", ()),
@@ -36,7 +36,7 @@ _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _PAPER_SOLUTION = next(iter(_SOLUTIONS))
 
-# The options that change the paper's method, as attributes.
+# The options that change the paper's method, as attributes of the options.
 _CHANGES = (
     "eigenvectors",
     "bank",
@@ -47,7 +47,7 @@ _CHANGES = (
     "search",
     "stop_when_unchanged",
 )
-# The preset that these options change.
+# The preset that these options need.
 _PAPER: PresetName = "paper"
 
 
@@ -82,7 +82,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_changes(group: argparse._ActionsContainer) -> None:
-    """Add the options in `_CHANGES`; None where an option is not given."""
+    """Add the options in `_CHANGES`; an option that is not given is None."""
     group.add_argument(
         "--eigenvectors",
         metavar="N",
@@ -127,24 +127,24 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Refuse a preset together with options that change another one.
+    """Refuse options that change the paper's method together with another preset.
 
     **Raises:** `InputError` that names the option.
     """
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
-            f"{changes[0]}: changes the paper's method, which --preset {options.preset} is not: leave one of "
-            "them out."
+            f"{changes[0]}: changes the paper's method, but --preset {options.preset} is another method: "
+            "leave one of the two options out."
         )
 
 
 def preset_name(options: argparse.Namespace) -> PresetName:
-    """The name of the chosen preset."""
+    """Returns the name of the given preset, of the paper's if an option changes it, or of the default."""
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
-    """The given options that change the paper's method."""
+    """Returns the given options that change the paper's method."""
     return [f"--{name.replace('_', '-')}" for name in _CHANGES if getattr(options, name) is not None]
 
 
@@ -157,11 +157,10 @@ def match_meshes(
     partial: bool = False,
     index_base: IndexBase | None = None,
 ) -> Correspondence:
-    """Match two meshes as the options say.
+    """Match two meshes with the options of `add_method`.
 
     **Arguments:**
 
-    - `options`: those of `add_method`.
     - `index_base`: the number of the first vertex in a file of `--init`.
 
     **Raises:** `InputError` if an option does not fit the meshes.
@@ -191,7 +190,7 @@ def match_meshes(
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
-    """The paper's method with the given changes."""
+    """Returns the paper's method with the given changes."""
     from jaxsmw.presets import Stage
 
     settings: dict[str, Any] = {
@@ -232,5 +231,5 @@ def _note_loose_frame(name: str, bounds: tuple[float, float] | None) -> None:
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings without those that are None, which keep the library's defaults."""
+    """Returns the settings that are not None; the library has defaults for the others."""
     return {name: value for name, value in settings.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Output files: their check before the work, pages that compare maps, and messages about written files."""
+"""The files that commands write: their check before the work, and messages about them after it."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
     if place in read:
         raise InputError(f"{path}: is an input and would be overwritten: choose another name.")
     if place in taken:
-        raise InputError(f"{path}: is another output as well: choose another name for one of them.")
+        raise InputError(f"{path}: two outputs have this name: choose another name for one of them.")
 
 
 def is_page(path: str) -> bool:
-    """Whether the name is that of an HTML page."""
+    """Returns whether the name is that of an HTML page."""
     return Path(path).suffix.lower() in (".html", ".htm")
 
 
@@ -89,7 +89,7 @@ def _check_page(path: str) -> None:
     from jaxsmw.report.figures import check_drawable
 
     if not is_page(path):
-        raise InputError(f"{path}: a page is written as .html; choose a name that ends in it.")
+        raise InputError(f"{path}: pages are written as .html: choose a name that ends in .html.")
     check_drawable()
     _check_writable(path)
 
@@ -101,7 +101,7 @@ def _check_writable(path: str) -> None:
 
 
 def report_written(*paths: str | os.PathLike[str]) -> None:
-    """Say which files the command has written, except with `--quiet`."""
+    """Name written files on standard error, except with `--quiet`."""
     for path in paths:
         report_progress(f"wrote {path}")
 
@@ -116,7 +116,7 @@ def write_comparison_page(
     partial: bool,
     up: Axis | None,
 ) -> None:
-    """Write a page with several maps; the page names each map by the shortest unique end of its path.
+    """Write a page that compares maps. The page calls each map by as much of its path as is unique.
 
     **Arguments:**
 

@@ -26,21 +26,21 @@ class Parser(argparse.ArgumentParser):
     """A parser that refuses bad arguments with one sentence and exit code 2."""
 
     def __init__(self, **settings: Any) -> None:
-        # An abbreviation would change its meaning when another option begins with it.
+        # An abbreviation would change its meaning with every new option that begins alike.
         super().__init__(allow_abbrev=False, **settings)
 
     def print_help(self, file: Any = None) -> None:
-        """Print the help on standard output; unlike argparse, fail if this is impossible."""
+        """Print the help on standard output; argparse would ignore errors."""
         show(self.format_help().rstrip())
 
     def error(self, message: str) -> NoReturn:
-        """Print the message and exit."""
+        """Print the message on standard error and exit with code 2."""
         say(f"{self.prog}: {message} (see {self.prog} --help)")
         sys.exit(2)
 
 
 def make_parser() -> Parser:
-    """The parser of all commands; the parsed options have the command's function in `run`."""
+    """Returns the parser of all commands. Parsed options have the function of the command in `run`."""
     parser = Parser(
         prog="jaxsmw",
         description="Match two triangle meshes (OFF, OBJ, PLY, STL or MATLAB's MAT) of the same kind of body "
@@ -57,7 +57,7 @@ def make_parser() -> Parser:
 
 
 class _Version(argparse.Action):
-    """Print the version; the version is looked up only then, which takes longer than the whole help."""
+    """Print the version. The look-up is slow, so it waits until someone asks for the version."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace, page: bool) -> None:
-    """Refuse arguments that do not fit each other."""
+    """Refuse arguments that contradict each other, and outputs that cannot be written."""
     output = options.output
     if options.target and not options.map:
         raise InputError(f"{options.target}: a second mesh needs a map; give the map as the third file.")

@@ -20,7 +20,7 @@ def run_command(arguments: Sequence[str]) -> int:
             _run(arguments)
         finally:
             flush_output()
-    except SystemExit as ending:  # the parser's, for help and for bad arguments
+    except SystemExit as ending:  # from the parser, for help and bad arguments
         return int(ending.code or 0)
     except InputError as error:
         say(f"jaxsmw: {error}")
@@ -32,7 +32,7 @@ def run_command(arguments: Sequence[str]) -> int:
         detail = f" ({error})" if str(error) else ""
         say(f"jaxsmw: this machine has too little memory{detail}: give smaller meshes or smaller numbers.")
         return 1
-    except BrokenPipeError:  # whoever read standard output has gone and wants no message
+    except BrokenPipeError:  # nobody reads standard output any more, for example after `head`
         return 1
     return 0
 

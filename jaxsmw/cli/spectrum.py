@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print what is unusual about the mesh and its eigenvalues, and write what the options ask for."""
+    """Describe the mesh, print its eigenvalues, and write the requested files."""
     refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _lines(eigenvalues: np.ndarray) -> list[str]:
-    """The eigenvalues in lines that begin with the number of the first one."""
+    """Returns lines of eigenvalues; each line begins with the number of its first eigenvalue."""
     lines = []
     for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[first : first + _EIGENVALUES_PER_LINE])

@@ -50,14 +50,14 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         _unfinished.discard(temporary)
 
 
-# The temporary files of the blocks that are open now.
+# The temporary files of all open blocks.
 _unfinished: set[Path] = set()
 
 
 def remove_unfinished() -> None:
     """Remove the temporary files of all open blocks of `atomic_write`.
 
-    For a process that ends within such a block, without leaving the block first.
+    A process calls this function if it ends while a block is open.
     """
     for temporary in _unfinished.copy():
         with suppress(OSError):
@@ -73,7 +73,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """
     try:
         _check_target(path)
-        # Permissions do not tell all.
+        # A file system may refuse files in spite of the permissions.
         with tempfile.TemporaryFile(dir=Path(os.path.realpath(path)).parent):
             pass
     except OSError as error:
@@ -108,7 +108,7 @@ def check_directory(path: str | os.PathLike[str]) -> None:
 
     `InputError` if it cannot be made or written to.
     """
-    # Unlike `Path.exists`, this test accepts any name; `make_directory` refuses a name that is too long.
+    # `Path.exists` would raise an error for a name that is too long; `make_directory` refuses such a name.
     missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
     make_directory(path)
     for place in missing:
