@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.map_files import IndexBase, Table
+from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
 # How far weights in a file, printed with few digits, may lie below 0 and their sum from 1.

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
+from jaxsmw.choices import Search
 from jaxsmw.core.banks.filters import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
@@ -19,8 +20,6 @@ from jaxsmw.core.search import Patches
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
-
-Search = Literal["auto", "exhaustive", "patches", "approximate"]
 
 
 class PreparedWavelets(Prepared):
