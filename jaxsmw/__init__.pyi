@@ -1,8 +1,8 @@
-from .core.banks.filters import (
-    ControlPoints,
+from .core.banks import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,
+    FrameBounds,
     Gabor,
     HalfCosine,
     Heat,
@@ -22,8 +22,10 @@ from .core.banks.filters import (
     SpectralDistribution,
     Warp,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
@@ -84,7 +86,6 @@ __version__: str
 __all__ = [
     "PRESETS",
     "RESULTS",
-    "ControlPoints",
     "Correspondence",
     "CreaturePair",
     "CubicSpline",

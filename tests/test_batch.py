@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline
+from jaxsmw.core.banks import CubicSpline
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares

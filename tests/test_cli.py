@@ -17,8 +17,8 @@ import trimesh
 from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw.cli.main import _BANKS, _NOT_TIGHT, main
-from jaxsmw.core.banks import filters
-from jaxsmw.core.frames import frame_bounds
+from jaxsmw.core import banks
+from jaxsmw.core.banks import frame_bounds
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
@@ -163,7 +163,7 @@ def test_benchmarks_without_their_libraries_are_refused(run, tmp_path, monkeypat
 
 def test_banks_said_to_be_not_tight_are_those():
     for name, kind in _BANKS.items():
-        lower, upper = frame_bounds(getattr(filters, kind)(), jnp.arange(101.0), over="interval")
+        lower, upper = frame_bounds(getattr(banks, kind)(), jnp.arange(101.0), over="interval")
         assert (0.99 < lower <= upper < 1.01) == (name not in _NOT_TIGHT)
 
 

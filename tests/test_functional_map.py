@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import Meyer
-from jaxsmw.core.frames import frame_function
+from jaxsmw.core.banks import Meyer, frame_function
 from jaxsmw.core.functional_map import (
     QuadraticEnergy,
     dual_eigenvectors,

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw import descriptors, matching, presets
 from jaxsmw.core import refinement
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.solutions import LeastSquares

@@ -9,7 +9,7 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import Logarithm, Meyer, Warped
+from jaxsmw.core.banks import Logarithm, Meyer, Warped
 from jaxsmw.core.functional_map import encode, wavelet_energy
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS

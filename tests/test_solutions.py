@@ -9,8 +9,7 @@ from jax.test_util import check_grads
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline, FilterBank, Meyer
-from jaxsmw.core.frames import frame_function
+from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer, frame_function
 from jaxsmw.core.functional_map import QuadraticEnergy
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS

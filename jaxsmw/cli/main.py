@@ -20,7 +20,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory
 
 if TYPE_CHECKING:
-    from jaxsmw.core.banks.filters import FilterBank
+    from jaxsmw.core.banks import FilterBank
     from jaxsmw.core.solutions import Solution
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
@@ -633,7 +633,7 @@ def _note_frame_bounds(options: argparse.Namespace) -> None:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from jaxsmw.core.frames import frame_bounds
+    from jaxsmw.core.banks import frame_bounds
 
     # On evenly spaced eigenvalues, as those of a surface nearly are; one program instead of forty.
     lower, upper = eqx.filter_jit(frame_bounds)(_bank(options), jnp.arange(101.0), over="interval")
@@ -941,10 +941,10 @@ def _read_init(options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh) -> Any:
 
 
 def _bank(options: argparse.Namespace) -> FilterBank:
-    from jaxsmw.core.banks import filters
+    from jaxsmw.core import banks
 
     name = options.bank or _DEFAULT_BANK
-    kind = getattr(filters, _BANKS[name])
+    kind = getattr(banks, _BANKS[name])
     if options.filters is None:
         bank = kind()
     elif "filters" not in kind.__dataclass_fields__:
@@ -955,5 +955,5 @@ def _bank(options: argparse.Namespace) -> FilterBank:
         except ValueError as error:
             raise InputError(f"--filters {options.filters}: {error}; ask for more.") from error
     if name.startswith("adapted-"):
-        return filters.Warped(bank, filters.SpectralDistribution())
+        return banks.Warped(bank, banks.SpectralDistribution())
     return bank

@@ -44,7 +44,7 @@ import jax.scipy as jsp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from jaxsmw.core.frames import frame_function
+from jaxsmw.core.banks import frame_function
 from jaxsmw.core.products import product
 from jaxsmw.core.soft_maps import PointwiseMap, pull_back
 from jaxsmw.core.spectrum import Spectrum

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.banks.filters import FilterBank, Meyer, sample_bank
+from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import all_finite, check_choice, check_kind, counts_iterations
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings

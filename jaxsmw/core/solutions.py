@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Float
 
+from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_choice
-from jaxsmw.core.frames import frame_function
 from jaxsmw.core.functional_map import (
     Convention,
     Norm,

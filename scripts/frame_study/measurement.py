@@ -26,7 +26,7 @@ from frame_study.variants import (
     tabulate,
 )
 from jaxsmw import read_mesh
-from jaxsmw.core.banks.filters import FilterBank, Meyer
+from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Problem, Refinement, Refiner, refine
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares

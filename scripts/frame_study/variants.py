@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import brentq
 
-from jaxsmw.core.banks.filters import (
+from jaxsmw.core.banks import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,
@@ -31,8 +31,10 @@ from jaxsmw.core.banks.filters import (
     SimpleTight,
     SpectralDistribution,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from jaxsmw.core.frames import frame_bounds, frame_function, tighten
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
 from jaxsmw.core.refinement import WaveletPreservation
 from jaxsmw.core.results import RESULTS

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Int64
 
-from jaxsmw.core.banks.filters import Identity
+from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
