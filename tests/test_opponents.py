@@ -75,7 +75,7 @@ def test_all_methods_mend_a_noisy_copy():
     n = len(y.mask)
     order = generator.permutation(n)
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
-    x = x.place(y.positions[order], y.normals[order])
+    x = x.with_positions(y.positions[order], y.normals[order])
     start = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
     pair = PreparedPair(

@@ -170,12 +170,15 @@ def test_signs_do_not_matter(case):
 
 
 def test_bad_numbers_are_reported(case):
-    broken = case.x.describe(case.x.descriptors.at[3, 2].set(jnp.nan))
+    broken = case.x.with_descriptors(case.x.descriptors.at[3, 2].set(jnp.nan))
     bad_start = np.full_like(case.start, len(case.whole.vertices))
     for arguments, expected in [
         ((broken, case.y, case.start), RESULTS.nonfinite_spectrum),
         ((case.x, case.y, bad_start), RESULTS.invalid_initial_map),
-        ((case.x.describe(case.x.descriptors * 1e200), case.y, case.start), RESULTS.nonfinite_functional_map),
+        (
+            (case.x.with_descriptors(case.x.descriptors * 1e200), case.y, case.start),
+            RESULTS.nonfinite_functional_map,
+        ),
     ]:
         bad = case.matched(*arguments)
         assert bad.result == expected
@@ -185,8 +188,8 @@ def test_bad_numbers_are_reported(case):
 def test_what_does_not_fit_is_refused(case):
     for x, y, options, message in [
         (case.x, case.y, {"turns": 0}, "at least 1 turn"),
-        (case.x.describe(None), case.y, {}, "number of descriptors"),
-        (case.x, case.y.describe(case.y.descriptors[:, :3]), {}, "number of descriptors"),
+        (case.x.with_descriptors(None), case.y, {}, "number of descriptors"),
+        (case.x, case.y.with_descriptors(case.y.descriptors[:, :3]), {}, "number of descriptors"),
     ]:
         with pytest.raises(ValueError, match=message):
             partial_functional_map(
@@ -211,7 +214,10 @@ def test_the_method_is_for_parts_only():
 
 
 def test_the_method_sees_what_a_pair_has(case):
-    x, y = case.x.describe(case.x.descriptors[:, :4]), case.y.describe(case.y.descriptors[:, :4])
+    x, y = (
+        case.x.with_descriptors(case.x.descriptors[:, :4]),
+        case.y.with_descriptors(case.y.descriptors[:, :4]),
+    )
     samples = jnp.arange(50), jnp.arange(50)
     meshes = case.part, case.whole
     pair = PreparedPair(case.x, case.y, jnp.asarray(case.start), samples, meshes=meshes, partial=True)
