@@ -26,7 +26,7 @@ from .core.banks import (
     frame_function,
     tighten,
 )
-from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
+from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
 from .core.refiners.feature_regression import FeatureRegression
@@ -183,7 +183,6 @@ __all__ = [
     "stack",
     "tighten",
     "wave_kernel_signature",
-    "wavelet_energy",
     "wavelet_signature",
     "write_functional_map",
     "write_mesh",

@@ -166,7 +166,9 @@ def test_vmap_is_the_loop(pair):
 
 def test_rows_that_are_not_those_of_the_vertices_are_refused(pair):
     x, _, _, _ = pair
-    with pytest.raises(ValueError, match=rf"descriptors have shape \(3, 2\); one row per vertex .*\({M}, d\)"):
+    with pytest.raises(
+        ValueError, match=rf"descriptors have shape \(3, 2\); one row per vertex .*\({M}, d\)"
+    ):
         x.with_descriptors(jnp.zeros((3, 2)))
     with pytest.raises(ValueError, match=rf"positions have shape .*; one row per vertex .*\({M}, 3\)"):
         x.with_positions(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 from synthetic import random_spectrum
 
 from jaxsmw.core.banks import Logarithm, Meyer, Warped
-from jaxsmw.core.functional_map import encode, wavelet_energy
+from jaxsmw.core.functional_map import WaveletProblem, encode
 from jaxsmw.core.refinement import WaveletPreservation, refine
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
@@ -103,7 +103,8 @@ def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
     np.testing.assert_allclose(soft, hard, atol=1e-14)
     g = Meyer(4)(x.eigenvalues, x.eigenvalues)
     for norm in ("area", "frobenius"):
-        energies = (wavelet_energy(t, x, y, g, g, convention=convention, norm=norm) for t in (start, one))
+        problem = WaveletProblem(x, y, g, g, convention)
+        energies = (problem.energy(t, norm=norm) for t in (start, one))
         expected, found = (energy(hard) for energy in energies)
         np.testing.assert_allclose(found, expected)
 

@@ -233,7 +233,7 @@ class WaveletPreservation(Refiner):
     def energy(
         self, problem: Problem, updated: Float[Array, "k_out k_in"], pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Eq. (5), area-weighted; see `wavelet_energy`."""
+        """Eq. (5), area-weighted; see `WaveletProblem.energy`."""
         wavelets, _, _ = problem.prepared
         return wavelets.energy(pointwise_map)(updated)
 

@@ -42,6 +42,7 @@ from jaxsmw.core.solutions import (
     Filtering,
     LeastSquares,
     NearestOrthogonal,
+    PreparedFiltering,
     RegularizedLeastSquares,
     Solution,
     WaveletProblem,
@@ -166,9 +167,8 @@ class BandMask(Filtering):
 
     mask: Float[Array, "k_out k_in"] = eqx.field(kw_only=True)
 
-    def prepare(self, problem: WaveletProblem) -> tuple[Array, Array]:
-        _, dual_out = super().prepare(problem)
-        return self.mask, dual_out
+    def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
+        return super().prepare(problem)._replace(kernel=self.mask)
 
 
 class Scaled(FilterBank):
