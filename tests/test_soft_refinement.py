@@ -421,7 +421,7 @@ def test_settings_that_do_not_exist(pair):
     with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
         refine_softly(x, y, start[:-3])
     short = Softmax()(x.eigenvectors[3:], y.eigenvectors, x.vertex_areas[3:], y.vertex_areas)
-    with pytest.raises(ValueError, match="maps 117 points to 120"):
+    with pytest.raises(ValueError, match="from 117 to 120 points, but the shapes have 120 and 120"):
         refine_softly(x, y, short)
     with pytest.raises(ValueError, match="Sinkhorn needs at least 1 iteration"):
         Sinkhorn(iterations=0)
