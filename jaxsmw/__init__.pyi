@@ -32,7 +32,7 @@ from .core.refinement import History, Refinement, Refiner, WaveletPreservation, 
 from .core.refiners.feature_regression import FeatureRegression
 from .core.refiners.registration import Registration
 from .core.results import RESULTS
-from .core.search import approximate_nearest_neighbor, nearest_neighbor
+from .core.search import nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.soft_maps import (
     NearestFew,
@@ -142,7 +142,6 @@ __all__ = [
     "WaveletPreservation",
     "WaveletPreservationLayer",
     "WaveletProblem",
-    "approximate_nearest_neighbor",
     "compiler_options",
     "compute_spectrum",
     "coverage",

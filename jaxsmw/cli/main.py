@@ -335,9 +335,9 @@ def _add_method(parser: argparse.ArgumentParser) -> None:
     )
     paper.add_argument(
         "--search",
-        choices=("auto", "exhaustive", "patches", "approximate"),
+        choices=("auto", "exhaustive", "patches"),
         help="for nearest neighbours: exhaustive and patches find the same ones, patches faster on large "
-        "meshes, and auto takes the faster; approximate misses some (jaxsmw[approximate]; default: auto)",
+        "meshes, and auto takes the faster (default: auto)",
     )
     paper.add_argument(
         "--stop-when-unchanged",
@@ -606,12 +606,7 @@ def _preset(options: argparse.Namespace) -> Any:
     solution = chosen.get("solution", "filtering")
     if solution == "filtering" and options.bank in _NOT_TIGHT:
         _note_frame_bounds(options)
-    try:
-        refiner = WaveletPreservation(
-            _bank(options), _solution(solution), search=chosen.get("search", "auto")
-        )
-    except ImportError as error:
-        raise InputError(f"--search {options.search}: {error}") from None
+    refiner = WaveletPreservation(_bank(options), _solution(solution), search=chosen.get("search", "auto"))
     names = {"eigenvectors": "number_of_eigenvectors", "samples": "number_of_samples"}
     kept = ("eigenvectors", "samples", "iterations", "stop_when_unchanged")
     return Stage(refiner, **{names.get(name, name): chosen[name] for name in kept if name in chosen})

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.core.functional_map import Convention, out_and_in
 from jaxsmw.core.products import product
-from jaxsmw.core.search import (
-    Patches,
-    approximate_nearest_neighbor,
-    make_patches,
-    nearest_neighbor,
-    nearest_neighbor_in_patches,
-)
+from jaxsmw.core.search import Patches, make_patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
+
+Search = Literal["auto", "exhaustive", "patches"]
+"""How nearest neighbours are found. All settings find the same; `"auto"` chooses the faster search."""
 
 
 def spectral_embeddings(
@@ -47,7 +46,6 @@ def decode(
     *,
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
-    approximate: bool = False,
 ) -> Int32[Array, " m"]:
     """Returns the pointwise map T: X -> Y of a functional map, by nearest neighbours (Algorithm 1, step 3).
 
@@ -56,15 +54,13 @@ def decode(
     **Arguments:**
 
     - `patches`: the `search_patches` of X and Y, which make the search faster on large shapes.
-    - `approximate`: whether the search may miss some neighbours; see `approximate_nearest_neighbor`.
 
     **Returns:** One vertex of Y per vertex of X, (m,).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     if patches is not None:
         return nearest_neighbor_in_patches(queries, database, *patches)
-    search = approximate_nearest_neighbor if approximate else nearest_neighbor
-    return search(queries, database, database_mask=spectrum_y.mask)
+    return nearest_neighbor(queries, database, database_mask=spectrum_y.mask)
 
 
 def decode_to_triangles(
@@ -107,7 +103,9 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     )
 
 
-def chosen_patches(search: str, spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches] | None:
+def chosen_patches(
+    search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> tuple[Patches, Patches] | None:
     """Returns the `search_patches` of a `search` setting, or None for an exhaustive search.
 
     The setting `"patches"` always uses patches. `"auto"` uses patches where they are faster.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -17,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import all_finite, check_choice, check_kind, counts_iterations
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
+from jaxsmw.core.pointwise_map import Search, chosen_patches, decode, spectral_embeddings
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
@@ -142,9 +141,6 @@ class Refinement(eqx.Module):
         return dataclasses.replace(self, pointwise_map=kept, history=history)
 
 
-Search = Literal["auto", "exhaustive", "patches", "approximate"]
-
-
 class WaveletPreservation(Refiner):
     """Multiscale spectral manifold wavelets preservation: Algorithm 1 of the MWP paper, with any frame.
 
@@ -163,11 +159,8 @@ class WaveletPreservation(Refiner):
     - `search`: how nearest neighbours are found. `"exhaustive"` compares all with all; `"patches"` finds the
       same but leaves out patches of the target that are too far away, which is several times as fast on a
       CPU but takes seconds longer to compile; `"auto"` does that on CPUs from 15 000 vertices.
-      `"approximate"` misses a few in a thousand of a good map, more of a poor one
-      (`approximate_nearest_neighbor`, needs FAISS).
 
-    **Raises:** `TypeError` for what is no bank or solution; `ValueError` for another choice; `ImportError` if
-    FAISS is to be used and not installed.
+    **Raises:** `TypeError` for what is no bank or solution; `ValueError` for another choice.
     """
 
     bank: FilterBank = Meyer()
@@ -182,8 +175,6 @@ class WaveletPreservation(Refiner):
         check_choice("convention", self.convention, get_args(Convention))
         check_choice("lambda_max", self.lambda_max, ("own", "common"))
         check_choice("search", self.search, get_args(Search))
-        if self.search == "approximate" and not find_spec("faiss"):
-            raise ImportError("search='approximate' needs FAISS: pip install 'jaxsmw[approximate]'")
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
         """The pair with the bank on both shapes' eigenvalues."""
@@ -227,7 +218,6 @@ class WaveletPreservation(Refiner):
             problem.spectrum_y,
             convention=self.convention,
             patches=patches,
-            approximate=self.search == "approximate",
         )
 
     def energy(

@@ -1,4 +1,4 @@
-"""Nearest neighbours: exact, among all rows or leaving out most of them; and approximate."""
+"""Exact nearest neighbours: by comparison with all points, or by patches, most of which can be skipped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
@@ -332,54 +331,3 @@ class _Found(NamedTuple):
     step: Int32[Array, ""]
     scores: Float[Array, "2 block"]
     rows: Int32[Array, "2 block"]
-
-
-def approximate_nearest_neighbor(
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
-    *,
-    database_mask: Bool[Array, " n"] | None = None,
-) -> Int32[Array, " m"]:
-    """For nearly every query the index of the nearest database row, by FAISS on the host, in float32.
-
-    Database rows in lists around k-means centers; of each query the lists of the four nearest centers are
-    searched (Jégou, Douze, Schmid, "Product quantization for nearest neighbor search", TPAMI 2011, without
-    the quantization). On spectral embeddings of surfaces, for a good map, 99.7 to 99.9 % of the queries find
-    the nearest row, the others one at nearly the same distance; for a poor map fewer do. Under `vmap`
-    examples are searched one after the other.
-
-    **Arguments:**
-
-    - `queries`, `database`: points in d dimensions.
-    - `database_mask`: rows with False are never chosen. If all are False the result is meaningless.
-
-    **Raises:** `ImportError` at the first search if FAISS is not installed (`pip install faiss-cpu`).
-    """
-    queries, database = lax.stop_gradient((queries, database))  # whole numbers have no derivatives
-    if database_mask is None:
-        database_mask = jnp.ones(database.shape[0], bool)
-    shape = jax.ShapeDtypeStruct(queries.shape[:1], jnp.int32)
-    return jax.pure_callback(_search_lists, shape, queries, database, database_mask, vmap_method="sequential")
-
-
-def _search_lists(queries: Array, database: Array, mask: Array) -> np.ndarray:
-    import faiss
-
-    allowed = np.flatnonzero(mask)
-    rows = np.ascontiguousarray(np.asarray(database)[allowed], np.float32)
-    if not np.isfinite(rows).all() or not len(rows):
-        return np.full(len(queries), len(mask), np.int32)  # no row, as the exact searches say
-    number = min(len(rows), round(_LISTS * len(rows) ** 0.5))
-    dimensions = rows.shape[1]
-    lists = faiss.IndexIVFFlat(faiss.IndexFlatL2(dimensions), dimensions, number)
-    lists.cp.niter, lists.cp.min_points_per_centroid = _TURNS, 1
-    lists.train(rows[:: max(1, len(rows) // (_PER_LIST * number))])
-    lists.add(rows)
-    lists.nprobe = _SEARCHED
-    _, found = lists.search(np.ascontiguousarray(queries, np.float32), 1)
-    # -1, the last here, is for queries that are no numbers.
-    return np.append(allowed, len(mask))[found[:, 0]].astype(np.int32)
-
-
-# Lists for each square root of the number of rows; how k-means goes to them; how many are searched.
-_LISTS, _TURNS, _PER_LIST, _SEARCHED = 3, 5, 40, 4
