@@ -28,9 +28,11 @@ from .core.banks import (
 )
 from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
-from .core.refinement import History, Refinement, Refiner, WaveletPreservation, refine
+from .core.refinement import History, Refinement, refine
+from .core.refiner import Problem, Refiner, State
 from .core.refiners.feature_regression import FeatureRegression
 from .core.refiners.registration import Registration
+from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
 from .core.search import nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -68,7 +70,7 @@ from .geometry.geodesics import SurfacePoints, geodesic_distances
 from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
-from .initial_maps.starts import initial_map
+from .initial_maps import initial_map
 from .io.exchange import (
     make_spectrum,
     read_functional_map,
@@ -77,10 +79,14 @@ from .io.exchange import (
     write_spectrum,
 )
 from .io.mesh_files import read_mesh, write_mesh
-from .matching import Correspondence, match, paired_spectra
-from .presets import PRESETS, Stage
+from .matching import Correspondence, match
+from .pair import Pair, paired_spectra
+from .preparation import PreparedPair, prepare
+from .presets import PRESETS, Preset
+from .repair.settings import RepairSettings
 from .runtime.batches import refine_pairs, stack
 from .runtime.compilation import compiler_options
+from .stage import Stage
 
 __version__: str
 __all__ = [
@@ -115,8 +121,12 @@ __all__ = [
     "Meyer",
     "NearestFew",
     "NearestOrthogonal",
+    "Pair",
     "Papadakis",
     "Power",
+    "PreparedPair",
+    "Preset",
+    "Problem",
     "QuadraticEnergy",
     "Recovery",
     "Refinement",
@@ -124,6 +134,7 @@ __all__ = [
     "Registration",
     "Regular",
     "RegularizedLeastSquares",
+    "RepairSettings",
     "Simoncelli",
     "SimpleTight",
     "Sinkhorn",
@@ -136,6 +147,7 @@ __all__ = [
     "SpectralDistribution",
     "Spectrum",
     "Stage",
+    "State",
     "SurfacePoints",
     "Warp",
     "Warped",
@@ -167,6 +179,7 @@ __all__ = [
     "one_to_one_map",
     "open_data_set",
     "paired_spectra",
+    "prepare",
     "pull_back",
     "read_functional_map",
     "read_ground_truth",

@@ -81,7 +81,7 @@ def test_is_what_its_definition_says(pair, partial):
         t = cdist(a, b @ matrix.T, "mahalanobis", VI=precision).argmin(axis=1)
         matrix_back, precision_back = predicted(yy, xy.T, xx)
         back = cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back).argmin(axis=1)
-    found = refine(x, y, start, refiner=FeatureRegression(partial=partial), iterations=2, history=True)
+    found = refine(x, y, start, refiner=FeatureRegression(), iterations=2, partial=partial, history=True)
     np.testing.assert_array_equal(found.pointwise_map, t)
     np.testing.assert_allclose(found.functional_map, matrix[:K, :K], atol=1e-10)
     distances = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t]
@@ -132,9 +132,7 @@ def test_does_not_stop_before_the_last_level(pair):
 def test_samples_ask_and_all_vertices_answer(pair):
     x, y, start, truth = pair
     samples = jnp.arange(0, M, 2), jnp.arange(1, M, 2)
-    found = refine(
-        x, y, start, refiner=FeatureRegression(), iterations=4, samples_x=samples[0], samples_y=samples[1]
-    )
+    found = refine(x, y, start, refiner=FeatureRegression(), iterations=4, samples=(samples[0], samples[1]))
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
@@ -183,9 +181,9 @@ def test_descriptors_that_are_no_numbers_are_reported(pair):
 
 def test_what_cannot_work_is_refused(pair):
     x, y, start, _ = pair
-    with pytest.raises(ValueError, match="X has 5 descriptors and Y 0"):
+    with pytest.raises(ValueError, match="X has 5 descriptors and Y has 0"):
         refine(x, y.with_descriptors(None), start, refiner=FeatureRegression())
-    with pytest.raises(ValueError, match="needs an eigenvector"):
+    with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         FeatureRegression((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):
         FeatureRegression(search="quick")

@@ -18,9 +18,9 @@ import learning
 from learn_descriptors import (
     LOSSES,
     DescriptorNetwork,
-    Pair,
     Shape,
     Sizes,
+    TrainingPair,
     described,
     draw,
     load,
@@ -67,7 +67,7 @@ def pair(creatures, spectra):
     ]
     x, y = (Shape(s.sample(jnp.asarray(c)), p) for s, c, p in zip(spectra, chosen, positions, strict=True))
     targets = creatures.true_map[chosen[0]]
-    return Pair(x, y, jnp.asarray(meshes[1].vertices[targets] / meshes[1].area ** 0.5))
+    return TrainingPair(x, y, jnp.asarray(meshes[1].vertices[targets] / meshes[1].area ** 0.5))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ from synthetic import random_spectrum
 
 from jaxsmw.core.banks import Logarithm, Meyer, Warped
 from jaxsmw.core.functional_map import WaveletProblem, encode
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
 from jaxsmw.core.soft_refinement import WaveletPreservationLayer, refine_softly

@@ -11,7 +11,8 @@ from synthetic import random_spectrum
 
 from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer, frame_function
 from jaxsmw.core.functional_map import QuadraticEnergy
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import (
     DescriptorPair,

@@ -460,13 +460,13 @@ def _benchmark(options: argparse.Namespace) -> None:
 
     check_drawable()
     try:
-        from jaxsmw.evaluation.benchmark import Settings, choose_pairs, run_benchmark
+        from jaxsmw.evaluation.benchmark import Settings, run_benchmark
     except ModuleNotFoundError as error:
         raise InputError(
             f"benchmarks need {error.name}, which is not installed: pip install 'jaxsmw[benchmark]'"
         ) from error
-    from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents.opponents import find_methods, suited_methods
+    from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+    from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
     from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.tables import markdown_table, write_tables
 
@@ -599,7 +599,7 @@ def _preset(options: argparse.Namespace) -> Any:
             f"--{option}: changes the paper's method, which --preset {options.preset} is not: leave one of "
             "them out."
         )
-    from jaxsmw.core.refinement import WaveletPreservation
+    from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.presets import Stage
 
     chosen = {name: getattr(options, name) for name in changes}

@@ -13,7 +13,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_choice, check_kind, counts_iterations
-from jaxsmw.core.refinement import WaveletPreservation, check_spectra, checked, diagnose
+from jaxsmw.core.refinement import check_spectra, checked, diagnose
+from jaxsmw.core.refiner import Problem, State
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
@@ -97,23 +99,23 @@ def refine_softly(
     if not tolerance > 0:
         raise ValueError(f"refine_softly needs a positive tolerance, not {tolerance}")
     matches = _matches(pointwise_map, spectrum_x.mask.shape[0], spectrum_y.mask.shape[0])
-    problem = refiner.prepare(spectrum_x, spectrum_y)
-    first, result = refiner.update(problem, pointwise_map, None)
-    first_result = checked(first, first, result)
+    prepared = refiner.prepare(Problem(spectrum_x, spectrum_y))
+    first, result = refiner.update(prepared, pointwise_map, None)
+    first_result = checked(first, result)
 
     def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
-        points = refiner.embeddings(problem, functional_map)
+        points = refiner.embeddings(prepared, State(functional_map))
         return recovery(*points, *_areas(spectrum_x, spectrum_y))
 
     def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        following, how = refiner.update(problem, recover(functional_map), functional_map)
-        return following, checked(following, following, how)
+        following, how = refiner.update(prepared, recover(functional_map), State(functional_map))
+        return following.functional_map, checked(following, how)
 
     if differentiation == "implicit":
-        loop = _to_the_fixed_point(step, first, iterations, tolerance)
+        loop = _to_the_fixed_point(step, first.functional_map, iterations, tolerance)
     else:
         step = jax.checkpoint(step) if differentiation == "checkpointed" else step
-        loop = _through_iterations(step, first, first_result, iterations)
+        loop = _through_iterations(step, first.functional_map, first_result, iterations)
     moved, norm = (
         jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (loop.last_change, loop.functional_map)
     )
