@@ -1,8 +1,8 @@
-from .core.banks.filters import (
-    ControlPoints,
+from .core.banks import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,
+    FrameBounds,
     Gabor,
     HalfCosine,
     Heat,
@@ -22,9 +22,11 @@ from .core.banks.filters import (
     SpectralDistribution,
     Warp,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
-from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
+from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, refine
 from .core.refiner import Problem, Refiner, State
@@ -32,7 +34,7 @@ from .core.refiners.feature_regression import FeatureRegression
 from .core.refiners.registration import Registration
 from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
-from .core.search import approximate_nearest_neighbor, nearest_neighbor
+from .core.search import nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.soft_maps import (
     NearestFew,
@@ -91,7 +93,6 @@ __version__: str
 __all__ = [
     "PRESETS",
     "RESULTS",
-    "ControlPoints",
     "Correspondence",
     "CreaturePair",
     "CubicSpline",
@@ -154,7 +155,6 @@ __all__ = [
     "WaveletPreservation",
     "WaveletPreservationLayer",
     "WaveletProblem",
-    "approximate_nearest_neighbor",
     "compiler_options",
     "compute_spectrum",
     "coverage",
@@ -196,7 +196,6 @@ __all__ = [
     "stack",
     "tighten",
     "wave_kernel_signature",
-    "wavelet_energy",
     "wavelet_signature",
     "write_functional_map",
     "write_mesh",

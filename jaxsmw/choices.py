@@ -22,8 +22,8 @@ Eigensolver = Literal["auto", "exact", "approximate"]
 APPROXIMATE_FROM = 50_000
 """The number of vertices from which the eigensolver `"auto"` is approximate."""
 
-Search = Literal["auto", "exhaustive", "patches", "approximate"]
-"""See `jaxsmw.WaveletPreservation`."""
+Search = Literal["auto", "exhaustive", "patches"]
+"""How nearest neighbours are found. All settings find the same; `"auto"` chooses the faster search."""
 
 GeodesicMethod = Literal["strips", "exact"]
 """See `jaxsmw.geodesic_distances`."""

@@ -144,7 +144,7 @@ class Stage:
             descriptors = None
             if self.number_of_descriptors and spectrum.descriptors is not None:
                 descriptors = spectrum.descriptors[:, : self.number_of_descriptors]
-            seen.append(spectrum.truncate(self.number_of_eigenvectors).describe(descriptors))
+            seen.append(spectrum.truncate(self.number_of_eigenvectors).with_descriptors(descriptors))
         fewer = [now.eigenvalues.shape != s.eigenvalues.shape for now, s in zip(seen, spectra, strict=True)]
         return common_range(*seen) if partial and any(fewer) else (seen[0], seen[1])
 

@@ -213,7 +213,7 @@ def described(mesh: Mesh) -> Spectrum:
     """A spectrum as a `DescriptorNetwork` wants it, of area 1, with SHOT, padded."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
-    return padded(spectrum.describe(jnp.asarray(shot)))
+    return padded(spectrum.with_descriptors(jnp.asarray(shot)))
 
 
 class Matched(NamedTuple):
@@ -309,7 +309,7 @@ def of_pair(pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
-    spectra = x.describe(None), y.describe(None)
+    spectra = x.with_descriptors(None), y.with_descriptors(None)
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
     starts = {REFERENCE: prepared.initial_map}
     for name, network in networks.items():

@@ -61,7 +61,7 @@ from jaxsmw import (
     read_mesh,
     refine_softly,
 )
-from jaxsmw.core.banks.filters import FilterBank, Power, Warped
+from jaxsmw.core.banks import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.runtime.files import atomic_write

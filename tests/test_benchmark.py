@@ -395,12 +395,10 @@ def test_removed_and_empty_files_and_unfinished_headers_are_measured_again(
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
     call = ["benchmark", str(scape), "--methods", "start", "--pairs", "1", "--output", str(tmp_path)]
-    with pytest.raises(SystemExit, match="0"):
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 0
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
     capsys.readouterr()
-    with pytest.raises(SystemExit, match="2"):
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 2
     (message,) = [line for line in capsys.readouterr().err.splitlines() if "results.csv" in line]
     assert "is not a table of results" in message and "remove it to measure its rows again" in message
 

@@ -217,9 +217,9 @@ def test_damaged_files_are_named(network, pair, tmp_path):
 def test_what_is_no_input_is_refused(network, pair, spectra, tmp_path):
     x, _ = spectra
     with pytest.raises(ValueError, match="no descriptors, where 352 are needed"):
-        network(x.describe(None))
+        network(x.with_descriptors(None))
     with pytest.raises(ValueError, match="10 descriptors, where 352"):
-        network(x.describe(x.descriptors[:, :10]))
+        network(x.with_descriptors(x.descriptors[:, :10]))
     for wrong in ({"width": 0}, {"blocks": 1.5}, {"filters": True}):
         with pytest.raises(ValueError, match=f"at least one of its {next(iter(wrong))}"):
             Sizes(**wrong)

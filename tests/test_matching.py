@@ -16,10 +16,9 @@ from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw import descriptors, matching
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import State
-from jaxsmw.core.refiners import wavelet_preservation
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -113,17 +112,6 @@ def test_the_approximate_eigenbasis_matches_as_well(pair):
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (exact, approximate)]
     # Of a copy, noise aside, all vertices are found exactly.
     assert errors[1] < errors[0] + 0.003
-
-
-def test_approximate_search_matches_as_well(pair, monkeypatch):
-    mesh_x, mesh_y, truth = pair
-    searching = replace(STAGE, refiner=WaveletPreservation(bank=Meyer(4), search="approximate"))
-    exact, approximate = match(mesh_x, mesh_y, **OPTIONS), match(mesh_x, mesh_y, preset=searching)
-    assert (exact.pointwise_map == approximate.pointwise_map).mean() > 0.97
-    assert mean_error(mesh_y, approximate.pointwise_map, truth) < 0.02
-    monkeypatch.setattr(wavelet_preservation, "find_spec", lambda _: None)
-    with pytest.raises(ImportError, match=r"pip install 'jaxsmw\[approximate\]'"):
-        WaveletPreservation(search="approximate")
 
 
 def test_repeats_bit_for_bit(pair):

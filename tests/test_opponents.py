@@ -79,7 +79,7 @@ def test_all_methods_repair_a_noisy_initial_map():
     n = len(y.mask)
     order = generator.permutation(n)
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
-    x = x.place(y.positions[order], y.normals[order])
+    x = x.with_positions(y.positions[order], y.normals[order])
     initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
     pair = MethodInput(

@@ -179,13 +179,13 @@ def test_signs_do_not_matter(case):
 
 
 def test_bad_numbers_are_reported(case):
-    broken = case.x.describe(case.x.descriptors.at[3, 2].set(jnp.nan))
+    broken = case.x.with_descriptors(case.x.descriptors.at[3, 2].set(jnp.nan))
     bad_map = np.full_like(case.initial_map, len(case.full.vertices))
     for arguments, expected in [
         ((broken, case.y, case.initial_map), RESULTS.nonfinite_spectrum),
         ((case.x, case.y, bad_map), RESULTS.invalid_initial_map),
         (
-            (case.x.describe(case.x.descriptors * 1e200), case.y, case.initial_map),
+            (case.x.with_descriptors(case.x.descriptors * 1e200), case.y, case.initial_map),
             RESULTS.nonfinite_functional_map,
         ),
     ]:
@@ -197,8 +197,8 @@ def test_bad_numbers_are_reported(case):
 def test_arguments_that_do_not_fit_are_refused(case):
     for x, y, options, message in [
         (case.x, case.y, {"iterations": 0}, "at least 1 iteration"),
-        (case.x.describe(None), case.y, {}, "number of descriptors"),
-        (case.x, case.y.describe(case.y.descriptors[:, :3]), {}, "number of descriptors"),
+        (case.x.with_descriptors(None), case.y, {}, "number of descriptors"),
+        (case.x, case.y.with_descriptors(case.y.descriptors[:, :3]), {}, "number of descriptors"),
     ]:
         with pytest.raises(ValueError, match=message):
             partial_functional_map(
@@ -223,7 +223,10 @@ def test_the_method_is_for_partial_shapes_only():
 
 
 def test_the_method_uses_the_prepared_pair(case):
-    x, y = case.x.describe(case.x.descriptors[:, :4]), case.y.describe(case.y.descriptors[:, :4])
+    x, y = (
+        case.x.with_descriptors(case.x.descriptors[:, :4]),
+        case.y.with_descriptors(case.y.descriptors[:, :4]),
+    )
     samples = jnp.arange(50), jnp.arange(50)
     meshes = case.partial, case.full
     pair = MethodInput(case.x, case.y, jnp.asarray(case.initial_map), samples, meshes=meshes, partial=True)

@@ -9,7 +9,7 @@ from jaxsmw.cli.arguments import whole_number
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxsmw.core.banks.filters import FilterBank
+    from jaxsmw.core.banks import FilterBank
 
 # The class of each bank. The first bank is the paper's.
 BANKS = {
@@ -56,10 +56,10 @@ def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
 
     **Raises:** `InputError` if the bank cannot have this number of filters.
     """
-    from jaxsmw.core.banks import filters
+    from jaxsmw.core import banks
 
     name = name or _PAPER_BANK
-    kind = getattr(filters, BANKS[name])
+    kind = getattr(banks, BANKS[name])
     if number_of_filters is None:
         bank = kind()
     elif "filters" not in kind.__dataclass_fields__:
@@ -69,7 +69,7 @@ def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
             bank = kind(number_of_filters)
         except ValueError as error:
             raise InputError(f"--filters {number_of_filters}: {error}; give a larger number.") from error
-    return filters.Warped(bank, filters.SpectralDistribution()) if name.startswith(_ADAPTED) else bank
+    return banks.Warped(bank, banks.SpectralDistribution()) if name.startswith(_ADAPTED) else bank
 
 
 def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
@@ -77,7 +77,7 @@ def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from jaxsmw.core.frames import frame_bounds
+    from jaxsmw.core.banks import frame_bounds
 
     # Eigenvalues of a surface are nearly evenly spaced. One compiled program replaces forty small ones.
     lower, upper = map(float, eqx.filter_jit(frame_bounds)(bank, jnp.arange(101.0), over="interval"))

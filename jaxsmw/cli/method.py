@@ -115,8 +115,7 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--search",
         choices=get_args(Search),
         help="search for nearest neighbours: exhaustive and patches find the same ones, patches faster on "
-        "large meshes; auto takes the faster of the two; approximate misses some and needs "
-        f"jaxsmw[approximate] (default: {default_search})",
+        f"large meshes; auto takes the faster of the two (default: {default_search})",
     )
     group.add_argument(
         "--stop-when-unchanged",
@@ -212,10 +211,7 @@ def _changed_refiner(options: argparse.Namespace) -> WaveletPreservation:
     if options.solution:
         name, arguments = _SOLUTIONS[options.solution]
         settings["solution"] = getattr(solutions, name)(*arguments)
-    try:
-        refiner = WaveletPreservation(**_given(settings))
-    except ImportError as error:
-        raise InputError(f"--search {options.search}: {error}") from None
+    refiner = WaveletPreservation(**_given(settings))
     if options.bank and isinstance(refiner.solution, solutions.Filtering):
         _note_loose_frame(options.bank, bounds_unless_tight(refiner.bank))
     return refiner

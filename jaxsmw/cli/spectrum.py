@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
     refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
-        from jaxsmw.io.exchange import check_spectrum_path
+        from jaxsmw.io.spectra import check_spectrum_path
 
         check_spectrum_path(options.output)
     bank = make_bank(options.bank, options.filters)
@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
     if options.output:
         import jax
 
-        from jaxsmw.io.exchange import write_spectrum
+        from jaxsmw.io.spectra import write_spectrum
 
         with jax.enable_x64(True):
             write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)

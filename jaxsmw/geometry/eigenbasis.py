@@ -83,7 +83,7 @@ def as_spectrum(
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
     # `jnp.asarray` would compile something for every size.
     arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))
-    return Spectrum(*arrays).place(*map(jax.device_put, (positions, normals)))
+    return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
 
 
 def eigenpairs(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from jaxsmw.core.banks.filters import FilterBank
+from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum

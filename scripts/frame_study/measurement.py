@@ -26,7 +26,7 @@ from frame_study.variants import (
     tabulate,
 )
 from jaxsmw import read_mesh
-from jaxsmw.core.banks.filters import FilterBank, Meyer
+from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence

@@ -43,7 +43,7 @@ import jax.scipy as jsp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.banks.filters import FilterBank, Identity
+from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.products import product
 from jaxsmw.core.refiner import State

@@ -12,7 +12,7 @@ uses.
 
 from __future__ import annotations
 
-from jaxsmw.core.banks.filters import Identity
+from jaxsmw.core.banks import Identity
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.evaluation.opponents.presets import Refined

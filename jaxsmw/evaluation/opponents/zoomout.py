@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Int
 
-from jaxsmw.core.banks.filters import Identity
+from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import refine
