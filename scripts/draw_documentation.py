@@ -55,7 +55,9 @@ def procedural_cases() -> Iterator[Case]:
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
 
     (source, at_source), (target, at_target) = star(3000, 0), star(2900, 1)
-    truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(KDTree(at_target).query(at_source)[1].astype(np.int64))
+    truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(
+        KDTree(at_target).query(at_source)[1].astype(np.int64)
+    )
     yield Case("symmetric", source, target, truth, {}, {"init": landmarks_on_arms(at_source, at_target)}, "z")
 
     part, truth = front_of(pair)
@@ -72,7 +74,9 @@ def real_cases(data: Path) -> Iterator[Case]:
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
     ):
-        (pair,) = (pair for pair in jaxsmw.evaluation.open_data_set(data / directory).pairs if pair.names == names)
+        (pair,) = (
+            pair for pair in jaxsmw.evaluation.open_data_set(data / directory).pairs if pair.names == names
+        )
         source, target = jaxsmw.read_mesh(pair.source_file), jaxsmw.read_mesh(pair.target_file)
         yield Case(name, source, target, pair.ground_truth(source, target), {}, cure, None)
 
@@ -112,7 +116,9 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
     return part, jaxsmw.evaluation.GroundTruth.of_all_vertices(truth)
 
 
-def coarser(pair: jaxsmw.geometry.CreaturePair, vertices: int) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
+def coarser(
+    pair: jaxsmw.geometry.CreaturePair, vertices: int
+) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
     """The target with few vertices, and for each vertex of the source the nearest of them."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")

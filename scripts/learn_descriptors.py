@@ -63,14 +63,14 @@ from jaxsmw import (
     prepare,
     read_mesh,
 )
-from jaxsmw.learning import WaveletPreservationLayer
-from jaxsmw.geometry import farthest_point_samples, shot_descriptors
-from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.core.products import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.functional_maps import nearest_neighbor
+from jaxsmw.geometry import farthest_point_samples, shot_descriptors
 from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0

@@ -59,11 +59,11 @@ from jaxsmw import (
     read_mesh,
 )
 from jaxsmw.banks import SoftmaxFrame
-from jaxsmw.geometry import farthest_point_samples
-from jaxsmw.learning import refine_softly
 from jaxsmw.core.banks import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.geometry import farthest_point_samples
+from jaxsmw.learning import refine_softly
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6

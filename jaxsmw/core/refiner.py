@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import spectral_embeddings
-from jaxsmw.core.refiner import Problem
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum

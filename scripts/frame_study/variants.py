@@ -36,7 +36,6 @@ from jaxsmw.core.banks import (
     tighten,
 )
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
-from jaxsmw.core.refiner import Problem
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import (
