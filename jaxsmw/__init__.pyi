@@ -1,8 +1,8 @@
-from .core.banks.filters import (
-    ControlPoints,
+from .core.banks import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,
+    FrameBounds,
     Gabor,
     HalfCosine,
     Heat,
@@ -22,9 +22,11 @@ from .core.banks.filters import (
     SpectralDistribution,
     Warp,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from .core.frames import FrameBounds, frame_bounds, frame_function, tighten
-from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel, wavelet_energy
+from .core.functional_map import QuadraticEnergy, encode, multiscale_kernel
 from .core.pointwise_map import decode, decode_to_triangles, search_patches
 from .core.refinement import History, Refinement, refine
 from .core.refiner import Problem, Refiner, State
@@ -32,7 +34,7 @@ from .core.refiners.feature_regression import FeatureRegression
 from .core.refiners.registration import Registration
 from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
-from .core.search import approximate_nearest_neighbor, nearest_neighbor
+from .core.search import nearest_neighbor
 from .core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from .core.soft_maps import (
     NearestFew,
@@ -59,7 +61,7 @@ from .core.triangles import nearest_point_on_triangles
 from .descriptors import describe
 from .errors import InputError
 from .evaluation.datasets import DataPair, DataSet, open_data_set
-from .evaluation.ground_truth import GroundTruth, read_ground_truth, read_pointwise_map, write_pointwise_map
+from .evaluation.ground_truth import GroundTruth, read_ground_truth
 from .evaluation.metrics import GeodesicError, coverage, geodesic_error
 from .geometry.assignment import one_to_one_map
 from .geometry.creature import CreaturePair, creature_pair
@@ -69,14 +71,15 @@ from .geometry.mesh import Mesh, diagnose, make_mesh
 from .geometry.sampling import farthest_point_samples
 from .geometry.shot import shot_descriptors
 from .initial_maps import initial_map
-from .io.exchange import (
+from .io.map_files import read_pointwise_map, write_pointwise_map
+from .io.mesh_files import read_mesh, write_mesh
+from .io.spectra import (
     make_spectrum,
     read_functional_map,
     read_spectrum,
     write_functional_map,
     write_spectrum,
 )
-from .io.mesh_files import read_mesh, write_mesh
 from .matching import Correspondence, match
 from .pair import Pair, paired_spectra
 from .preparation import PreparedPair, prepare
@@ -90,7 +93,6 @@ __version__: str
 __all__ = [
     "PRESETS",
     "RESULTS",
-    "ControlPoints",
     "Correspondence",
     "CreaturePair",
     "CubicSpline",
@@ -153,7 +155,6 @@ __all__ = [
     "WaveletPreservation",
     "WaveletPreservationLayer",
     "WaveletProblem",
-    "approximate_nearest_neighbor",
     "compiler_options",
     "compute_spectrum",
     "coverage",
@@ -195,7 +196,6 @@ __all__ = [
     "stack",
     "tighten",
     "wave_kernel_signature",
-    "wavelet_energy",
     "wavelet_signature",
     "write_functional_map",
     "write_mesh",

@@ -19,7 +19,7 @@ import pytest
 
 import jaxsmw
 from jaxsmw import RESULTS, creature_pair, geodesic_error, write_mesh
-from jaxsmw.cli.main import _parser
+from jaxsmw.cli.parser import make_parser
 from jaxsmw.evaluation import GroundTruth
 
 ROOT = Path(__file__).parents[1]
@@ -114,11 +114,11 @@ def test_commands_are_understood(page, monkeypatch):
     def refuse(parser: argparse.ArgumentParser, message: str) -> None:
         raise ValueError(f"{page}: {parser.prog}: {message}")
 
-    monkeypatch.setattr("jaxsmw.cli.main._Parser.error", refuse)
+    monkeypatch.setattr("jaxsmw.cli.parser.Parser.error", refuse)
     for command in commands(page):
         program, *arguments = shlex.split(command)
         if program == "jaxsmw":
-            _parser().parse_args(arguments)
+            make_parser().parse_args(arguments)
         elif arguments[0].startswith("scripts/"):
             script = ROOT / arguments[0]
             source = script.read_text("utf-8")
@@ -131,7 +131,7 @@ def test_commands_are_understood(page, monkeypatch):
 
 @pytest.mark.parametrize("page", [page for page in PAGES if mentioned_commands(page)])
 def test_mentioned_options_exist(page):
-    (subcommands,) = (a.choices for a in _parser()._actions if isinstance(a, argparse._SubParsersAction))
+    (subcommands,) = (a.choices for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
     for command in mentioned_commands(page):
         _, name, *arguments = shlex.split(command)
         for option in (argument.partition("=")[0] for argument in arguments if argument.startswith("--")):
@@ -181,7 +181,7 @@ def test_annotations_mean_something():
     """Every name in an annotation is imported, except types of matplotlib, for type checkers only."""
     resolved = 0
     for module in pkgutil.walk_packages(jaxsmw.__path__, "jaxsmw."):
-        if module.name.startswith(("jaxsmw.report", "jaxsmw.cli.main", "jaxsmw.__main__")):
+        if module.name.startswith(("jaxsmw.report", "jaxsmw.cli", "jaxsmw.__main__")):
             continue
         for _, member in inspect.getmembers(importlib.import_module(module.name), inspect.isroutine):
             function = inspect.unwrap(member)
