@@ -120,7 +120,7 @@ def describe(
     for spectrum, side, found in zip((spectrum_x, spectrum_y), sampled.sides, both, strict=True):
         everywhere = found if side.samples is None else found[side.samples.nearest]
         everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
-        described.append(spectrum.describe(jax.device_put(everywhere)))
+        described.append(spectrum.with_descriptors(jax.device_put(everywhere)))
     return described[0], described[1]
 
 

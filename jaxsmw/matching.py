@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
@@ -22,18 +23,16 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
-from jaxsmw.geometry.eigenbasis import Eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused
 from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
-from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.progress import timed
@@ -219,8 +218,8 @@ def match(
       or PyVista, or tuples of vertices and faces, as for `make_mesh`.
     - `preset`: how the map is refined: `"accurate"`; `"paper"`, the method of the MWP paper; `"fast"`, the
       same method on samples; or stages of your own, for example
-      `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See `jaxsmw.PRESETS`. Presets adapt
-      to small meshes, with fewer eigenvectors and samples; stages of your own are taken literally.
+      `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See `jaxsmw.PRESETS`. Presets
+      adapt to small meshes, with fewer eigenvectors and samples; stages of your own are taken literally.
     - `init`: the initial map.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: nearest neighbours of that descriptor. Only SHOT tells
           left from right. With `"shot"`, presets with repair also try alternative initial maps.
@@ -259,14 +258,7 @@ def match(
     seconds = dict(prepared.seconds)
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
-        alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
-        if chosen.repair is not None and isinstance(init, str) and init == "shot":
-            alternatives = alternative_initial_maps(
-                pair, prepared.spectrum_x, prepared.spectrum_y, chosen.repair
-            )
-        outcome = refine_in_stages(
-            prepared, chosen.stages, chosen.repair, alternatives=alternatives, history=history
-        )
+        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
         jax.block_until_ready(outcome.refinements[-1])
     return _correspondence(prepared, chosen, outcome, seconds)
 
@@ -296,8 +288,8 @@ def _correspondence(
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
     if outcome.suspicious:
-        assert preset.repair is not None and outcome.distortion is not None
-        warnings.warn(_warning(prepared, preset.repair, outcome.distortion), stacklevel=3)
+        assert preset.repair is not None
+        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -316,17 +308,23 @@ def _correspondence(
     )
 
 
-def _warning(prepared: PreparedPair, repair: RepairSettings, distortion: float) -> str:
-    init = prepared.init
+def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -> str:
+    """What looks wrong about a map, and what may help."""
+    pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
+    found = np.asarray(outcome.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
+    areas = pair.mesh_x.vertex_areas / pair.mesh_x.area
+    mirrored = areas[orientation_reversal(pair, found, spectrum_x, repair.scores)].sum()
+    cut_off = areas[discontinuous_parts(pair, found, repair.scores)].sum()
     more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
     cure = f"start from {'more' if more else 'a few'} landmarks"
-    if prepared.pair.partial:
+    if pair.partial:
         cure += ", and check that both meshes have the same unit of length"
     else:
         cure += ", or say that one mesh is a part of the other if it is (partial=True, --partial)"
     return (
-        f"{prepared.pair.name}: limbs may be swapped, or the body may be upside down: the map has "
-        f"distortion {distortion:.3f}, and right maps have up to {repair.suspicious} (more between "
-        "non-isometric shapes, with topological noise, or for a mirror image). Look at the map (--report, "
-        f"in Python jaxsmw.report.summary.write_report), and if it is wrong, {cure}"
+        f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down: the map has "
+        f"distortion {outcome.distortion:.3f}, mirrors {mirrored:.0%} of the source and cuts off "
+        f"{cut_off:.0%}. Right maps have distortion up to {repair.suspicious} (more between non-isometric "
+        "shapes, with topological noise, or for a mirror image). Look at the map (--report, in Python "
+        f"jaxsmw.report.summary.write_report), and if it is wrong, {cure}"
     )

@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Array, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import Eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.initial_maps import InitialMap, initial_map
@@ -88,7 +87,9 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """A map of X's vertices on the device, padded like X."""
-        return jax.device_put(pad_rows(pointwise_map, program_size(self.pair.mesh_x)))
+        # The type of every later map, so that one program serves all stages.
+        padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
+        return jax.device_put(padded)
 
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """The padded spectra as a stage sees them."""

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline
+from jaxsmw.core.banks import CubicSpline
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS

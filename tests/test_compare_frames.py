@@ -23,8 +23,7 @@ from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
 import jaxsmw
-from jaxsmw.core.banks.filters import CubicSpline, Gabor, Meyer
-from jaxsmw.core.frames import tighten
+from jaxsmw.core.banks import CubicSpline, Gabor, Meyer, tighten
 from jaxsmw.core.functional_map import multiscale_kernel
 from jaxsmw.core.refiner import Problem
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation

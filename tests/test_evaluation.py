@@ -1,4 +1,4 @@
-"""Ground truth in all its forms, files that are wrong, and the errors and curves computed from it."""
+"""Ground truth in all formats, wrong files, and the errors and curves computed from ground truth."""
 
 import json
 
@@ -12,13 +12,11 @@ from jaxsmw import InputError, make_mesh, read_mesh
 from jaxsmw.evaluation.ground_truth import (
     GroundTruth,
     read_ground_truth,
-    read_landmarks,
-    read_pointwise_map,
     write_ground_truth,
-    write_pointwise_map,
 )
 from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.io.map_files import read_landmarks, read_pointwise_map, write_pointwise_map
 
 # 4 and 9 vertices; 2 and 8 faces.
 X = make_mesh(*grid_mesh(2, 2), name="mesh_x")
@@ -32,7 +30,7 @@ def no_cache(monkeypatch):
 
 @pytest.fixture
 def write(tmp_path):
-    """Write a file and give its path."""
+    """Writes a file and returns its path."""
 
     def write(name, content):
         path = tmp_path / name
@@ -60,15 +58,17 @@ class TestReading:
         assert read_ground_truth(str(path), X, Y, index_base=1).targets.tolist() == [7, 0, 0, 1]
         assert read_ground_truth([path], X, Y).targets.tolist() == [8, 1, 1, 2]
 
-    def test_vertices_that_no_face_uses_are_left_out(self, write):
-        """As where a part keeps the vertices of the whole."""
+    def test_unreferenced_vertices_are_left_out(self, write):
+        """A partial shape may keep the vertices of the full shape."""
         part = make_mesh(X.vertices, X.faces[:1], name="part")
         path = write("truth.txt", "8\n1\n2\n3\n")
         with pytest.warns(UserWarning, match=r"truth.txt: 1 of 4 points are vertices that no face of part"):
             truth = read_ground_truth(path, part, Y)
         assert truth.source_vertices.tolist() == sorted(X.faces[0]) and len(truth.targets) == 3
         (left_out,) = set(range(4)) - set(X.faces[0].tolist())
-        with pytest.raises(InputError, match="no face of part uses: give the truth of this mesh"):
+        with pytest.raises(
+            InputError, match="no face of part references: give the ground truth of this mesh"
+        ):
             read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
 
     def test_two_columns(self, write):
@@ -148,7 +148,12 @@ class TestReading:
         path = write("landmarks.txt", "0 8\n3 0\n")
         assert read_landmarks(path, X, Y).tolist() == [[0, 8], [3, 0]]
         assert read_landmarks(write("l.txt", "4 1"), X, Y, index_base=1).tolist() == [[3, 0]]
-        for content, message in (("0\n", "has 1 number where 2"), ("4 0\n", "4 is not one .* of mesh_x")):
+        for content, message in (
+            ("0\n", "has 1 number where 2"),
+            ("4 0\n", "4 is not one .* of mesh_x"),
+            ("0 8\n3,0\n", "line 2: '3,0' is not a number: separate numbers by spaces, not by ','"),
+            ("1_0 8\n", "line 1: '1_0' is not a number: correct the line"),
+        ):
             with pytest.raises(InputError, match=message):
                 read_landmarks(write("l.txt", content), X, Y)
 
@@ -177,7 +182,7 @@ class TestReading:
         null = mesh("shrec16_partial/null/dog.off")
         paths = [data / f"shrec16_partial/holes/holes_dog_shape_1.baryc_gt{end}" for end in ("", "_sym")]
         direct, mirrored = (read_ground_truth(path, part, null).targets.positions(null) for path in paths)
-        # On the dog, standing upright and looking straight ahead, mirroring is a reflection.
+        # The dog stands upright and looks straight ahead, so mirroring is a reflection.
         assert len(direct) == len(part.vertices)
         spread = np.abs(direct - mirrored).max(axis=0) / np.ptp(null.vertices, axis=0)
         assert spread.max() > 0.5
@@ -208,7 +213,8 @@ class TestBadFiles:
             ("1\n2\n0x3\n4\n", "line 3: '0x3' is not a number"),
             ("1\n2\n1_0\n4\n", "line 3: '1_0' is not a number"),
             ("1\n2\n٣\n4\n", "line 3: '.u0663' is not a number"),
-            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number"),
+            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number: separate numbers by spaces, not by ','"),
+            ("1;2\n2\n3\n4\n", "line 1: '1;2' is not a number: separate numbers by spaces, not by ';'"),
             ("vertex\n1\n2\n3\n4", "line 1: 'vertex' is not a number"),
         ],
     )
@@ -224,7 +230,7 @@ class TestBadFiles:
         ("name", "content", "message"),
         [
             ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
-            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a truth with one per line"),
+            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a file with one per line"),
             ("t.txt", "1 2\n3\n", "line 2: has 1 number where 2 should be"),
             (
                 "t.txt",
@@ -264,9 +270,9 @@ class TestBadFiles:
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
     def test_files_that_cannot_be_read_or_written(self, tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="missing: does not exist"):
             read_pointwise_map(tmp_path / "missing", X, Y)
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read_ground_truth(tmp_path, X, Y)
         with pytest.raises(InputError, match="cannot be written"):
             write_pointwise_map(tmp_path / "missing" / "a.map", [0])
@@ -289,7 +295,7 @@ class TestGeodesicError:
             np.testing.assert_allclose(result.median, np.sqrt(0.5) / 2)
             assert result.unreachable == 0
 
-    def test_the_truth_has_no_error_in_any_form(self):
+    def test_the_ground_truth_has_no_error_in_any_format(self):
         generator = np.random.default_rng(0)
         points = SurfacePoints(generator.integers(0, 8, 4), generator.dirichlet([1, 1, 1], 4))
         assert geodesic_error(Y, points, GroundTruth.of_all_vertices(points)).errors.tolist() == [0] * 4
@@ -342,7 +348,7 @@ class TestGeodesicError:
         assert len(first.errors) == 40
         np.testing.assert_array_equal(first.errors, again.errors)
         assert (first.source_vertices != other.source_vertices).any()
-        # Without replacement: all of them are all, in another order.
+        # Drawing all rows without replacement only changes their order.
         most = geodesic_error(Y, pointwise_map, truth, number_of_samples=1000)
         np.testing.assert_array_equal(np.sort(most.errors), np.sort(everything.errors))
         assert (np.bincount(first.source_vertices) <= 10).all()
@@ -378,11 +384,11 @@ class TestGeodesicError:
             ([0, 1, 2], ([], []), "has no rows"),
         ],
     )
-    def test_what_does_not_fit(self, pointwise_map, truth, message):
+    def test_arguments_that_do_not_fit_are_refused(self, pointwise_map, truth, message):
         with pytest.raises(InputError, match=message):
             geodesic_error(Y, pointwise_map, GroundTruth(*(np.array(part, dtype=np.int64) for part in truth)))
 
-    def test_samples_must_be_some(self):
+    def test_at_least_one_sample_is_needed(self):
         with pytest.raises(InputError, match="0 samples cannot be evaluated"):
             geodesic_error(Y, [0], GroundTruth.of_all_vertices(np.array([0])), number_of_samples=0)
 
@@ -405,7 +411,7 @@ class TestStatistics:
         heights = error.correspondence_quality_curve(steps[:-1])
         assert error.area_under_curve(largest) == pytest.approx((heights * np.diff(steps)).sum() / largest)
 
-    def test_in_words_and_as_json(self):
+    def test_as_text_and_as_json(self):
         error = self.error([0.1, 0.2, np.inf, 0.0])
         assert str(error) == (
             "mean 0.10000, median 0.15000, 25.0% within 0.02, 25.0% within 0.05, 50.0% within 0.1, area under the "
@@ -442,9 +448,9 @@ class TestStatistics:
             coverage(Y, [9])
 
 
-def test_errors_that_others_measured_for_the_same_maps(shared):
-    # Published with the maps: means over 1000 vertices of their choice, with exact distances. Ours are over
-    # other rows of the same truth, so that only sampling lies between.
+def test_errors_agree_with_published_errors_of_the_same_maps(shared):
+    # The published means are over 1000 chosen vertices, with exact distances. Our means are over other rows of the
+    # same ground truth, so only the sampling differs.
     published = {
         ("002", "007"): {
             "T0": 362,
@@ -474,7 +480,7 @@ def test_errors_that_others_measured_for_the_same_maps(shared):
                 assert abs(errors.mean() - mean) < 3.5 * standard_error, (a, b, name)
 
 
-def test_vertices_without_a_truth_take_the_nearest_ones():
+def test_vertices_without_ground_truth_take_that_of_the_nearest_vertex():
     mesh = bumpy_mesh(2)
     known = np.arange(0, 162, 2)
     found = GroundTruth(known, known + 1).everywhere(mesh)

@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw import descriptors, matching
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import State
-from jaxsmw.core.refiners import wavelet_preservation
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
 from jaxsmw.descriptors import describe
@@ -94,7 +95,7 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
 def test_both_shapes_have_the_same_eigensolver(pair, monkeypatch):
     """Also where one is larger than what is approximated, and the other is not."""
     mesh_x = pair[0]
-    monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
+    monkeypatch.setattr(eigenbasis, "APPROXIMATE_FROM", 2000)
     smaller = bumpy_mesh(3)
     spectrum_x, spectrum_y = paired_spectra(Pair(mesh_x, smaller), 10)
     for mesh, spectrum in ((mesh_x, spectrum_x), (smaller, spectrum_y)):
@@ -113,17 +114,6 @@ def test_the_approximate_eigenbasis_matches_as_well(pair):
     assert errors[1] < errors[0] + 0.003
 
 
-def test_approximate_search_matches_as_well(pair, monkeypatch):
-    mesh_x, mesh_y, truth = pair
-    searching = replace(STAGE, refiner=WaveletPreservation(bank=Meyer(4), search="approximate"))
-    exact, approximate = match(mesh_x, mesh_y, **OPTIONS), match(mesh_x, mesh_y, preset=searching)
-    assert (exact.pointwise_map == approximate.pointwise_map).mean() > 0.97
-    assert mean_error(mesh_y, approximate.pointwise_map, truth) < 0.02
-    monkeypatch.setattr(wavelet_preservation, "find_spec", lambda _: None)
-    with pytest.raises(ImportError, match=r"pip install 'jaxsmw\[approximate\]'"):
-        WaveletPreservation(search="approximate")
-
-
 def test_repeats_bit_for_bit(pair):
     first, second = (match(*pair[:2], **OPTIONS) for _ in range(2))
     np.testing.assert_array_equal(first.pointwise_map, second.pointwise_map)
@@ -137,6 +127,62 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
         match(*pair[:2], preset=replace(STAGE, number_of_samples=samples))
     # Where messages about compilation are wanted in this thread only, those of another do not appear.
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
+
+
+@pytest.fixture
+def compilations():
+    """The names of all programs that any thread compiles during a test."""
+    names: list[str] = []
+
+    def listen(event: str, duration: float, **details: str) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(details["fun_name"])
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.mark.parametrize("preset", ["fast", "accurate", replace(STAGE, stop_when_unchanged=True)], ids=str)
+def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
+    """Programs compiled ahead, from outlines of the arrays, are those that refinement runs."""
+    jax.clear_caches()
+    found = match(*pair[:2], preset=preset)
+    assert compilations.count("jit(refine)") == len(found.stages)
+
+
+def test_the_reverse_map_of_registration_compares_all_columns():
+    """Above 15 000 vertices the search uses patches, also with fewer eigenvectors than columns."""
+    creature = creature_pair(vertices=15_600)
+    truth = creature.truth.nearest_corners(creature.target)
+    stage = Stage(Registration((20, 30)), number_of_samples=400)
+    found = match(creature.source, creature.target, preset=stage, init=truth)
+    queries, database = (np.asarray(points) for points in found._embeddings())
+    assert database.shape[1] > found.functional_map.shape[0]
+    with found._precision():
+        reverse = np.asarray(matching.compiled(matching._reverse_map)(*found._last_stage()))
+    _, nearest = KDTree(queries[found.mesh_x.used_vertices]).query(database)
+    expected = np.flatnonzero(found.mesh_x.used_vertices)[nearest]
+    agree = reverse == expected
+    # Two vertices can be equally near, to the precision of float32.
+    apart = np.linalg.norm(queries[reverse] - database, axis=1) - np.linalg.norm(
+        queries[expected] - database, axis=1
+    )
+    assert agree.mean() > 0.999 and apart.max() < 1e-5
+
+
+@pytest.mark.parametrize("search", ["exhaustive", "patches"])
+@pytest.mark.parametrize(
+    "refiner", [WaveletPreservation, FeatureRegression, Registration], ids=lambda r: r.__name__
+)
+def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
+    mesh_x, mesh_y, truth = pair
+    stage = Stage(refiner(search=search), number_of_eigenvectors=30)
+    found = match(mesh_x, mesh_y, preset=stage, init=truth)
+    points = [np.asarray(p) for p in found._embeddings()]
+    reverse = np.asarray(matching.compiled(matching._reverse_map)(*found._last_stage()))
+    np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
+    np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 
 
 def test_pairs_of_about_one_size_share_programs(caplog):

@@ -12,7 +12,7 @@ import pytest
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline, FilterBank, Meyer
+from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import refine

@@ -95,7 +95,7 @@ def test_is_what_its_definition_says(pair, number_of_descriptors):
     x, y, start, *_ = pair
     if number_of_descriptors:
         generator = np.random.default_rng(2)
-        x, y = (s.describe(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
+        x, y = (s.with_descriptors(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
     refiner = Registration((20,))
     found = refine(x, y, start, refiner=refiner, iterations=2, history=True)
     t, queries, database = defined(x, y, np.asarray(start), (20, K))
@@ -206,7 +206,7 @@ def test_signs_and_padding_and_vmap(pair):
 
 def test_patches_find_the_same(pair):
     x, y, start, *_ = pair
-    x, y = (s.describe(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
+    x, y = (s.with_descriptors(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
     maps = [
         refine(x, y, start, refiner=Registration(search=search)).pointwise_map
         for search in ("exhaustive", "patches")
@@ -268,18 +268,18 @@ def test_nothing_but_constants_to_go_by(pair):
 def test_what_cannot_work_is_refused(pair):
     x, y, start, *_ = pair
     bare = Spectrum(y.eigenvalues, y.eigenvectors, y.vertex_areas, y.mask)
-    with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.place"):
+    with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.with_positions"):
         refine(x, bare, start, refiner=Registration())
-    placed = refine(x, bare.place(y.positions, y.normals), start, refiner=Registration())
+    placed = refine(x, bare.with_positions(y.positions, y.normals), start, refiner=Registration())
     np.testing.assert_array_equal(
         placed.pointwise_map, refine(x, y, start, refiner=Registration()).pointwise_map
     )
     with pytest.raises(ValueError, match="X has 2 descriptors and Y has 0"):
-        refine(x.describe(x.eigenvectors[:, :2]), y, start, refiner=Registration())
+        refine(x.with_descriptors(x.eigenvectors[:, :2]), y, start, refiner=Registration())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         Registration((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):
         Registration(search="quick")
-    broken = x.place(x.positions.at[3, 1].set(jnp.nan), x.normals)
+    broken = x.with_positions(x.positions.at[3, 1].set(jnp.nan), x.normals)
     found = refine(broken, y, start, refiner=Registration())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()

@@ -1,5 +1,6 @@
 """What is wrong with a map, told without the truth."""
 
+import igl
 import jax
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from jaxsmw.repair.scores import (
     orientation_reversal,
     same_map,
 )
+from jaxsmw.repair.settings import ScoreSettings
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +75,22 @@ def test_swapped_limbs_are_discontinuous_and_reversed(mesh, spectrum):
     assert distortion(Pair(mesh, mesh), mirrored, spectrum) > 3 * dirichlet_energy_ratio(
         Pair(mesh, mesh), mirrored, spectrum
     )
+
+
+def test_a_right_map_between_coarse_meshes_is_not_distorted():
+    """With 200 vertices a match is often an edge away from the truth, which is no distortion."""
+    fine, noise = body_with_arms(), np.random.default_rng(0).normal(size=(2562, 3))
+    x, y = (
+        make_mesh(*igl.decimate(fine.vertices + amount * noise, fine.faces, 400)[:2]) for amount in (0, 0.03)
+    )
+    assert len(x.vertices) == len(y.vertices) == 202
+    truth = KDTree(y.vertices).query(x.vertices)[1]
+    spectrum = compute_spectrum(x, len(x.vertices) // 2)
+    by_all = ScoreSettings(vertices_per_eigenvector=1)
+    excess, excess_by_all = (
+        distortion(Pair(x, y), truth, spectrum, s) - 1 for s in (ScoreSettings(), by_all)
+    )
+    assert 0 <= excess < 0.4 * excess_by_all
 
 
 def test_edges_of_coarse_meshes_are_not_discontinuities():

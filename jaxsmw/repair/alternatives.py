@@ -87,20 +87,17 @@ def _in_both_directions(
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
     backward = nearest_map(reversed_, features_y, features_x)
-    reverse_weight = spectrum_x.eigenvalues.dtype.type(weight)
-    found = compiled(_decode_mean)(
-        *jax.device_put((forward, backward, reverse_weight)), spectrum_x, spectrum_y
-    )
+    on_device = jax.device_put((forward, backward, spectrum_x.eigenvalues.dtype.type(weight)))
+    found = compiled(_decode_mean)(on_device, spectrum_x, spectrum_y)
     return np.asarray(found).astype(np.int64)
 
 
 def _decode_mean(
-    forward: Int[Array, " m"],
-    backward: Int[Array, " n"],
-    reverse_weight: Float[Array, ""],
+    maps_and_weight: tuple[Int[Array, " m"], Int[Array, " n"], Float[Array, ""]],
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
 ) -> Int[Array, " m"]:
+    forward, backward, reverse_weight = maps_and_weight
     responses = WaveletPreservation().problem(spectrum_x, spectrum_y).responses
     of_forward = encode(forward, spectrum_x, spectrum_y)
     of_backward = encode(backward, spectrum_y, spectrum_x).T
@@ -115,7 +112,7 @@ def _by_extremities(
     """Maps by pairings of extremities; `spectrum_x`, of all of X, serves for the scores."""
     pair = sampled.pair
     refinement = _CoarseRefinement(sampled, settings)
-    ends = side_by_side(lambda side: extremities(side.mesh), *sampled.sides)
+    ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
     distances = [
         distance_features(side, of_side.vertices, unit)
         for side, of_side, unit in zip(sampled.sides, ends, pair.units_of_length, strict=True)
@@ -169,5 +166,6 @@ class _CoarseRefinement:
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
         """The outcome of the regression, not yet judged; unsuccessful if numbers went wrong."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
-        first = jax.device_put(pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask)))
+        padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
+        first = jax.device_put(padded.astype(np.int32))
         return Outcome([self.stage.run(self.spectrum_x, self.spectrum_y, first, self.samples)], first)

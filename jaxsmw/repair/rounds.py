@@ -13,6 +13,7 @@ from jaxtyping import Array, Int, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.preparation import PreparedPair
+from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import RepairSettings
@@ -27,7 +28,7 @@ def refine_in_stages(
     stages: Sequence[Stage],
     repair: RepairSettings | None = None,
     *,
-    alternatives: Iterable[Int64[np.ndarray, " m"]] = (),
+    alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
     history: bool = False,
 ) -> Outcome:
     """Refines the initial map of a pair by one stage after the other, and repairs a map that looks wrong.
@@ -50,7 +51,8 @@ def refine_in_stages(
     - `prepared`: the pair with its initial map.
     - `stages`: the stages, in order.
     - `repair`: the settings of the repair; None for no repair.
-    - `alternatives`: alternative initial maps, computed one by one and only if needed.
+    - `alternatives`: alternative initial maps, computed one by one and only if needed. By default
+      `jaxsmw.repair.alternatives`, if the initial map is `"shot"`.
     - `history`: see `jaxsmw.refine`.
 
     **Returns:** An `Outcome`. The refinement stops at the first stage that fails.
@@ -72,7 +74,17 @@ def refine_in_stages(
         best.distortion,
         repair.suspicious,
     )
+    if alternatives is None:
+        alternatives = _usual_alternatives(prepared, repair)
     return repairer.best_of_alternatives(best, map(prepared.padded_map, alternatives))
+
+
+def _usual_alternatives(
+    prepared: PreparedPair, settings: RepairSettings
+) -> Iterable[Int64[np.ndarray, " m"]]:
+    if not isinstance(prepared.init, str) or prepared.init != "shot":
+        return ()
+    return alternative_initial_maps(prepared.pair, prepared.spectrum_x, prepared.spectrum_y, settings)
 
 
 _View = tuple[Spectrum, Spectrum]

@@ -18,7 +18,12 @@ _Item = TypeVar("_Item")
 _DEFAULT = ScoreSettings()
 
 
-def dirichlet_energy_ratio(pair: Pair, pointwise_map: Int64[np.ndarray, " m"], spectrum_x: Spectrum) -> float:
+def dirichlet_energy_ratio(
+    pair: Pair,
+    pointwise_map: Int64[np.ndarray, " m"],
+    spectrum_x: Spectrum,
+    settings: ScoreSettings = _DEFAULT,
+) -> float:
     """The Dirichlet energy of the matched positions over that of X's own positions.
 
     Both energies are taken in the span of X's eigenvectors, which leaves out the scatter of single matches:
@@ -30,12 +35,15 @@ def dirichlet_energy_ratio(pair: Pair, pointwise_map: Int64[np.ndarray, " m"], s
 
     - `pointwise_map`: T: X -> Y (m,).
     - `spectrum_x`: of X, with some hundred eigenvectors. Padding beyond the vertices of X is ignored.
+    - `settings`: the numbers of the scores.
     """
-    m = len(pair.mesh_x.vertices)
+    m, n = (len(mesh.vertices) for mesh in pair.meshes)
+    resolved = max(2, min(m, n) // settings.vertices_per_eigenvector)
     eigenvalues, eigenvectors, areas = (
         np.asarray(part)
         for part in (spectrum_x.eigenvalues, spectrum_x.eigenvectors, spectrum_x.vertex_areas)
     )
+    eigenvalues, eigenvectors = eigenvalues[:resolved], eigenvectors[:, :resolved]
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
         # A constant has no energy, but would leave rounding errors.
@@ -65,13 +73,11 @@ def distortion(
     Maps by `Registration` have at most 1.12 between poses of one body, and at most 1.2 between non-isometric
     shapes, if the maps are right. With swapped limbs most maps have more than 1.3.
 
-    **Arguments:** see `dirichlet_energy_ratio`, and
-
-    - `settings`: the numbers of the scores.
+    **Arguments:** see `dirichlet_energy_ratio`.
     """
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
     share = float(pair.mesh_x.vertex_areas[reversed_].sum() / pair.mesh_x.area)
-    ratio = dirichlet_energy_ratio(pair, pointwise_map, spectrum_x)
+    ratio = dirichlet_energy_ratio(pair, pointwise_map, spectrum_x, settings)
     if not pair.partial:
         ratio = max(ratio, 1 / max(ratio, 1e-6))
     return ratio * (1 + settings.orientation_weight * share)
@@ -105,7 +111,7 @@ def orientation_reversal(
     Each triangle of X covers an area on Y, negative if its matches face the other way. The density of this
     signed area is smoothed in the span of X's first eigenvectors and compared with a threshold.
 
-    **Arguments:** see `distortion`.
+    **Arguments:** see `dirichlet_energy_ratio`.
     """
     mesh_x, mesh_y = pair.meshes
     unit_x, unit_y = pair.units_of_length

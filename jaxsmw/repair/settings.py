@@ -11,6 +11,8 @@ class ScoreSettings:
 
     **Attributes:**
 
+    - `vertices_per_eigenvector`: energies are measured in at most one eigenvector per this number of
+      vertices. On coarse meshes further eigenvectors would measure the distances between vertices.
     - `discontinuity_distance`, `discontinuity_ratio`: an edge is discontinuous if its ends are matched
       farther apart than this distance, and than this multiple of the edge's own length. (Matches of
       neighbours are 0.03 apart on bodies of 5000 vertices.)
@@ -23,6 +25,7 @@ class ScoreSettings:
       less than this share of the area.
     """
 
+    vertices_per_eigenvector: int = 10
     discontinuity_distance: float = 0.1
     discontinuity_ratio: float = 3.0
     orientation_eigenvectors: int = 50
@@ -49,6 +52,22 @@ class ExpectedErrorSettings:
     distortion_weight: float = 2.0
     misplaced_weight: float = 0.5
     heat_time: float = 1e-3
+
+
+@dataclass(frozen=True)
+class ExtremitySettings:
+    """The numbers of `jaxsmw.repair.extremities`. Lengths are in square roots of the area.
+
+    **Attributes:**
+
+    - `samples`: this number of evenly spread points represents the surface.
+    - `distance`: no two extremities are closer to each other.
+    - `most`: the largest number of extremities. More have too many pairings.
+    """
+
+    samples: int = 200
+    distance: float = 0.35
+    most: int = 6
 
 
 @dataclass(frozen=True)
@@ -82,6 +101,7 @@ class RepairSettings:
       initial maps from pairings of extremities.
     - `extremity_pairings`: the number of pairings that are tried.
     - `extremity_maps`: the number of pairings that become alternative initial maps.
+    - `extremities`: the numbers by which extremities are found.
     - `scores`: the numbers of the scores.
     """
 
@@ -104,4 +124,5 @@ class RepairSettings:
     extremity_samples: int = 500
     extremity_pairings: int = 16
     extremity_maps: int = 2
+    extremities: ExtremitySettings = ExtremitySettings()
     scores: ScoreSettings = ScoreSettings()

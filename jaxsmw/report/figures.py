@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
 from jaxsmw.report.inputs import check_error_limit, check_errors, check_functional_map, check_map, describe
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
-from jaxsmw.report.standing import Axis, stand, stand_pair
+from jaxsmw.report.standing import stand, stand_pair
 from jaxsmw.runtime.files import atomic_write, check_writable
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
@@ -34,7 +35,7 @@ from jaxsmw.report.page_data import (
     spectra_on_page,
 )
 from jaxsmw.report.rendering import ELEVATION, choose_azimuth
-from jaxsmw.report.standing import Axis, stand_pair
+from jaxsmw.report.standing import stand_pair
 from jaxsmw.runtime.files import atomic_write
 
 # Bodies that are wider than this multiple of their height are shown one above the other on narrow screens.

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import get_args
 
 import igl
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Proper rotations that turn the named axis up. Bodies in y-up and z-up files then face the same way: forward
 # is +z in y-up files and -y in z-up files, and x runs across the body in both.

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from jaxsmw.core.banks.filters import FilterBank
+from jaxsmw.choices import Axis
+from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
@@ -36,7 +37,6 @@ from jaxsmw.report.figures import (
 from jaxsmw.report.inputs import check_map
 from jaxsmw.report.page import ShownMap, write_page
 from jaxsmw.report.page_data import eigenvectors_on_page
-from jaxsmw.report.standing import Axis
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
@@ -77,7 +77,7 @@ def write_report(
     settings: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
-) -> None:
+) -> list[Path]:
     """Writes the pictures of a match, an interactive page and a summary to a directory.
 
     The report includes the expected error (`Correspondence.expected_error`) and, if given, measured errors.
@@ -94,6 +94,8 @@ def write_report(
     - `seconds`: the wall time of every step of the run so far, in seconds, by name; by default the steps of
       `match`. The report adds its own steps and states the sum as the total, so steps must not overlap.
     - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+
+    **Returns:** The files that were written.
 
     **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
     """
@@ -132,6 +134,8 @@ def write_report(
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+    names = ("report.html", *(f"{name}.png" for name in figures), "summary.json")
+    return [directory / name for name in names]
 
 
 def _shown_maps(

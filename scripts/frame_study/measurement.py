@@ -26,9 +26,9 @@ from frame_study.variants import (
     tabulate,
 )
 from jaxsmw import read_mesh
-from jaxsmw.core.banks.filters import FilterBank, Meyer
-from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
+from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
@@ -38,7 +38,8 @@ from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching import initial_map
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import prepare
 
 DATA_SETS = ("faust_r", "tosca_r")
 # Shapes are padded to a multiple of this, so that one compiled program serves a whole data set.
@@ -77,7 +78,7 @@ class PairName(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class MeasuredPair:
     """A pair of shapes, its start and its truth, ready to be refined.
 
     **Attributes:**
@@ -115,19 +116,18 @@ def read_pair(data: Path, name: PairName) -> tuple[Mesh, Mesh, GroundTruth]:
     return mesh_x, mesh_y, read_ground_truth([truth for _, truth in files], mesh_x, mesh_y)
 
 
-def load_pair(data: Path, name: PairName, settings: Settings) -> Pair:
+def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
     """Read a pair and compute what all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
-    spectra = compute_spectrum(mesh_x, k), compute_spectrum(mesh_y, k)
-    start = initial_map(mesh_x, mesh_y, *spectra)
-    padded = pad(spectra[0]), pad(spectra[1])
+    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=k)
+    start, padded = prepared.initial_map, (pad(prepared.spectrum_x), pad(prepared.spectrum_y))
     rows = np.random.default_rng(settings.seed).permutation(len(truth.source_vertices))
     rows = rows[: settings.evaluated_points]
     sources, targets = truth.source_vertices[rows], np.asarray(truth.targets)[rows]
     different, row = np.unique(targets, return_inverse=True)
     distances = geodesic_distances(mesh_y, different) / np.sqrt(mesh_y.area)
-    return Pair(mesh_x, mesh_y, padded, pad_map(start, padded[0]), sources, targets, distances[row])
+    return MeasuredPair(mesh_x, mesh_y, padded, pad_map(start, padded[0]), sources, targets, distances[row])
 
 
 def pad(spectrum: Spectrum) -> Spectrum:
@@ -178,7 +178,9 @@ def _frames(number_of_filters: int) -> dict[str, FilterBank]:
     return frames(number_of_filters)
 
 
-def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings: Settings) -> list[Row]:
+def measure_variants(
+    pair: MeasuredPair, name: PairName, wanted: list[Variant], settings: Settings
+) -> list[Row]:
     """Refine with every variant; a row of the main table for each."""
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     start = np.asarray(pair.start)
@@ -209,7 +211,7 @@ def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings
     return rows
 
 
-def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
+def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
     """Errors of the maps, and the shares of matches that each iteration changes and moves; or NaN."""
     m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
     row: dict[str, float] = {"error_0": pair.error(maps[0])}
@@ -224,7 +226,7 @@ def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
 
 
 def measure_parameters(
-    pair: Pair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
+    pair: MeasuredPair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
 ) -> list[Row]:
     """Meyer, filtering, with other numbers of eigenvectors and filters; the error after each iteration."""
     if not wanted:
@@ -253,7 +255,7 @@ def measure_parameters(
 
 
 def measure_invariance(
-    pair: Pair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
+    pair: MeasuredPair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
 ) -> list[Row]:
     """How much wavelets at corresponding centres differ at corresponding points, per frame and scale.
 

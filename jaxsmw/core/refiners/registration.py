@@ -167,7 +167,7 @@ class _Surface(NamedTuple):
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
                 "Registration needs positions and normals, which a spectrum lacks: compute_spectrum gives "
-                "them, and Spectrum.place adds them"
+                "them, and Spectrum.with_positions adds them"
             )
         dtype = spectrum.eigenvectors.dtype
         weights = spectrum.vertex_areas / jnp.sum(spectrum.vertex_areas)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.core.banks.filters import FilterBank, Meyer, sample_bank
+from jaxsmw.choices import Search
+from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
@@ -19,8 +19,6 @@ from jaxsmw.core.search import Patches
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
-
-Search = Literal["auto", "exhaustive", "patches", "approximate"]
 
 
 class PreparedWavelets(Prepared):
@@ -56,11 +54,10 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     - `search`: how nearest neighbours are found. `"exhaustive"` compares all vertices with all vertices.
       `"patches"` finds the same neighbours but skips patches of the target that are too far away: several
       times as fast on a CPU, but seconds longer to compile. `"auto"` uses patches on CPUs from 15 000
-      vertices. `"approximate"` misses a few in a thousand neighbours of a good map, more of a poor map
-      (`approximate_nearest_neighbor`, needs FAISS).
+      vertices.
 
     **Raises:** `TypeError` if the bank is not a `FilterBank` or the solution not a `Solution`; `ValueError`
-    for an unknown choice; `ImportError` if the search needs FAISS and FAISS is not installed.
+    for an unknown choice.
     """
 
     bank: FilterBank = Meyer()
@@ -75,8 +72,6 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("convention", self.convention, get_args(Convention))
         check_choice("lambda_max", self.lambda_max, ("own", "common"))
         check_choice("search", self.search, get_args(Search))
-        if self.search == "approximate" and not find_spec("faiss"):
-            raise ImportError("search='approximate' needs FAISS: pip install 'jaxsmw[approximate]'")
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
         """Both shapes with the bank sampled at their eigenvalues."""
@@ -116,20 +111,18 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
             prepared.spectrum_y,
             convention=self.convention,
             patches=prepared.patches,
-            approximate=self.search == "approximate",
         )
 
     def recover_reverse(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " n"]:
         """Nearest neighbours of the vertices of Y among those of X."""
         queries, database = self.embeddings(prepared, state)[::-1]
-        search = "auto" if self.search == "approximate" else self.search
-        patches = chosen_patches(search, prepared.spectrum_y, prepared.spectrum_x)
+        patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
 
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Eq. (5), area-weighted; see `wavelet_energy`."""
+        """Eq. (5), area-weighted; see `WaveletProblem.energy`."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(
