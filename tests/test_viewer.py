@@ -28,6 +28,8 @@ from jaxsmw.report.page_data import encode_rounded
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import stand_pair
 
+pytestmark = pytest.mark.browser
+
 HOSTILE = '</script></title><img src=x onerror="window.hacked=1"><b>\'&{{script}}'
 
 
