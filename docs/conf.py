@@ -79,9 +79,11 @@ _PUBLIC: dict[str, str] = {}
 _ORIGINS: dict[str, str] = {}
 for _module in map(import_module, _MODULES):
     for _name in _module.__all__:
+        _value = getattr(_module, _name)
+        if isinstance(_value, ModuleType):
+            continue
         _path = f"{_module.__name__}.{_name}"
         _documented = _PUBLIC.setdefault(_name, _path)
-        _value = getattr(_module, _name)
         if _path != _documented:
             _ORIGINS[_path] = _documented
         if hasattr(_value, "__qualname__"):
