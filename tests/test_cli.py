@@ -134,7 +134,7 @@ def test_a_tiny_mesh_is_told_what_it_lacks(run, tmp_path):
     (tmp_path / "tetrahedron.off").write_text(OFF.format(4, 4, TRIANGLES, FACES))
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
     assert_refused(run(*call), naming="--init wks")
-    assert_refused(run(*call, "--eigenvectors", "100"), naming="between 1 and 3")
+    assert_refused(run(*call, "--eigenvectors", "100"), naming="choose a number from 1 to 3")
     assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="with 1 eigenvectors")
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
