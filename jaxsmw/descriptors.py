@@ -1,4 +1,4 @@
-"""Descriptors of two shapes: SHOT where vertices are compared, and its principal components everywhere."""
+"""Descriptors of a pair: SHOT where vertices are compared, and principal components of SHOT everywhere."""
 
 from __future__ import annotations
 
@@ -13,49 +13,76 @@ from jaxtyping import Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, units_of_length
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples, spread_samples
 from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
+from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
 
+# Descriptors do not tell vertices apart that are a few hundredths of the square root of the area away from
+# each other. Ten thousand vertices are dense enough for that.
+_COMPARED, _COMPARED_FROM = 10_000, 15_000
+# From this number of vertices on, the smaller neighbourhoods hold ten vertices.
+_FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
+# Descriptors of larger neighbourhoods vary more slowly, so fewer of them suffice.
+_SPREAD = 2000
 
-class Compared(NamedTuple):
-    """A shape, or where it has too many vertices to compare all, samples of it; `spectrum` is theirs."""
+
+class SampledShape(NamedTuple):
+    """A shape at the vertices where descriptors are compared: all vertices, or samples of a large mesh.
+
+    **Attributes:**
+
+    - `mesh`: the shape.
+    - `samples`: the samples; None for all vertices.
+    - `spectrum`: the spectrum at these vertices.
+    """
 
     mesh: Mesh
     samples: Samples | None
     spectrum: Spectrum
 
     @classmethod
-    def make(cls, mesh: Mesh, samples: Samples | None, spectrum: Spectrum) -> Compared:
+    def make(cls, mesh: Mesh, samples: Samples | None, spectrum: Spectrum) -> SampledShape:
+        """**Raises:** `InputError` if the spectrum belongs to another mesh."""
         if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
             raise InputError(
-                f"{mesh.name}: it has {n} vertices, but the spectrum given for it is of {rows}: give its own."
+                f"{mesh.name}: the mesh has {n} vertices, but its spectrum has {rows}: give the mesh's own "
+                "spectrum."
             )
         if samples is not None:
             spectrum = spectrum.sample(jnp.asarray(samples.vertices))
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """Where what is known of vertices, or of the samples nearest to them, stands."""
+        """The rows of vertices, or of the samples nearest to them, in arrays over the compared vertices."""
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
 
-# Descriptors tell no more apart than what is a few hundredths of the square root of the area away, for which
-# ten thousand vertices are plenty.
-_COMPARED, _COMPARED_FROM = 10_000, 15_000
-# The smaller neighbourhoods hold ten vertices from this many on.
-_FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# Descriptors of wider neighbourhoods vary more slowly.
-_SPREAD = 2000
+class SampledPair(NamedTuple):
+    """A pair at the vertices where descriptors are compared."""
+
+    pair: Pair
+    x: SampledShape
+    y: SampledShape
+
+    @property
+    def sides(self) -> tuple[SampledShape, SampledShape]:
+        """X and Y."""
+        return self.x, self.y
 
 
-def compared(
-    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
-) -> tuple[Compared, Compared]:
-    """Both shapes, thinned where they have too many vertices."""
-    samples_x, samples_y = side_by_side(_samples, mesh_x, mesh_y)
-    return Compared.make(mesh_x, samples_x, spectrum_x), Compared.make(mesh_y, samples_y, spectrum_y)
+def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
+    """A pair at all vertices, or at 10 000 evenly spread vertices of each mesh with more than 15 000.
+
+    **Raises:** `InputError` if a spectrum belongs to another mesh.
+    """
+    samples_x, samples_y = side_by_side(_samples, *pair.meshes)
+    return SampledPair(
+        pair,
+        SampledShape.make(pair.mesh_x, samples_x, spectrum_x),
+        SampledShape.make(pair.mesh_y, samples_y, spectrum_y),
+    )
 
 
 def _samples(mesh: Mesh) -> Samples | None:
@@ -63,22 +90,16 @@ def _samples(mesh: Mesh) -> Samples | None:
 
 
 def describe(
-    mesh_x: Mesh,
-    mesh_y: Mesh,
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-    number_of_descriptors: int,
-    *,
-    partial: bool = False,
+    pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum, number_of_descriptors: int
 ) -> tuple[Spectrum, Spectrum]:
-    """The spectra with descriptors: principal components of SHOT on both shapes together, of mean square 1.
+    """Both spectra with descriptors: principal components of SHOT on both shapes together, of mean square 1.
 
-    SHOT with the usual radius, and on meshes that are fine enough with one of two thirds, too, side by side.
+    SHOT is computed with the usual radius, and on fine meshes also with two thirds of that radius.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`, `partial`: see `paired_spectra`.
-    - `number_of_descriptors`: d, from 1 to 352; the components in which the shapes' vertices differ most.
+    - `spectrum_x`, `spectrum_y`: see `paired_spectra`.
+    - `number_of_descriptors`: d, from 1 to 352; the components in which the vertices differ most.
 
     **Returns:** Both spectra with `descriptors`, (m, d) and (n, d).
 
@@ -86,39 +107,59 @@ def describe(
     """
     if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
         raise InputError(
-            f"{number_of_descriptors} descriptors were asked for; SHOT gives from 1 to {SHOT_DIMENSION}."
+            f"{number_of_descriptors} descriptors were requested; SHOT has from 1 to {SHOT_DIMENSION}."
         )
-    sides = compared(mesh_x, mesh_y, spectrum_x, spectrum_y)
-    of_radii = [paired_shot(*sides, partial)]
-    if min(len(side.mesh.vertices) for side in sides) >= _FINE:
-        with suppress(InputError), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # where a mesh is too coarse for it, the usual one is enough
-            of_radii.append(paired_shot(*sides, partial, _FINE_RADIUS))
+    sampled = sample_pair(pair, spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype
-    both = np.hstack([np.concatenate(of_radius) for of_radius in of_radii], dtype=dtype)
-    areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sides]
+    shot = np.hstack([np.concatenate(both) for both in _shot_at_all_radii(sampled)], dtype=dtype)
+    areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sampled.sides]
     weight = np.concatenate([a / a.sum() / 2 for a in areas]).astype(dtype)
-    centered = both - weight @ both
-    covariance = centered.T @ (weight[:, None] * centered)
-    variances, directions = np.linalg.eigh(covariance.astype(np.float64))
-    first = slice(None, -number_of_descriptors - 1, -1)
-    scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
-    components = np.split(centered @ (directions[:, first] / scale).astype(dtype), [len(areas[0])])
+    components = _principal_components(shot, weight, number_of_descriptors)
     described = []
-    for spectrum, side, found in zip((spectrum_x, spectrum_y), sides, components, strict=True):
+    both = np.split(components, [len(areas[0])])
+    for spectrum, side, found in zip((spectrum_x, spectrum_y), sampled.sides, both, strict=True):
         everywhere = found if side.samples is None else found[side.samples.nearest]
         everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
-        described.append(spectrum.describe(jax.device_put(everywhere)))
+        described.append(spectrum.with_descriptors(jax.device_put(everywhere)))
     return described[0], described[1]
 
 
-def paired_shot(
-    x: Compared, y: Compared, partial: bool, radius: float = SHOT_RADIUS
-) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """SHOT of both shapes at one scale."""
+def _shot_at_all_radii(
+    sampled: SampledPair,
+) -> list[tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]]:
+    """SHOT of both shapes with the usual radius, and with a smaller radius if both meshes are fine enough."""
+    shot = [paired_shot(sampled)]
+    if min(len(mesh.vertices) for mesh in sampled.pair.meshes) >= _FINE:
+        with suppress(InputError), warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # the usual radius suffices for a mesh too coarse for the smaller one
+            shot.append(paired_shot(sampled, _FINE_RADIUS))
+    return shot
 
-    def of_one(side: tuple[Compared, float]) -> Float[np.ndarray, "n d"]:
-        (mesh, samples, _), unit = side
+
+def _principal_components(
+    values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
+) -> Float[np.ndarray, "n d"]:
+    """The first principal components of weighted rows, scaled to mean square 1."""
+    centered = values - weight @ values
+    covariance = centered.T @ (weight[:, None] * centered)
+    variances, directions = np.linalg.eigh(covariance.astype(np.float64))
+    first = slice(None, -number - 1, -1)
+    scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
+    return centered @ (directions[:, first] / scale).astype(values.dtype)
+
+
+def paired_shot(
+    sampled: SampledPair, radius: float = SHOT_RADIUS
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+    """SHOT of both shapes at the compared vertices, with a radius in `Pair.units_of_length`.
+
+    **Raises:** `InputError` if a mesh is too coarse for the radius.
+    """
+
+    def of_one(argument: tuple[SampledShape, float]) -> Float[np.ndarray, "n d"]:
+        (mesh, samples, _), unit = argument
         own_radius = radius * unit / mesh.area**0.5
         if radius <= SHOT_RADIUS or len(mesh.vertices) <= _SPREAD:
             return shot_descriptors(mesh, radius=own_radius, samples=samples)
@@ -126,5 +167,5 @@ def paired_shot(
         nearest = fewer.nearest if samples is None else fewer.nearest[samples.vertices]
         return shot_descriptors(mesh, radius=own_radius, samples=fewer)[nearest]
 
-    units = units_of_length(x.mesh, y.mesh, partial)
-    return side_by_side(of_one, (x, units[0]), (y, units[1]))
+    unit_x, unit_y = sampled.pair.units_of_length
+    return side_by_side(of_one, (sampled.x, unit_x), (sampled.y, unit_y))

@@ -53,25 +53,31 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.refinement import Refiner, Search, WaveletPreservation, refine
+from jaxsmw.choices import Eigensolver, Search
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
-from jaxsmw.geometry.eigenbasis import Eigensolver, compute_spectrum, eigenpairs
+from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.initial_maps.starts import initial_map
+from jaxsmw.initial_maps import initial_map
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.matching import match, paired_spectra
-from jaxsmw.presets import PRESETS, Preset, Stage
+from jaxsmw.matching import match
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import prepare
+from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
+from jaxsmw.stage import Stage
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
@@ -148,16 +154,15 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         pair = creature_pair(vertices=size)
         meshes = pair.source, pair.target
         x, y = (compute_spectrum(mesh, EIGENVECTORS, eigensolver="exact") for mesh in meshes)
-        start = jnp.asarray(initial_map(*meshes, x, y, init="shot" if size <= STORED else "wks"))
+        start = jnp.asarray(initial_map(Pair(*meshes), x, y, init="shot" if size <= STORED else "wks"))
         samples = [jnp.asarray(farthest_point_samples(mesh, SAMPLES)) for mesh in meshes]
 
         def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
-            chosen = dict(zip(("samples_x", "samples_y"), sampled, strict=False))
 
             def once() -> Any:
                 with one_blas_thread():  # as in `match`
                     return jax.block_until_ready(
-                        run(x, y, start, refiner=refiner, iterations=ITERATIONS, **chosen)
+                        run(x, y, start, refiner=refiner, iterations=ITERATIONS, samples=sampled or None)
                     )
 
             return once
@@ -327,7 +332,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         def both(k: int, meshes: tuple[Mesh, Mesh] = (pair.source, pair.target)) -> object:
             return [eigenpairs(mesh, k) for mesh in meshes]
 
-        accurate = max(stage.number_of_eigenvectors for stage in PRESETS["accurate"])
+        accurate = PRESETS["accurate"].number_of_eigenvectors
 
         kept = Path(directory) / "kept"
         started(*matching, cache=kept)()
@@ -447,7 +452,7 @@ def peak_memory() -> float:
 
 
 def matched_from_files(
-    files: list[str], preset: Preset
+    files: list[str], preset: PresetName
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
     """Name, seconds and peak memory of each stage; initial and refined map."""
     stages = [("start", time.perf_counter(), 0.0)]
@@ -477,7 +482,7 @@ def scale(options: argparse.Namespace) -> Iterator[Part]:
     yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
 
 
-def scaled(options: argparse.Namespace, preset: Preset, sizes: Sequence[int]) -> Part:
+def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
     """One preset at several sizes."""
     truth = pair_with_truth(options)
     rows, measured = [], []
@@ -582,7 +587,9 @@ def ours_from_files(
 ) -> tuple[np.ndarray, float]:
     """The map, and the seconds of refinement alone."""
     refiner = WaveletPreservation(search=search)
-    stage = Stage(refiner, EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples)
+    stage = Stage(
+        refiner, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples
+    )
     result = match(*map(read_mesh, files), preset=stage)
     return result.pointwise_map, result.seconds["refinement"]
 
@@ -590,8 +597,7 @@ def ours_from_files(
 @cache
 def our_start(*files: str) -> np.ndarray:
     """The initial map of `match`, kept from call to call: peers are not charged for it."""
-    meshes = [read_mesh(file) for file in files]
-    return initial_map(*meshes, *paired_spectra(*meshes, EIGENVECTORS))
+    return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
 def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:

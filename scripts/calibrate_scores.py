@@ -1,16 +1,18 @@
-"""How far scores that need no ground truth can be trusted.
+"""Measures how reliable the scores are that need no ground truth.
 
     python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME]
         [--output FILE.md]
 
-Two tables, over pairs drawn at random from each data set (see `docs/datasets.md`):
+The script draws pairs at random from each data set (see `docs/datasets.md`) and prints three tables:
 
-- `Correspondence.expected_error` of a preset's outcomes beside the true errors: their rank correlation, and
-  how many gross errors (over a tenth of the square root of the area) lie in the tenth of the vertices for
-  which it is largest; then what errors vertices have, by what was expected of them.
-- for `accurate`, how often each score prefers the map that it ends at to one of the body's mirror image,
-  which the same stages, but for mending, make of the mirrored truth. Only for sets that have that, vertex by
-  vertex. The uncertainty of the regression is that of one begun from the map.
+- `Correspondence.expected_error` of the results of a preset, compared with the true errors: the rank
+  correlation, and the share of gross errors (over a tenth of the square root of the area) among the tenth of
+  the vertices with the largest expected errors.
+- The true errors of all vertices, in tenths by their expected errors.
+- For the preset `accurate`: how often each score prefers the result to a mirrored map. The mirrored map is
+  computed from the mirrored ground truth, by the same stages without repair. The table covers only data sets
+  with a mirrored ground truth for every vertex. The uncertainty of the regression is that of a regression
+  started from the map.
 """
 
 from __future__ import annotations
@@ -19,7 +21,6 @@ import argparse
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -30,22 +31,27 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from jaxsmw import InputError, geodesic_error, match, read_mesh
-from jaxsmw.evaluation.benchmark import choose_pairs
-from jaxsmw.evaluation.datasets import DataPair, DataSet, open_data_set
+from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_data_set
 from jaxsmw.matching import Correspondence
-from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.faults import flaw, stretch
+from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.repair.scores import dirichlet_energy_ratio, distortion
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
-# What the preset does after its first stage, without looking for mirrored limbs.
-AS_IT_STARTS = tuple(replace(stage, mending=None) for stage in PRESETS["accurate"][1:])
+# The stages of the preset after the first, without repair.
+WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 
 class Measured(NamedTuple):
-    """One pair: true and expected errors of some vertices; for each score, direct and mirrored."""
+    """The measurements of one pair.
+
+    **Attributes:**
+
+    - `true`, `expected`: the true and the expected errors of some vertices (p,).
+    - `scores`: each score of the direct and of the mirrored map, by name.
+    """
 
     true: Float64[np.ndarray, " p"]
     expected: Float64[np.ndarray, " p"]
@@ -53,9 +59,9 @@ class Measured(NamedTuple):
 
 
 def measure(
-    pair: DataPair, seed: int, preset: Preset = "accurate", number_of_samples: int | None = 1000
+    pair: DataPair, seed: int, preset: PresetName = "accurate", number_of_samples: int | None = 1000
 ) -> Measured:
-    """Match a pair and look at its outcome with and without the truth."""
+    """Matches a pair, and compares the scores of the result with the ground truth."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     found = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
@@ -67,26 +73,28 @@ def measure(
         with suppress(InputError):
             mirrored = pair.ground_truth(mesh_x, mesh_y, mirrored=True)
     if mirrored is not None and isinstance(mirrored.targets, np.ndarray) and not pair.partial:
-        turned = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=AS_IT_STARTS)
-        direct, other = (looks(result) for result in (found, turned))
+        reflected = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=WITHOUT_REPAIR)
+        direct, other = (scores_of(result) for result in (found, reflected))
         scores = {name: (direct[name], other[name]) for name in direct}
     expected = found.expected_error()[error.source_vertices]
     return Measured(error.errors[known], expected[known], scores)
 
 
-def looks(found: Correspondence) -> dict[str, float]:
-    """Scores of a map, the smaller the better."""
-    meshes, pointwise_map = (found.mesh_x, found.mesh_y), found.pointwise_map
-    regression = match(*meshes, init=pointwise_map, preset=AS_IT_STARTS[0]).refinement.updated
+def scores_of(found: Correspondence) -> dict[str, float]:
+    """Returns the scores of a map by name; lower is better."""
+    known = found.pair, found.pointwise_map, found.spectrum_x
+    regression = match(*found.pair.meshes, init=found.pointwise_map, preset=WITHOUT_REPAIR[0])
+    uncertainty = regression.refinement.state.uncertainty
+    assert uncertainty is not None
     return {
-        "stretch": stretch(*meshes, pointwise_map, found.spectrum_x),
-        "uncertainty of the regression": float(regression.uncertainty),
-        "flaw": flaw(*meshes, pointwise_map, found.spectrum_x),
+        "Dirichlet energy ratio": dirichlet_energy_ratio(*known),
+        "uncertainty of the regression": float(uncertainty),
+        "distortion": distortion(*known),
     }
 
 
 def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
-    """The page, in parts."""
+    """Yields the three tables as Markdown."""
     rows = [
         ["", "pairs", "mean error", "mean expected", "rank correlation", "gross errors", "in the worst tenth"]
     ]
@@ -108,7 +116,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
                 f"{sum(held) / total:.0%}" if total else "—",
             ]
         )
-    yield "Errors x 10⁻³; the worst tenth is that of each pair.\n\n" + markdown(rows)
+    yield "Errors x 10⁻³; the worst tenth is taken for each pair.\n\n" + markdown(rows)
 
     everything = [pair for pairs in measured.values() for pair in pairs]
     true, expected = (
@@ -121,7 +129,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         figures = own.mean(), np.median(own)
         rows.append([f"{1e3 * low:.1f} to {1e3 * high:.1f}", *(f"{1e3 * figure:.1f}" for figure in figures)])
         rows[-1].append(f"{np.mean(own > GROSS):.1%}")
-    yield "All vertices, in tenths by the error expected:\n\n" + markdown(rows)
+    yield "All vertices, in tenths by their expected errors:\n\n" + markdown(rows)
 
     names = list(dict.fromkeys(name for pair in everything for name in pair.scores))
     if names:
@@ -138,12 +146,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
-    parser.add_argument("--pairs", metavar="N", default="20", help="of each set (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")
+    parser.add_argument("--pairs", metavar="N", default="20", help="pairs from each data set (default: 20)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default: 0)")
     parser.add_argument("--preset", choices=PRESETS, default="accurate", help="(default: accurate)")
-    parser.add_argument("--output", metavar="FILE.md", type=Path, help="gets the tables as well")
+    parser.add_argument("--output", metavar="FILE.md", type=Path, help="file for the tables")
     options = parser.parse_args()
-    warnings.simplefilter("ignore")  # about meshes, of which each would tell
+    warnings.simplefilter("ignore")  # about each mesh
 
     chosen: list[tuple[DataSet, DataPair]] = []
     for directory in options.data_sets:

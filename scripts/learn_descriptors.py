@@ -6,7 +6,7 @@
 It needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` makes descriptors of
-vertices from SHOT and the wave kernel signature. A `jaxsmw.WaveletPreservationLayer` behind it makes of those
+vertices from SHOT and the wave kernel signature. A `jaxsmw.learning.WaveletPreservationLayer` behind it makes of those
 of two shapes a functional map and a soft map, and by gradients through both the network is trained by Adam
 (optax) on pairs of FAUST's first five people, one at each step: once with the truth, once without.
 
@@ -56,21 +56,21 @@ from jaxsmw import (
     Filtering,
     Mesh,
     Meyer,
+    Pair,
     Spectrum,
     WaveletPreservation,
-    WaveletPreservationLayer,
     compute_spectrum,
-    farthest_point_samples,
-    initial_map,
-    nearest_neighbor,
+    prepare,
     read_mesh,
-    shot_descriptors,
 )
 from jaxsmw.core.products import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.functional_maps import nearest_neighbor
+from jaxsmw.geometry import farthest_point_samples, shot_descriptors
 from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
@@ -175,7 +175,7 @@ class Shape(NamedTuple):
     positions: Float[Array, "s 3"]
 
 
-class Pair(NamedTuple):
+class TrainingPair(NamedTuple):
     """Two shapes, and where in Y the samples of X belong."""
 
     x: Shape
@@ -201,18 +201,18 @@ def source(file: Path) -> Source:
 
 
 @cache
-def prepared(pair: DataPair) -> Pair:
+def prepared(pair: DataPair) -> TrainingPair:
     """A pair as training takes it."""
     x, y = map(source, pair.meshes)
     truth = pair.ground_truth(x.mesh, y.mesh).everywhere(x.mesh)[x.samples]
-    return Pair(x.shape, y.shape, jnp.asarray(places(y.mesh)[truth], float))
+    return TrainingPair(x.shape, y.shape, jnp.asarray(places(y.mesh)[truth], float))
 
 
 def described(mesh: Mesh) -> Spectrum:
     """A spectrum as a `DescriptorNetwork` wants it, of area 1, with SHOT, padded."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
-    return padded(spectrum.describe(jnp.asarray(shot)))
+    return padded(spectrum.with_descriptors(jnp.asarray(shot)))
 
 
 class Matched(NamedTuple):
@@ -235,7 +235,7 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
     return Matched(by_descriptors, found.soft_map, found.functional_map, energy / LAYER_EIGENVECTORS)
 
 
-def distance_to_truth(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
+def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """The loss with labels: how far from the truth the layer takes points, and descriptors by themselves."""
     found = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
@@ -245,7 +245,7 @@ def distance_to_truth(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""
     return by_layer + by_descriptors / 2
 
 
-def inconsistency(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
+def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """The loss without.
 
     What of wavelets is lost, how far functional maps there and back are from undoing each other, and how far
@@ -265,7 +265,7 @@ def inconsistency(network: DescriptorNetwork, pair: Pair) -> Float[Array, ""]:
     return WEIGHT * (there.energy + back.energy + bijectivity) + by_layer + by_descriptors / 2
 
 
-LOSSES: dict[str, Callable[[DescriptorNetwork, Pair], Float[Array, ""]]] = {
+LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]] = {
     "labels": distance_to_truth,
     "cycles": inconsistency,
 }
@@ -308,9 +308,9 @@ def of_pair(pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
-    spectra = x.describe(None), y.describe(None)
-    whole = (compute_spectrum(mesh, EIGENVECTORS) for mesh in (mesh_x, mesh_y))
-    starts = {REFERENCE: initial_map(mesh_x, mesh_y, *whole)}
+    spectra = x.with_descriptors(None), y.with_descriptors(None)
+    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
+    starts = {REFERENCE: prepared.initial_map}
     for name, network in networks.items():
         starts[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
     maps = {f"{name}{START}": found for name, found in starts.items()}

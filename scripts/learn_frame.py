@@ -7,7 +7,7 @@ It needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `SoftmaxFrame`, a Parseval frame whatever
 its parameters are, starts like Meyer's with six filters and is trained on pairs of FAUST's first five people
-by Adam (optax), one pair at each step, with gradients through `jaxsmw.refine_softly` on samples of both
+by Adam (optax), one pair at each step, with gradients through `jaxsmw.learning.refine_softly` on samples of both
 shapes: once with the truth, once without. What is minimised is how far matches are from the truth, or how far
 one is from where one began after going there and back, as the root of the mean square over a soft map.
 
@@ -50,18 +50,20 @@ from jaxsmw import (
     Filtering,
     Mesh,
     Meyer,
-    SoftmaxFrame,
+    Pair,
     Spectrum,
     WaveletPreservation,
-    farthest_point_samples,
     initial_map,
     paired_spectra,
+    prepare,
     read_mesh,
-    refine_softly,
 )
-from jaxsmw.core.banks.filters import FilterBank, Power, Warped
+from jaxsmw.banks import SoftmaxFrame
+from jaxsmw.core.banks import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.geometry import farthest_point_samples
+from jaxsmw.learning import refine_softly
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6
@@ -94,7 +96,8 @@ def like_meyer() -> SoftmaxFrame:
 def sampled(pair: DataPair) -> Sampled:
     """Samples, starts in both directions and truth of a pair, lengths in square roots of the area."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
-    spectra = paired_spectra(mesh_x, mesh_y, EIGENVECTORS)
+    pair_of_meshes = Pair(mesh_x, mesh_y)
+    spectra = paired_spectra(pair_of_meshes, EIGENVECTORS)
     samples = [farthest_point_samples(mesh, SAMPLES) for mesh in (mesh_x, mesh_y)]
     positions = [places(mesh)[chosen] for mesh, chosen in zip((mesh_x, mesh_y), samples, strict=True)]
 
@@ -107,8 +110,8 @@ def sampled(pair: DataPair) -> Sampled:
     return Sampled(
         *(spectrum.sample(jnp.asarray(chosen)) for spectrum, chosen in zip(spectra, samples, strict=True)),
         *(jnp.asarray(place, jnp.float32) for place in positions),
-        jnp.asarray(nearest(initial_map(mesh_x, mesh_y, *spectra), 0, mesh_y)),
-        jnp.asarray(nearest(initial_map(mesh_y, mesh_x, *spectra[::-1]), 1, mesh_x)),
+        jnp.asarray(nearest(initial_map(pair_of_meshes, *spectra), 0, mesh_y)),
+        jnp.asarray(nearest(initial_map(pair_of_meshes.reversed(), *spectra[::-1]), 1, mesh_x)),
         jnp.asarray(places(mesh_y)[truth], jnp.float32),
     )
 
@@ -160,8 +163,8 @@ def load(path: Path) -> FilterBank:
 def of_pair(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
     """Mean geodesic errors x 10³ of refinement with each bank, from the same start."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
-    spectra = paired_spectra(mesh_x, mesh_y, EIGENVECTORS)
-    start = initial_map(mesh_x, mesh_y, *spectra)
+    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
+    spectra, start = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map
     maps = {name: refined(spectra, start, WaveletPreservation(bank)) for name, bank in banks.items()}
     return errors(pair, mesh_x, mesh_y, maps, seed)
 

@@ -1,21 +1,23 @@
-"""The MWP paper's comparisons, on whatever data sets are there.
+"""Repeats the comparisons of the MWP paper on all available data sets.
 
     python scripts/reproduce_paper.py DATA_DIRECTORY [--output DIR] [--only NAME ...]
         [--sets NAME ...] [--pairs N] [--quick]
 
-DATA_DIRECTORY holds data sets as `docs/datasets.md` describes them, each in its own directory. Every
-experiment below is measured on those it is for:
+DATA_DIRECTORY holds data sets in the layouts of `docs/datasets.md`, each in its own directory. Each
+experiment uses the data sets that suit the experiment:
 
 - `table1`: error and refinement time of all methods (Table 1), time with precomputation (Table 2) and
-  correspondence quality curves (Fig. 4), on sets whose pairs are of one class;
-- `fig6`: parts of shapes, cuts and holes apart;
-- `fig7`: bodies glued to themselves;
-- `fig9`: other meshings and resolutions of the target, and other starts;
-- `nonisometric`: pairs of different classes, from published starts where there are, beside published results;
-- `settings`: MWP and its opponents at other settings than the published ones, on the sets of `table1`.
+  correspondence quality curves (Fig. 4), on data sets whose pairs are of one class;
+- `fig6`: partial shapes, separately for cuts and holes;
+- `fig7`: shapes with topological noise;
+- `fig9`: other meshes and resolutions of the target, and other initial maps;
+- `nonisometric`: pairs of different classes, from published initial maps if there are any, compared with
+  published results;
+- `settings`: MWP and the other methods at other settings than published, on the data sets of `table1`.
 
-The output gets a directory for each run (what `jaxsmw benchmark` writes) and `README.md` with all tables.
-Whatever interrupts it, the same command goes on from there. Quick takes minutes on shapes of 5000 vertices.
+The output directory gets a directory for each run, as written by `jaxsmw benchmark`, and `README.md` with all
+tables. After an interruption the same command continues. `--quick` takes minutes on shapes with 5000
+vertices.
 """
 
 from __future__ import annotations
@@ -34,9 +36,12 @@ from jaxtyping import Int64
 from scipy.spatial import KDTree
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.benchmark import Results, Settings, choose_pairs, run_benchmark
-from jaxsmw.evaluation.datasets import DataPair, DataSet, class_of, open_data_set
-from jaxsmw.evaluation.opponents.opponents import METHODS, Method, Published, suited_methods
+from jaxsmw.evaluation.benchmark import Results, run_benchmark
+from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, class_of, open_data_set
+from jaxsmw.evaluation.measurement import Settings
+from jaxsmw.evaluation.opponents.base import Method
+from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
+from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
@@ -44,15 +49,15 @@ from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")
-# How many pairs of each set fig9 takes of those that the other experiments take.
+# fig9 uses one of so many pairs that the other experiments use.
 FIG9_SHARE = 4
-STARTS = ("shot", "wks", "hks", "wavelet", "functional")
-# SHOT and what is made of it alone tell left from right.
+INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
+# These descriptors cannot distinguish left from right; SHOT can, and "functional" is computed from SHOT.
 _MIRRORED = {"wks", "hks", "wavelet"}
 
 
 class Run(NamedTuple):
-    """One benchmark: a column of an experiment's table."""
+    """One benchmark, which is one column in the table of an experiment."""
 
     experiment: str
     name: str
@@ -63,11 +68,14 @@ class Run(NamedTuple):
 
 
 def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
-    """Those of some names, or all that are recognised in a directory's directories."""
+    """Opens the data sets with the given names, or all data sets in a directory.
+
+    **Raises:** `InputError` if a named data set cannot be opened, or if there is no data set.
+    """
     if names:
         return [open_data_set(data / name) for name in names]
     if not data.is_dir():
-        raise InputError(f"{data}: is no directory: give the one that holds the data sets.")
+        raise InputError(f"{data}: is not a directory: give the directory that holds the data sets.")
     found = []
     for directory in sorted(path for path in data.iterdir() if path.is_dir()):
         try:
@@ -80,40 +88,40 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
 
 
 def is_isometric(data_set: DataSet) -> bool:
-    """Whether its pairs are poses of whole bodies of one kind."""
+    """Whether each pair shows two poses of a full shape of one class."""
     special = ("SHREC'16 partial", "SHREC'16 topology")
     within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
     return within and data_set.layout not in special
 
 
 def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Whole near-isometric shapes, every method."""
+    """Full near-isometric shapes, all methods."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Parts to their full shapes."""
+    """Partial shapes to full shapes."""
     for data_set in data_sets:
         if data_set.layout != "SHREC'16 partial":
             continue
         for kind in ("cuts", "holes"):
             pairs = tuple(pair for pair in data_set.pairs if pair.source.startswith(kind))
             if pairs:
-                part = dataclasses.replace(data_set, pairs=pairs)
+                subset = dataclasses.replace(data_set, pairs=pairs)
                 yield Run(
                     "fig6",
                     f"{data_set.name}-{kind}",
-                    part,
-                    chosen(part, options),
+                    subset,
+                    chosen(subset, options),
                     methods(pairs, options),
                     same(options),
                 )
 
 
 def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Topological noise."""
+    """Shapes with topological noise."""
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
             pairs = chosen(data_set, options)
@@ -121,16 +129,16 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Other meshings and resolutions of the target, other starts."""
+    """Other meshes and resolutions of the target, and other initial maps."""
     some = {name: METHODS[name] for name in FIG9_METHODS}
     few = argparse.Namespace(**{**vars(options), "pairs": max(2, (options.pairs or 40) // FIG9_SHARE)})
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, few)
-        for start in (*STARTS, *published(data_set)):
-            setting = same(options, init=start, mirrored=_can_mirror(start, pairs))
-            yield Run("fig9", f"{data_set.name}-from-{Path(start).name}", data_set, pairs, some, setting)
+        for init in (*INITIAL_MAPS, *published(data_set)):
+            setting = same(options, init=init, mirrored=_can_mirror(init, pairs))
+            yield Run("fig9", f"{data_set.name}-from-{Path(init).name}", data_set, pairs, some, setting)
         if not all(len(pair.truth) in (0, 2) for pair in pairs):
-            continue  # no rows to carry over
+            continue  # because `derive` needs rows of ground truth that exist for each shape
         for name, remesh in MESHINGS.items():
             directory = options.output / "fig9" / f"meshes-{data_set.name}-{name}"
             derived = derive(directory, pairs, name, remesh)
@@ -139,31 +147,34 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Different kinds of bodies, and what others made of them from the same starts."""
+    """Non-isometric shapes, compared with published results from the same initial maps."""
     for data_set in data_sets:
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        starts = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
-        for start in starts or ["shot"]:
-            finished = {Path(path).name: Published(Path(path)) for path in directories if path not in starts}
-            setting = same(options, init=start)
+        # Results are in directories whose names extend the name of the directory with their initial maps.
+        initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
+        for init in initial or ["shot"]:
+            finished = {
+                Path(path).name: PublishedMaps(Path(path)) for path in directories if path not in initial
+            }
+            setting = same(options, init=init)
             pairs = chosen(data_set, options)
             yield Run(
-                "nonisometric", f"{data_set.name}-from-{Path(start).name}", data_set, pairs,
+                "nonisometric", f"{data_set.name}-from-{Path(init).name}", data_set, pairs,
                 methods(pairs, options) | finished, setting,
             )  # fmt: skip
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Whether the published settings are what decides."""
+    """Other settings than published."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
 
 
 def other_settings() -> dict[str, Method]:
-    """The published ones, more eigenvectors and fewer, more iterations, another first k and other steps."""
+    """Returns the methods with published settings, and with each of the changes in `_CHANGES`, by name."""
     found = {"start": METHODS["start"]}
     for name, changes in _CHANGES.items():
         method = found[name] = METHODS[name]
@@ -194,37 +205,38 @@ EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric, s
 
 
 def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
-    """The pairs of a set that are measured."""
+    """Returns the pairs of a data set to measure."""
     return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
 
 
 def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
-    """All that suit some pairs, or a few quick ones."""
+    """Returns all methods that suit the pairs; with `--quick` three fast methods."""
     every = suited_methods(pairs)
     return {name: every[name] for name in ("start", "mwp", "zoomout-sampled")} if options.quick else every
 
 
 def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
-    """What all methods of a run have in common."""
+    """Returns the settings of a run."""
     return Settings(init, mirrored, 200 if options.quick else None, options.seed)
 
 
 def published(data_set: DataSet) -> list[str]:
-    """Directories with maps that come with a set."""
+    """Returns the directories with maps that come with a data set."""
     return sorted(str(path) for path in (data_set.directory / "maps").glob("*") if path.is_dir())
 
 
-def _can_mirror(start: str, pairs: list[DataPair]) -> bool:
-    unsure = start in _MIRRORED or "symm" in Path(start).name
-    return unsure and all(pair.mirrored_truth is not None for pair in pairs)
+def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
+    """Whether to use the mirrored ground truth, too, for this kind of initial map."""
+    ambiguous = init in _MIRRORED or "symm" in Path(init).name
+    return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# Each meshing gives, for every new vertex, the old vertex at its place, or -1.
+# A new mesh, and for each of its vertices the old vertex at the same place, or -1.
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 
 def finer(mesh: Mesh) -> Remeshed:
-    """Every face cut in four."""
+    """Splits every face into four."""
     vertices, faces = igl.upsample(mesh.vertices, mesh.faces, 1)
     old = np.full(len(vertices), -1)
     old[: len(mesh.vertices)] = np.arange(len(mesh.vertices))
@@ -232,12 +244,12 @@ def finer(mesh: Mesh) -> Remeshed:
 
 
 def coarser(mesh: Mesh) -> Remeshed:
-    """Edges collapsed, the shortest first, until a quarter of the faces is left."""
+    """Collapses edges, the shortest first, until a quarter of the faces is left."""
     return _decimate(mesh, mesh.vertices, len(mesh.faces) // 4)
 
 
 def uneven(mesh: Mesh) -> Remeshed:
-    """The same down to half, with edges counted up to four times as long towards one end of the body."""
+    """Collapses edges until half of the faces is left, fewer towards one end of the body."""
     centered = mesh.vertices - mesh.vertices.mean(axis=0)
     _, _, axes = np.linalg.svd(centered, full_matrices=False)
     along = centered @ axes[0]
@@ -254,7 +266,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """A remeshed set on disk: the sources as they are, the targets meshed anew."""
+    """Writes a remeshed set with the sources as they are and the targets meshed again, and opens the set."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")
@@ -276,7 +288,7 @@ def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[
 
 
 def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[str, MethodSummary]]:
-    """Measure what is missing and write its tables."""
+    """Measures the missing results of a run, and writes its tables."""
     directory = make_directory(output / run.experiment / run.name)
     print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
     results = run_benchmark(run.data_set, run.pairs, directory, run.methods, run.settings, executor)
@@ -286,8 +298,11 @@ def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[s
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
-    """A table for each experiment: methods by runs, mean error and seconds of refinement."""
-    parts = ["# The paper's comparisons", "Mean error x 10⁻³ of √area, seconds from start to map."]
+    """Returns a table for each experiment, with mean error and seconds for each method and run."""
+    parts = [
+        "# The paper's comparisons",
+        "Mean error x 10⁻³ of √area; seconds from the initial map to the result.",
+    ]
     for experiment in dict.fromkeys(experiment for experiment, _ in found):
         columns = {name: summaries for (own, name), summaries in found.items() if own == experiment}
         names = dict.fromkeys(name for summaries in columns.values() for name in summaries)
@@ -311,12 +326,12 @@ def main() -> None:
     parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument("--output", type=Path, default=Path("paper"), metavar="DIR")
     parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS))
-    parser.add_argument("--sets", nargs="+", metavar="NAME", help="directories to use (default: all)")
-    parser.add_argument("--pairs", type=int, help="at most so many of each set, at random (default: all)")
+    parser.add_argument("--sets", nargs="+", metavar="NAME", help="names of data sets to use (default: all)")
+    parser.add_argument("--pairs", type=int, help="number of random pairs from each set (default: all)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster")
-    parser.add_argument("--quick", action="store_true", help="two pairs, three methods, 200 points")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
+    parser.add_argument("--quick", action="store_true", help="only two pairs, three methods and 200 points")
     options = parser.parse_args()
     if options.quick:
         options.pairs = min(options.pairs or 2, 2)

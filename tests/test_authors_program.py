@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering
 from jaxsmw.core.spectrum import Spectrum

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.banks import CubicSpline
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.runtime import batches as batch
@@ -73,7 +74,7 @@ def test_samples_and_early_stop():
     some, its_starts = PAIRS[:3], starts[:3]
     for position, refined in refine_pairs(spectra, some, its_starts, samples=samples, batch_size=2):
         x, y = PAIRS[position]
-        alone = refine(spectra[x], spectra[y], starts[position], samples_x=samples[x], samples_y=samples[y])
+        alone = refine(spectra[x], spectra[y], starts[position], samples=(samples[x], samples[y]))
         np.testing.assert_array_equal(refined.pointwise_map, alone.pointwise_map)
     options = dict(iterations=30, stop_when_unchanged=True)
     for position, refined in refine_pairs(spectra, some, its_starts, batch_size=4, **options):

@@ -1,4 +1,4 @@
-"""BCICP: every step against its plain statement, the whole against cases with a known answer."""
+"""BCICP: each step equals a plain NumPy program, and the method solves cases with a known result."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def body() -> tuple[Mesh, Spectrum]:
 
 @pytest.fixture(scope="module")
 def copy(body) -> tuple[Mesh, Spectrum, np.ndarray]:
-    """The body with its vertices in another order: vertex i of the copy is vertex `order[i]` of the body."""
+    """A copy of the body in another vertex order: vertex i of the copy is vertex `order[i]` of the body."""
     return permuted(body[0])
 
 
@@ -42,13 +42,13 @@ def permuted(mesh: Mesh, seed: int = 0) -> tuple[Mesh, Spectrum, np.ndarray]:
 
 
 def scrambled(truth: np.ndarray, mesh: Mesh, seed: int = 1) -> np.ndarray:
-    """A start of which a tenth is random, and a connected cap is mapped to the other side."""
+    """An initial map with a tenth of random images, and a connected cap mapped to the opposite side."""
     generator = np.random.default_rng(seed)
-    start = np.where(generator.random(len(truth)) < 0.1, generator.permutation(truth), truth)
+    initial_map = np.where(generator.random(len(truth)) < 0.1, generator.permutation(truth), truth)
     cap = mesh.vertices @ [0.6, 0.0, 0.8] > 0.8
     assert 0.03 < cap.mean() < 0.12
-    start[cap] = truth[cdist(-mesh.vertices[cap], mesh.vertices).argmin(axis=1)]
-    return start
+    initial_map[cap] = truth[cdist(-mesh.vertices[cap], mesh.vertices).argmin(axis=1)]
+    return initial_map
 
 
 def random_maps(surfaces, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -65,8 +65,8 @@ def dense_adjacency(mesh: Mesh) -> np.ndarray:
     return adjacency
 
 
-def bent(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The true map, but for a small disc that lies on the other side; and which vertices that are."""
+def with_wrong_disc(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The true map, except for a small disc mapped to the opposite side, and a mask of the disc."""
     disc = np.linalg.norm(x.positions - x.positions[7], axis=1) < 0.12
     assert 3 < disc.sum() < 30
     t = truth.copy()
@@ -97,7 +97,7 @@ def test_the_bijective_step_is_one_search_over_four_conditions(surfaces):
     np.testing.assert_array_equal(found[1], squared.argmin(axis=0))
 
 
-def test_coverage_improves_and_loses_nothing(surfaces):
+def test_coverage_improves_and_covered_vertices_stay_covered(surfaces):
     _, y = surfaces
     t, u = random_maps(surfaces)
     improved = steps._improve_coverage(y, t, u)
@@ -105,7 +105,7 @@ def test_coverage_improves_and_loses_nothing(surfaces):
     assert len(set(improved)) > len(set(t)) + 50
     changed = improved != t
     np.testing.assert_array_equal(u[improved[changed]], np.flatnonzero(changed))
-    # What is still uncovered could only have been covered by uncovering something.
+    # A vertex stays uncovered only if its preimage would have to leave another vertex uncovered.
     for uncovered in set(range(len(u))) - set(improved):
         assert np.sum(improved == improved[u[uncovered]]) == 1
 
@@ -120,7 +120,7 @@ def test_smoothing_averages_in_space(surfaces, copy):
     np.testing.assert_array_equal(steps._smooth(x, y, t, 0), t)
 
 
-def test_torn_edges_are_those_with_distant_images(surfaces, body):
+def test_discontinuous_edges_have_distant_images(surfaces, body):
     x, y = surfaces
     t, _ = random_maps(surfaces)
     mesh = body[0]
@@ -129,21 +129,21 @@ def test_torn_edges_are_those_with_distant_images(surfaces, body):
     for middle in range(len(t)):
         distance = np.minimum(distance, distance[:, middle, None] + distance[middle])
     expected = distance[t[x.edges[:, 0]], t[x.edges[:, 1]]] > 0.1 * np.sqrt(mesh.area)
-    found = steps._torn_edges(x, y, t)
+    found = steps._discontinuous_edges(x, y, t)
     np.testing.assert_array_equal(found, expected)
     assert 0.5 < found.mean() < 1
 
 
-def test_outliers_are_the_small_pieces(surfaces, copy):
+def test_outliers_are_the_small_regions(surfaces, copy):
     x, y = surfaces
-    t, disc = bent(x, y, copy[2])
+    t, disc = with_wrong_disc(x, y, copy[2])
     np.testing.assert_array_equal(steps._outliers(x, y, t), disc)
     assert not steps._outliers(x, y, copy[2]).any()
 
 
 def test_repair_interpolates_harmonically(surfaces, copy):
     x, y = surfaces
-    t, disc = bent(x, y, copy[2])
+    t, disc = with_wrong_disc(x, y, copy[2])
     adjacency = dense_adjacency(copy[0])
     laplacian = np.diag(adjacency.sum(axis=1)) - adjacency
     known = y.eigenvectors[t[~disc]]
@@ -156,43 +156,44 @@ def test_repair_interpolates_harmonically(surfaces, copy):
     assert distance.max() < 0.1 < np.linalg.norm(y.positions[t] - y.positions[copy[2]], axis=1).max()
 
 
-def mended(body, copy, start: np.ndarray, back: np.ndarray, **options) -> np.ndarray:
-    """Euclidean error of each vertex after BCICP, in edges of average length."""
+def errors_after_bcicp(body, copy, initial_map: np.ndarray, reverse: np.ndarray, **options) -> np.ndarray:
+    """Returns the Euclidean error of each vertex after BCICP, in edges of average length."""
     (mesh_y, spectrum_y), (mesh_x, spectrum_x, truth) = body, copy
-    found, _ = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, start, back, **options)
+    found, _ = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, initial_map, reverse, **options)
     edge = np.linalg.norm(np.diff(mesh_y.vertices[mesh_y.edges], axis=1), axis=2).mean()
     return np.linalg.norm(mesh_y.vertices[found] - mesh_y.vertices[truth], axis=1) / edge
 
 
-def test_a_scrambled_copy_is_mended(body, copy):
+def test_scrambled_initial_maps_are_repaired(body, copy):
     truth = copy[2]
-    start, back = scrambled(truth, copy[0]), scrambled(np.argsort(truth), body[0], seed=3)
-    assert np.mean(start != truth) > 0.12
-    error = mended(body, copy, start, back)
+    initial_map, reverse = scrambled(truth, copy[0]), scrambled(np.argsort(truth), body[0], seed=3)
+    assert np.mean(initial_map != truth) > 0.12
+    error = errors_after_bcicp(body, copy, initial_map, reverse)
     assert np.mean(error > 0) < 0.01
 
 
 @pytest.mark.parametrize("change", [{"iterations": 1}, {"smoothing": 0}])
 def test_every_option_matters(body, copy, surfaces, change):
     options = {"iterations": 2, "smoothing": 5}
-    start, back = random_maps(surfaces)
-    assert (
-        mended(body, copy, start, back, **options) != mended(body, copy, start, back, **options | change)
-    ).any()
+    initial_maps = random_maps(surfaces)
+    plain, changed = (
+        errors_after_bcicp(body, copy, *initial_maps, **chosen) for chosen in (options, options | change)
+    )
+    assert (plain != changed).any()
 
 
 def test_padding_and_signs_do_not_matter(body, copy):
     (mesh_y, spectrum_y), (mesh_x, spectrum_x, truth) = body, copy
-    start, back = scrambled(truth, mesh_x), scrambled(np.argsort(truth), mesh_y, seed=3)
-    plain = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, start, back, iterations=3)
+    initial_map, reverse = scrambled(truth, mesh_x), scrambled(np.argsort(truth), mesh_y, seed=3)
+    plain = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, initial_map, reverse, iterations=3)
     n = len(truth)
     padded = bcicp(
         mesh_x,
         mesh_y,
         spectrum_x.pad(n + 9),
         spectrum_y.pad(n + 5),
-        np.pad(start, (0, 9)),
-        np.pad(back, (0, 5)),
+        np.pad(initial_map, (0, 9)),
+        np.pad(reverse, (0, 5)),
         iterations=3,
     )
     for found, expected in zip(padded, plain, strict=True):
@@ -201,13 +202,13 @@ def test_padding_and_signs_do_not_matter(body, copy):
     signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], K))
     flipped = eqx.tree_at(lambda s: s.eigenvectors, spectrum_x, spectrum_x.eigenvectors * signs[None, :])
     for found, expected in zip(
-        bcicp(mesh_x, mesh_y, flipped, spectrum_y, start, back, iterations=3), plain, strict=True
+        bcicp(mesh_x, mesh_y, flipped, spectrum_y, initial_map, reverse, iterations=3), plain, strict=True
     ):
         np.testing.assert_array_equal(found, expected)
 
 
 def hostile_mesh() -> Mesh:
-    """A body, a separate open sheet, three sheets at one edge, and a vertex of no face in between."""
+    """A body, an open sheet, a third sheet at one of its edges, and an unreferenced vertex in between."""
     body = bumpy_mesh(2)
     sheet, faces = grid_mesh(6, 6)
     n = len(body.vertices)
@@ -223,28 +224,28 @@ def test_hostile_meshes():
     assert len(mesh.nonmanifold_edges) and len(mesh.boundary_edges) and not mesh.used_vertices.all()
     spectrum, n = jaxsmw.compute_spectrum(mesh, K), len(mesh.vertices)
     used = np.flatnonzero(mesh.used_vertices)
-    unused = np.flatnonzero(~mesh.used_vertices)
+    unreferenced = np.flatnonzero(~mesh.used_vertices)
     generator = np.random.default_rng(0)
-    start = np.where(generator.random(n) < 0.2, generator.choice(used, n), np.arange(n))
-    start[unused] = unused
+    initial_map = np.where(generator.random(n) < 0.2, generator.choice(used, n), np.arange(n))
+    initial_map[unreferenced] = unreferenced
     surface = steps._Surface.of(mesh, spectrum)
-    assert surface.areas[surface.component > 0].sum() < 0.05  # a small component is no outlier
+    assert surface.areas[surface.component > 0].sum() < 0.05  # a small component, which is no outlier
     assert not steps._outliers(surface, surface, np.arange(len(used))).any()
-    for found in bcicp(mesh, mesh, spectrum, spectrum, start, start, iterations=2, smoothing=5):
+    for found in bcicp(mesh, mesh, spectrum, spectrum, initial_map, initial_map, iterations=2, smoothing=5):
         assert found.dtype == np.int64 and found.shape == (n,)
         assert mesh.used_vertices[found[used]].all()
-        np.testing.assert_array_equal(found[unused], unused)
+        np.testing.assert_array_equal(found[unreferenced], unreferenced)
 
 
-def test_maps_that_cannot_be_are_refused(body, copy):
+def test_impossible_arguments_are_refused(body, copy):
     (mesh_y, spectrum_y), (mesh_x, spectrum_x, truth) = body, copy
     good = mesh_x, mesh_y, spectrum_x, spectrum_y, truth, np.argsort(truth)
     n = len(truth)
     for number, wrong, message in [
-        (4, truth[:-1], "no map"),
-        (4, truth[:0], "no map"),
-        (5, np.full(n, n), "no surface"),
-        (5, np.full(n, -1), "no surface"),
+        (4, truth[:-1], "not a pointwise map"),
+        (4, truth[:0], "not a pointwise map"),
+        (5, np.full(n, n), "no face references"),
+        (5, np.full(n, -1), "no face references"),
         (3, spectrum_y.truncate(K - 1), "eigenvectors"),
         (2, spectrum_x.sample(jnp.arange(n - 1)), "but its spectrum"),
     ]:
@@ -256,8 +257,8 @@ def test_maps_that_cannot_be_are_refused(body, copy):
         bcicp(*good, iterations=0)
 
 
-def test_a_published_result_is_nearly_reached(shared):
-    """Gorilla to man, from the published starts: what the authors' program made of them is beside them."""
+def test_the_error_comes_close_to_that_of_a_published_map(shared):
+    """Gorilla to man, from the published initial maps, compared with the published result."""
     directory = shared / "data" / "tosca_nonisometric"
     data_set = open_data_set(directory)
     (pair,) = [p for p in data_set.pairs if (p.source, p.target) == ("8_gorilla_02", "8_man_02")]
@@ -267,14 +268,14 @@ def test_a_published_result_is_nearly_reached(shared):
         file = directory / "maps" / kind / f"{x}_{y}.map"
         return jaxsmw.read_pointwise_map(file, mesh_x, mesh_y, index_base=1)
 
-    start = stored("WKSini_direct", pair.source, pair.target, mesh_x, mesh_y)
-    back = stored("WKSini_direct", pair.target, pair.source, mesh_y, mesh_x)
+    initial_map = stored("WKSini_direct", pair.source, pair.target, mesh_x, mesh_y)
+    reverse = stored("WKSini_direct", pair.target, pair.source, mesh_y, mesh_x)
     published = stored("WKSini_direct_BCICP", pair.source, pair.target, mesh_x, mesh_y)
     spectrum_x, spectrum_y = (jaxsmw.compute_spectrum(mesh, 50) for mesh in (mesh_x, mesh_y))
-    found, _ = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, start, back, iterations=3)
+    found, _ = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, initial_map, reverse, iterations=3)
     truth = pair.ground_truth(mesh_x, mesh_y)
     mean = {
         name: jaxsmw.geodesic_error(mesh_y, t, truth, number_of_samples=200).mean
-        for name, t in (("start", start), ("found", found), ("published", published))
+        for name, t in (("initial", initial_map), ("found", found), ("published", published))
     }
-    assert mean["found"] < 1.5 * mean["published"] < 0.5 * mean["start"], mean
+    assert mean["found"] < 1.5 * mean["published"] < 0.5 * mean["initial"], mean

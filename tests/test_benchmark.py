@@ -1,4 +1,4 @@
-"""The benchmark command: what it finds, what it keeps when killed, and what it refuses."""
+"""The benchmark command: its results, its behaviour when killed, and the input it refuses."""
 
 import csv
 import json
@@ -13,22 +13,28 @@ from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from itertools import permutations
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet
 import pytest
+from jax._src import monitoring
 from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError
-from jaxsmw.cli.main import main
+from jaxsmw.choices import MethodName, PeerName
+from jaxsmw.cli.run import run_command
 from jaxsmw.core.results import RESULTS
-from jaxsmw.evaluation import benchmark
-from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings, choose_pairs, run_benchmark
-from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents.opponents import METHODS, Method, PreparedPair, find_methods
+from jaxsmw.evaluation import measurement
+from jaxsmw.evaluation.benchmark import Results, run_benchmark
+from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+from jaxsmw.evaluation.measurement import CURVE, FIGURES, Settings
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.evaluation.opponents.peers import installed_peers
+from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
@@ -38,7 +44,7 @@ from jaxsmw.runtime.provenance import measured_code
 
 @pytest.fixture(scope="module")
 def scape(tmp_path_factory) -> Path:
-    """Three poses of no body at all, laid out like SCAPE."""
+    """Three deformed copies of a bumpy sphere, in the layout of SCAPE."""
     directory = tmp_path_factory.mktemp("bodies")
     mesh = bumpy_mesh(4)
     for number, stretch in enumerate(([1, 1, 1], [1.05, 1, 0.97], [1, 0.95, 1.04])):
@@ -52,7 +58,7 @@ def command(data: Path, output: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "jaxsmw", *map(str, arguments)]
 
 
-def test_one_command_finishes_what_a_killed_one_began(scape, tmp_path, capsys):
+def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     output = tmp_path / "results"
     call = command(scape, output, "--workers", "1", "--evaluation-samples", "300")
     first = subprocess.Popen(
@@ -70,11 +76,10 @@ def test_one_command_finishes_what_a_killed_one_began(scape, tmp_path, capsys):
 
     second = subprocess.run(call, check=True, capture_output=True, text=True)
     lines = results.read_text().splitlines()
-    assert lines[: len(kept)] == kept  # not measured again: times would differ
+    assert lines[: len(kept)] == kept  # a second measurement would have other times
     assert len(lines) == len(set(lines)) == 1 + 6 * 2
     assert second.stdout.startswith("| method | mean error |")
-    with pytest.raises(SystemExit, match="0"):
-        main(call[3:])
+    assert run_command(call[3:]) == 0
     assert capsys.readouterr().out == second.stdout and results.read_text().splitlines() == lines
 
     table = pyarrow.parquet.read_table(output / "results.parquet").to_pylist()
@@ -86,13 +91,12 @@ def test_one_command_finishes_what_a_killed_one_began(scape, tmp_path, capsys):
     for name in ("summary.md", "table.tex", "curves.png", "shapes.csv", "provenance.json"):
         assert (output / name).stat().st_size > 100
 
-    with pytest.raises(SystemExit, match="2"):
-        main([*call[3:], "--seed", "1"])
+    assert run_command([*call[3:], "--seed", "1"]) == 2
     assert "seed in settings was 0 and not 1" in capsys.readouterr().err
 
 
-def test_workers_of_a_dask_cluster_one_of_which_dies(scape, tmp_path):
-    """A real scheduler and two workers on loopback: all results arrive, none twice."""
+def test_a_dask_cluster_loses_a_worker(scape, tmp_path):
+    """A real scheduler and two workers on loopback: all results arrive, and none arrives twice."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     started = [
         subprocess.Popen(
@@ -137,7 +141,7 @@ def wait_for(condition, processes) -> None:
         time.sleep(0.05)
 
 
-def test_nobody_answers(scape, tmp_path):
+def test_a_scheduler_that_does_not_answer_is_named(scape, tmp_path):
     call = command(scape, tmp_path / "results", "--scheduler", "tcp://127.0.0.1:1")
     outcome = subprocess.run(call, capture_output=True, text=True)
     assert outcome.returncode == 2 and "no Dask scheduler answers" in outcome.stderr
@@ -161,14 +165,14 @@ def test_pairs_are_chosen(scape, tmp_path):
     with pytest.raises(InputError, match="at least 1"):
         choose_pairs(data_set, "0", 0)
     (tmp_path / "list.txt").write_text("mesh002 mesh002\n")
-    with pytest.raises(InputError, match="does not say which points of mesh002 and mesh002"):
+    with pytest.raises(InputError, match="has no ground truth for mesh002 to mesh002"):
         choose_pairs(data_set, str(tmp_path / "list.txt"), 0)
 
 
-def test_unknown_methods_and_starts_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"'magic' is no method: choose from start, mwp"):
+def test_unknown_methods_and_initial_maps_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"'magic' is not a method: choose from start, mwp"):
         find_methods(["mwp", "magic"])
-    with pytest.raises(InputError, match=r"'luck' is no start: choose from shot"):
+    with pytest.raises(InputError, match=r"'luck' is not an initial map: choose from shot"):
         Settings("luck")
     for name in ("mwp", "mine", "other/mine"):
         (tmp_path / name).mkdir(parents=True)
@@ -183,10 +187,28 @@ def test_help_names_every_method():
         [sys.executable, "-m", "jaxsmw", "benchmark", "--help"], capture_output=True, text=True
     )
     assert set(METHODS) <= set(re.findall(r"[\w-]+", re.sub(r"-\s+", "-", outcome.stdout)))
+    assert get_args(MethodName) == tuple(METHODS)
+    assert set(installed_peers()) <= set(get_args(PeerName))
+
+
+TOO_LONG = "x" * 300
+
+
+def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
+    calls = [
+        (["benchmark", TOO_LONG], "is not a directory"),
+        (["benchmark", str(scape), "--methods", TOO_LONG], "is not a method"),
+        (["benchmark", str(scape), "--init", TOO_LONG], "is not an initial map"),
+        (["benchmark", str(scape), "--pairs", TOO_LONG], "cannot be read as text"),
+    ]
+    for call, message in calls:
+        assert run_command(call) == 2
+        errors = capsys.readouterr().err
+        assert message in errors and TOO_LONG in errors and "Traceback" not in errors
 
 
 class Here(Executor):
-    """Does its work at once, in this process."""
+    """Runs each task immediately, in this process."""
 
     def submit(self, function, /, *arguments, **options):
         future = Future()
@@ -197,19 +219,32 @@ class Here(Executor):
         return future
 
 
+def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
+    """Runs some methods on some pairs, in this process."""
+    data_set = open_data_set(data)
+    chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
+    return run_benchmark(data_set, chosen, output, find_methods(names), every, Here())
+
+
 @pytest.fixture
 def measure(scape, tmp_path):
-    """Some methods on some pairs, in this process."""
+    """`run_here` on the poses, with results in the test's own directory."""
 
-    def run(names, *, output=tmp_path, data=scape, pairs="2", **settings):
-        data_set = open_data_set(data)
-        chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
-        return run_benchmark(data_set, chosen, output, find_methods(names), every, Here())
+    def run(names, *, output=tmp_path, data=scape, **options):
+        return run_here(names, output, data, **options)
 
     return run
 
 
-def test_maps_made_elsewhere_are_starts_and_methods(measure, tmp_path):
+@pytest.fixture(scope="module")
+def finished(scape, tmp_path_factory) -> Path:
+    """The results of one method on two pairs."""
+    directory = tmp_path_factory.mktemp("finished")
+    run_here(["start"], directory, scape)
+    return directory
+
+
+def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     generator = np.random.default_rng(0)
     for kind, wrong in (("rough", 0.3), ("perfect", 0.0)):
         (tmp_path / kind).mkdir()
@@ -236,12 +271,12 @@ def test_maps_made_elsewhere_are_starts_and_methods(measure, tmp_path):
     (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
     found = measure(["start", str(tmp_path / "perfect")], output=other, pairs="6")
     assert list(found.failures) == ["mesh000 to mesh001"] and len(found.rows) == 10
-    with pytest.raises(InputError, match=r"the rest is kept:\nmesh000 to mesh001: .*has 2 lines"):
+    with pytest.raises(InputError, match=r"all other results are kept:\nmesh000 to mesh001: .*has 2 lines"):
         found.check()
 
 
-def test_a_map_that_took_left_for_right_counts_as_mirrored_only_when_asked(measure, tmp_path):
-    """A sphere, its truth the identity and its mirrored truth the reflection; the map is the reflection."""
+def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(measure, tmp_path):
+    """The ground truth of a sphere is the identity, its mirrored ground truth and the map are the reflection."""
     vertices, faces = sphere_mesh(3)
     reflected = KDTree(vertices).query(vertices * [-1, 1, 1])[1]
     data = tmp_path / "data"
@@ -263,7 +298,7 @@ def test_a_map_that_took_left_for_right_counts_as_mirrored_only_when_asked(measu
         assert float(row["mean"]) == 0 if mirrored else float(row["mean"]) > 0.2
 
 
-def test_a_shape_that_changed_is_noticed(measure, scape, tmp_path):
+def test_a_changed_shape_is_detected(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     output.mkdir()
@@ -278,30 +313,128 @@ def test_one_bad_shape_does_not_stop_the_others(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     output.mkdir()
-    whole = (data / "mesh002.off").read_text()
-    (data / "mesh002.off").write_text(whole[: len(whole) // 2])
+    contents = (data / "mesh002.off").read_text()
+    (data / "mesh002.off").write_text(contents[: len(contents) // 2])
     found = measure(["start"], data=data, output=output, pairs="6")
     assert len(found.rows) == 2 and len((output / "results.csv").read_text().splitlines()) == 1 + 2
     with pytest.raises(InputError) as caught:
         found.check()
     _, *causes = str(caught.value).splitlines()
     assert len(causes) == 1 and "and 2 more: " in causes[0] and causes[0].count("mesh002.off") == 1
-    (data / "mesh002.off").write_text(whole)
+    (data / "mesh002.off").write_text(contents)
     found = measure(["start"], data=data, output=output, pairs="6")
     found.check()
     assert len(found.rows) == 6
 
 
-def test_tables_are_of_what_could_be_measured(scape, tmp_path, monkeypatch, capsys):
+def without_last_value(lines: list[str]) -> list[str]:
+    return [*lines[:-1], lines[-1].rpartition(",")[0]]
+
+
+def with_one_more_column(lines: list[str]) -> list[str]:
+    return [f"{lines[0]},more", *(f"{line},1" for line in lines[1:])]
+
+
+def with_words_for_numbers(lines: list[str]) -> list[str]:
+    return [lines[0], *(re.sub(r"\d+\.\d+", "many", line) for line in lines[1:])]
+
+
+@pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda lines: ["a,b", "1,2"], "line 1: is not the header"),
+        (lambda lines: ["", *lines], "line 1: is not the header"),
+        (lambda lines: lines[1:], "line 1: is not the header"),
+        (with_one_more_column, "line 1: is not the header"),
+        (without_last_value, r"line \d: has \d+ values for \d+ columns"),
+        (lambda lines: [lines[0], "", *lines[1:]], r"line 2: has 0 values for \d+ columns"),
+        (with_words_for_numbers, "line 2: has 'many' in the column seconds"),
+        (lambda lines: [lines[0], '"' + lines[1], *lines[2:]], "is not a table of results"),
+    ],
+)
+def test_damaged_results_are_named_and_left_as_they_are(measure, finished, tmp_path, name, damage, message):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    damaged = "".join(f"{line}\n" for line in damage((tmp_path / name).read_text().splitlines()))
+    (tmp_path / name).write_text(damaged)
+    with pytest.raises(InputError, match=message) as caught:
+        measure(["start"])
+    assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
+    assert "restore the file, or remove it" in str(caught.value)
+    assert (tmp_path / name).read_text() == damaged
+
+
+@pytest.mark.parametrize("name", ["results.csv", "shapes.csv", "provenance.json"])
+@pytest.mark.parametrize("contents", [bytes(range(256)) * 4, b"\0" * 100 + b"\n", b"not a table", b"\xff\n"])
+def test_files_of_another_kind_are_named_and_left_as_they_are(measure, finished, tmp_path, name, contents):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    (tmp_path / name).write_bytes(contents)
+    with pytest.raises(
+        InputError, match=f"{name}(, line 1)?: is (not the header|not a table|damaged)"
+    ) as caught:
+        measure(["start"])
+    assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents
+
+
+@pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
+@pytest.mark.parametrize("kept", [None, 0, 10])
+def test_removed_and_empty_files_and_unfinished_headers_are_measured_again(
+    measure, finished, tmp_path, name, kept
+):
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    contents = (tmp_path / name).read_bytes()
+    (tmp_path / name).unlink()
+    if kept is not None:
+        (tmp_path / name).write_bytes(contents[:kept])
+    assert len(measure(["start"]).rows) == 2
+    header, *rows = (tmp_path / name).read_text().splitlines()
+    assert header == contents.decode().splitlines()[0]
+    assert len(rows) == contents.decode().count("\n") - 1
+
+
+def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
+    call = ["benchmark", str(scape), "--methods", "start", "--pairs", "1", "--output", str(tmp_path)]
+    assert run_command([*call, "--evaluation-samples", "50"]) == 0
+    (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
+    capsys.readouterr()
+    assert run_command([*call, "--evaluation-samples", "50"]) == 2
+    (message,) = [line for line in capsys.readouterr().err.splitlines() if "results.csv" in line]
+    assert "is not a table of results" in message and "remove it to measure its rows again" in message
+
+
+def test_a_benchmark_leaves_the_calling_process_as_it_is(measure, monkeypatch):
+    """Environment, listeners and compiled programs stay, though measuring would release programs in a worker."""
+    monkeypatch.setattr("jaxsmw.runtime.compilation._GOOD_PART", 0.0)
+    double = jax.jit(lambda x: 2 * x)
+    double(1.0)
+    environment, listeners = dict(os.environ), list(monitoring.get_event_duration_listeners())
+    assert len(measure(["start", "mwp"]).rows) == 4
+    assert dict(os.environ) == environment
+    assert monitoring.get_event_duration_listeners() == listeners
+    assert double._cache_size() == 1
+
+
+def test_importing_the_benchmark_registers_no_listener():
+    script = """if True:
+        import equinox, jax, optimistix
+        from jax._src import monitoring
+        before = list(monitoring.get_event_duration_listeners())
+        import jaxsmw.evaluation.benchmark
+        print(monitoring.get_event_duration_listeners() == before)
+    """
+    found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    assert found.stdout == "True\n"
+
+
+def test_tables_show_the_measured_pairs(scape, tmp_path, monkeypatch, capsys):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     (data / "mesh002.off").write_text("OFF\n1")
     monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
     call = ["benchmark", str(data), "--methods", "start", "--output", str(output)]
-    with pytest.raises(SystemExit) as ended:
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 2
     printed = capsys.readouterr()
-    assert ended.value.code == 2
     assert "| start |" in printed.out and "| start |" in (output / "summary.md").read_text()
     assert "2 of 6 pairs" in (output / "summary.md").read_text()
     assert "5 shapes or pairs could not be measured" in (output / "summary.md").read_text()
@@ -330,7 +463,7 @@ def row(
     return identity | {"result": result} | numbers | {"curve": curve}
 
 
-def test_tables_say_what_the_rows_say():
+def test_tables_summarise_the_rows():
     rows = [
         *(row(f"x{i}", "mwp", 0.01 * (i + 1), seconds=i) for i in range(5)),
         *(row(f"x{i}", "a_b", 0.01 * (i + 1) + 0.02, seconds=np.nan) for i in range(4)),
@@ -352,7 +485,7 @@ def test_tables_say_what_the_rows_say():
 
 
 class Slow(Method):
-    """Compiles something, and says how often it ran and how long."""
+    """Compiles a program in each run, takes some seconds, and counts its runs."""
 
     number_of_eigenvectors = 1
     reference = "nothing"
@@ -363,32 +496,35 @@ class Slow(Method):
     def __call__(self, pair):
         self.runs += 1
         time.sleep(self.seconds)
-        return jax.jit(lambda start: jnp.sort(start + self.runs))(pair.start), RESULTS.successful
+        return jax.jit(lambda initial_map: jnp.sort(initial_map + self.runs))(
+            pair.initial_map
+        ), RESULTS.successful
 
 
 def test_times_are_without_compilation(monkeypatch):
-    """What compiles is run again, but not where that would take long."""
-    monkeypatch.setattr(benchmark, "_LONG", 0.5)
-    monkeypatch.setattr(benchmark, "_warm", {"short"})
+    """A method that compiles runs again, unless its run takes long."""
+    monkeypatch.setattr(measurement, "_LONG", 0.5)
+    monkeypatch.setattr(measurement, "_warm", {"short"})
     spectrum = random_spectrum(30, 5, seed=0)
-    pair = PreparedPair(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
-    compiling = benchmark._compiling.seconds
+    pair = MethodInput(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
     for name, seconds, runs in (("short", 0.0, 2), ("long", 0.6, 1)):
         method = Slow(seconds)
-        began = time.perf_counter()
-        _, _, measured = benchmark._timed(name, method, pair)
+        with measurement._CompilationClock() as compilation:
+            began = time.perf_counter()
+            _, _, measured = measurement._timed(name, method, pair)
+            elapsed = time.perf_counter() - began
         assert method.runs == runs
-        assert benchmark._compiling.seconds > compiling
-        assert seconds <= measured < time.perf_counter() - began
+        assert compilation.seconds > 0
+        assert seconds <= measured <= elapsed - compilation.seconds
 
 
-def test_a_table_has_its_first_row_for_a_header():
+def test_the_first_row_of_a_table_is_its_header():
     rows = markdown([["a", "b"], ["1", "2"]])
     assert rows == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
 
 
-def test_all_code_that_numbers_depend_on_counts():
-    """Whoever changes a preset does not go on with results of the one before."""
+def test_the_digest_covers_all_code_that_results_depend_on():
+    """After a change of any such code, results are not mixed with older results."""
     measured = {path.resolve() for path in measured_code()}
     script = "import sys, jaxsmw.evaluation.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
     found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)

@@ -23,10 +23,10 @@ from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
 import jaxsmw
-from jaxsmw.core.banks.filters import CubicSpline, Gabor, Meyer
-from jaxsmw.core.frames import tighten
+from jaxsmw.core.banks import CubicSpline, Gabor, Meyer, tighten
 from jaxsmw.core.functional_map import multiscale_kernel
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiner import Problem
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
@@ -271,7 +271,7 @@ def test_projection_gives_the_nearest_orthogonal_matrix():
     found = {}
     for update in ("filtering", "projected"):
         method = variants.refiner(DEFAULT._replace(update=update), Meyer(4), x, y, number_of_filters=4)
-        problem = method.prepare(x, y)
+        problem = method.prepare(Problem(x, y))
         found[update] = np.asarray(method.update(problem, start, None)[0])
     np.testing.assert_allclose(found["projected"] @ found["projected"].T, np.eye(10), atol=1e-12)
     nearest = np.linalg.norm(found["projected"] - found["filtering"])

@@ -1,4 +1,4 @@
-"""Coherent Point Drift: against a dense program in plain NumPy, and on cases with a known answer."""
+"""Coherent Point Drift: equal to a dense NumPy program, and right on cases with a known result."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ from jaxsmw.evaluation.opponents.cpd import (
 
 
 def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
-    """The method as Myronenko and Song print it (their figure 4), with all matrices."""
+    """The method as printed by Myronenko and Song (figure 4), with all matrices stored."""
     (m, d), n = x.shape, len(y)
     mean, (x, y) = x.mean(0), (p - p.mean(0) for p in (x, y))
     scale, (x, y) = np.sqrt((x**2).sum() / m), (p / np.sqrt((p**2).sum() / len(p)) for p in (x, y))
@@ -38,11 +38,14 @@ def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
 
 M, N, RANK, LOW_RANK = 140, 150, 150, 40
 ORDER = np.random.default_rng(1).permutation(N)[:M]
-# Sizes, rank and dtype are all that these programs are compiled for, so the tests share them.
+# Programs are compiled for sizes, rank and dtype, so the tests share these.
 
 
-def bent(d=3, noise=0.0, seed=0):
-    """Data (M, d), and centroids (N, d) of which a smooth bend, in another frame and unit, takes M to them."""
+def deformed(d=3, noise=0.0, seed=0):
+    """Returns data (M, d) and centroids (N, d): a smooth deformation takes M of the centroids to the data.
+
+    Data and centroids are in different frames and units.
+    """
     generator = np.random.default_rng(seed)
     y = generator.uniform(-1, 1, size=(N, d))
     x = 3 * (y + 0.3 * np.sin(2 * y[:, ::-1]))[ORDER] + 2
@@ -53,7 +56,7 @@ def bent(d=3, noise=0.0, seed=0):
     "settings", [{}, {"width": 1.0}, {"stiffness": 0.5}, {"outliers": 0.5}, {"outliers": 0.0}]
 )
 def test_equals_the_dense_method(settings):
-    x, y = bent(noise=0.2)
+    x, y = deformed(noise=0.2)
     plain, _ = dense_drift(x, y, 8)
     moved, variance = dense_drift(x, y, 8, **settings)
     drift = coherent_point_drift(
@@ -66,7 +69,7 @@ def test_equals_the_dense_method(settings):
 
 
 def test_low_rank_comes_close():
-    x, y = bent(noise=0.2)
+    x, y = deformed(noise=0.2)
     exact, _ = dense_drift(x, y, 8)
     drift = coherent_point_drift(jnp.asarray(x), jnp.asarray(y), rank=LOW_RANK, iterations=8, tolerance=0.0)
     error = np.abs(drift.centroids - exact).max() / np.abs(exact - (3 * y + 2)).max()
@@ -74,8 +77,8 @@ def test_low_rank_comes_close():
 
 
 def test_float32_in_many_dimensions_does_not_underflow():
-    """Likelihoods near exp(-d/2), all below the least float32, beside a noise below the least float64."""
-    x, y = bent(d=300, noise=0.5)
+    """Likelihoods near exp(-d/2) are below the smallest float32, and the noise is below the smallest float64."""
+    x, y = deformed(d=300, noise=0.5)
     exact, variance = dense_drift(x, y, 4, stiffness=1e3)
     scale = np.sqrt(((x - x.mean(0)) ** 2).sum() / M)
     likelihoods = -cdist(x, exact, "sqeuclidean").min(1) / (2 * variance * scale**2)
@@ -99,8 +102,8 @@ def test_kernel_factor_of_full_rank_is_exact():
 
 
 def test_known_displacement():
-    """A bend too strong for nearest neighbours."""
-    x, y = bent()
+    """The deformation is too strong for nearest neighbours."""
+    x, y = deformed()
     drift = coherent_point_drift(jnp.asarray(x), jnp.asarray(y), rank=RANK)
     assert drift.iterations < 150
     nearest, drifted = (cdist(x, centroids).argmin(1) == ORDER for centroids in (3 * y + 2, drift.centroids))
@@ -110,7 +113,7 @@ def test_known_displacement():
 
 
 def test_iterations_and_tolerance_stop_it():
-    x, y = (jnp.asarray(points) for points in bent())
+    x, y = (jnp.asarray(points) for points in deformed())
     assert coherent_point_drift(x, y, iterations=3, rank=RANK).iterations == 3
     loose, tight = (coherent_point_drift(x, y, tolerance=t, rank=RANK).iterations for t in (1e-2, 1e-5))
     assert 1 < loose < tight < 150
@@ -120,17 +123,17 @@ def test_iterations_and_tolerance_stop_it():
     "wrong", [{"width": 0.0}, {"stiffness": -1.0}, {"outliers": 1.0}, {"rank": 0}, {"iterations": 0}]
 )
 def test_numbers_out_of_range_raise(wrong):
-    x, y = (jnp.asarray(points) for points in bent())
+    x, y = (jnp.asarray(points) for points in deformed())
     with pytest.raises(ValueError, match="needs a positive"):
         coherent_point_drift(x, y, **wrong)
 
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[jax.Array, Spectrum, Spectrum]:
-    """Embeddings that no C aligns: X's is that of Y, bent."""
+    """Two embeddings that no C aligns: the embedding of X is a deformed embedding of Y."""
     x, y = (
         Spectrum(jnp.arange(3.0), jnp.asarray(points), jnp.full(n, 1 / n), jnp.ones(n, bool))
-        for points, n in zip(bent(), (M, N), strict=True)
+        for points, n in zip(deformed(), (M, N), strict=True)
     )
     return jnp.eye(3), dataclasses.replace(x, eigenvectors=(x.eigenvectors - 2) / 3), y
 
@@ -139,7 +142,7 @@ def flip(spectrum: Spectrum, signs) -> Spectrum:
     return dataclasses.replace(spectrum, eigenvectors=spectrum.eigenvectors * signs[None, :])
 
 
-def test_recovers_what_nearest_neighbours_miss(pair):
+def test_recovery_succeeds_where_nearest_neighbours_fail(pair):
     assert np.mean(np.asarray(decode(*pair)) == ORDER) < 0.4
     np.testing.assert_array_equal(recover_by_drift(*pair, rank=RANK), ORDER)
 
@@ -163,7 +166,7 @@ def test_padding_changes_nothing(pair):
 
 
 def test_masked_points_change_nothing_wherever_they_lie():
-    x, y = (jnp.asarray(points) for points in bent(noise=0.2))
+    x, y = (jnp.asarray(points) for points in deformed(noise=0.2))
     masked = coherent_point_drift(
         jnp.pad(x, ((0, 70), (0, 0)), constant_values=9.0),
         jnp.pad(y, ((50, 0), (0, 0)), constant_values=9.0),
@@ -177,13 +180,13 @@ def test_masked_points_change_nothing_wherever_they_lie():
 
 
 def test_refiner_recovers_by_drift(pair):
-    """Both half-steps that `refine` repeats."""
+    """`DriftRecovery` encodes by least squares and recovers by drift."""
     _, x, y = pair
     refiner = DriftRecovery(rank=LOW_RANK, drift_iterations=4)
-    problem = refiner.prepare(x, y)
-    start = jnp.asarray(np.where(np.arange(M) % 3 > 0, ORDER, 0), jnp.int32)
-    functional_map, _ = refiner.update(problem, start, None)
-    np.testing.assert_allclose(functional_map, encode(start, x, y), atol=1e-12)
+    problem = refiner.prepare(Problem(x, y))
+    initial_map = jnp.asarray(np.where(np.arange(M) % 3 > 0, ORDER, 0), jnp.int32)
+    functional_map, _ = refiner.update(problem, initial_map, None)
+    np.testing.assert_allclose(functional_map, encode(initial_map, x, y), atol=1e-12)
     found = refiner.recover(problem, functional_map)
     drifted = recover_by_drift(functional_map, x, y, rank=LOW_RANK, iterations=4)
     np.testing.assert_array_equal(found, drifted)
@@ -194,7 +197,7 @@ def test_refiner_recovers_by_drift(pair):
 
 
 def test_never_stores_all_probabilities_or_kernels():
-    """50 000 x 50 000 of them would take 10 GB in float32; the compiled program has to do with 1/20."""
+    """50 000 x 50 000 numbers take 10 GB in float32; the compiled program needs less than 1/20."""
     points = jax.ShapeDtypeStruct((50_000, 30), jnp.float32)
     compiled = jax.jit(lambda x, y: coherent_point_drift(x, y, rank=100)).lower(points, points).compile()
     assert compiled.memory_analysis().temp_size_in_bytes < 500e6

@@ -1,4 +1,4 @@
-"""Data sets are recognised by the layouts in which they circulate, and what is missing is named."""
+"""Data sets are recognised by their published layouts, and missing files are named."""
 
 import re
 import shutil
@@ -19,7 +19,7 @@ VERTICES, FACES = grid_mesh(4, 5)
 
 
 def put(path: Path, contents: str | None = None) -> None:
-    """A file with such contents, or a mesh of twenty vertices."""
+    """Writes a file with the given contents, or a mesh with twenty vertices."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if contents is not None:
         path.write_text(contents)
@@ -97,7 +97,7 @@ def names(data_set: DataSet) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layouts_are_recognised_and_their_truth_is_read(tmp_path, layout):
+def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout):
     build, first = LAYOUTS[layout]
     build(tmp_path / "set")
     data_set = open_data_set(tmp_path / "set")
@@ -131,14 +131,14 @@ def test_lists_of_pairs_come_first(tmp_path):
     put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
     data_set = open_data_set(tmp_path)
     assert names(data_set) == [("dog0", "cat1"), ("cat2", "dog0")]
-    # Others within a class can be asked for.
+    # Further pairs within a class have ground truth, too.
     others = {pair.names for pair in data_set.others}
     assert len(others) == 6 and ("cat10", "cat2") in others and len(data_set.shapes) == 4
     shrec19(tmp_path / "other")
     put(tmp_path / "other" / "PAIRS_list_SHREC19_connectivity.txt", "2,10\n")
     assert names(open_data_set(tmp_path / "other")) == [("2", "10")]
     put(tmp_path / "list.txt", "cat1 cat2\ncat1 horse\n")
-    with pytest.raises(InputError, match="line 2: 'horse' is none of the shapes"):
+    with pytest.raises(InputError, match="line 2: 'horse' is not one of the shapes"):
         read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
     put(tmp_path / "list.txt", "cat1 cat2 cat1\n")
     with pytest.raises(InputError, match="line 1: does not name two"):
@@ -159,32 +159,34 @@ def test_one_shape_in_two_formats_is_one_shape(tmp_path):
 
 BREAKAGES = {
     "no directory": (lambda d: None, "is not a directory"),
-    "empty": (lambda d: d.mkdir(), "not laid out like a data set"),
+    "empty": (lambda d: d.mkdir(), "not laid out like a known data set"),
     "only text": (lambda d: put(d / "readme.txt", "x"), "remeshed sets: off/NAME.off"),
-    "no meshes": (lambda d: put(d / "corres" / "a.vts", "1\n"), "no folder with the meshes"),
-    "no truth": (lambda d: (remeshed(d), (d / "corres" / "cat2.vts").unlink()), "cat2.vts: is missing"),
+    "no meshes": (lambda d: put(d / "corres" / "a.vts", "1\n"), "no folder with their meshes"),
+    "no truth": (lambda d: (remeshed(d), (d / "corres" / "cat2.vts").unlink()), "cat2.vts: the ground truth of .* is missing"),
     "no mesh": (lambda d: (remeshed(d), (d / "off" / "cat2.off").unlink()), "no mesh for .*cat2.vts"),
     "several": (lambda d: (remeshed(d / "a"), faust(d / "b")), r"several data sets \(a, b\)"),
     "a kid without truth": (
-        lambda d: (topology(d), (d / "kid02_ref.txt").unlink()), "kid02_ref.txt: is missing"
+        lambda d: (topology(d), (d / "kid02_ref.txt").unlink()), "kid02_ref.txt: the ground truth of .* is missing"
     ),
     "no null": (lambda d: put(d / "cuts" / "cuts_cat_shape_1.off"), "no null/"),
-    "no parts": (lambda d: put(d / "null" / "cat.off"), "no cuts/ or holes/"),
-    "a part of nothing": (lambda d: (partial(d), put(d / "cuts" / "cuts_dog_shape_1.off")), "no full shape"),
-    "a part without truth": (
+    "no partial shapes": (lambda d: put(d / "null" / "cat.off"), "no cuts/ or holes/"),
+    "a partial shape without its full shape": (
+        lambda d: (partial(d), put(d / "cuts" / "cuts_dog_shape_1.off")), "full shape of this partial shape is not in"
+    ),
+    "a partial shape without truth": (
         lambda d: (partial(d), (d / "cuts" / "cuts_cat_shape_1.baryc_gt").unlink()),
-        "cuts_cat_shape_1.baryc_gt: is missing",
+        "cuts_cat_shape_1.baryc_gt: the ground truth of .* is missing",
     ),
     "no kid00": (lambda d: (topology(d), (d / "kid00.off").unlink()), "no kid00"),
-    "one shape": (lambda d: put(d / "cat0.off"), "no two of its shapes make a pair"),
+    "one shape": (lambda d: put(d / "cat0.off"), "no two of its shapes form a pair"),
     "a listed pair without truth": (
-        lambda d: (shrec19(d), put(d / "PAIRS_list_x.txt", "1,10")), "ground truth 1_10 of a listed pair"
+        lambda d: (shrec19(d), put(d / "PAIRS_list_x.txt", "1,10")), "ground truth 1_10 of a listed pair is missing"
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BREAKAGES)
-def test_what_is_missing_is_named(tmp_path, case):
+def test_missing_files_are_named(tmp_path, case):
     damage, message = BREAKAGES[case]
     damage(tmp_path / "set")
     with pytest.raises(InputError, match=message) as caught:
@@ -193,15 +195,28 @@ def test_what_is_missing_is_named(tmp_path, case):
     assert "\n" not in str(caught.value)
 
 
-def test_the_folder_of_meshes_is_not_the_set(tmp_path):
+def test_unreadable_directories_are_named(tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(
+        InputError, match=rf"{tmp_path}: cannot be read \(Permission denied\): check its perm"
+    ):
+        open_data_set(tmp_path)
+
+
+def test_the_mesh_folder_is_not_the_data_set(tmp_path):
     remeshed(tmp_path)
     shutil.copytree(tmp_path / "off", tmp_path / "shapes")
     assert len(open_data_set(tmp_path).pairs) == 6
-    with pytest.raises(InputError, match=f"meshes of a remeshed set: give {re.escape(str(tmp_path))}"):
+    with pytest.raises(
+        InputError, match=f"only the mesh folder of a remeshed set: give {re.escape(str(tmp_path))}"
+    ):
         open_data_set(tmp_path / "off")
 
 
-def test_shapes_that_should_share_vertices(tmp_path):
+def test_shapes_that_should_have_the_same_vertices(tmp_path):
     put(tmp_path / "cat0.off")
     write_mesh(tmp_path / "cat1.off", make_mesh(*grid_mesh(5, 5)))
     pair = open_data_set(tmp_path).pairs[0]

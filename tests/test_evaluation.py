@@ -1,4 +1,4 @@
-"""Ground truth in all its forms, files that are wrong, and the errors and curves computed from it."""
+"""Ground truth in all formats, wrong files, and the errors and curves computed from ground truth."""
 
 import json
 
@@ -30,7 +30,7 @@ def no_cache(monkeypatch):
 
 @pytest.fixture
 def write(tmp_path):
-    """Write a file and give its path."""
+    """Writes a file and returns its path."""
 
     def write(name, content):
         path = tmp_path / name
@@ -58,15 +58,17 @@ class TestReading:
         assert read_ground_truth(str(path), X, Y, index_base=1).targets.tolist() == [7, 0, 0, 1]
         assert read_ground_truth([path], X, Y).targets.tolist() == [8, 1, 1, 2]
 
-    def test_vertices_that_no_face_uses_are_left_out(self, write):
-        """As where a part keeps the vertices of the whole."""
+    def test_unreferenced_vertices_are_left_out(self, write):
+        """A partial shape may keep the vertices of the full shape."""
         part = make_mesh(X.vertices, X.faces[:1], name="part")
         path = write("truth.txt", "8\n1\n2\n3\n")
         with pytest.warns(UserWarning, match=r"truth.txt: 1 of 4 points are vertices that no face of part"):
             truth = read_ground_truth(path, part, Y)
         assert truth.source_vertices.tolist() == sorted(X.faces[0]) and len(truth.targets) == 3
         (left_out,) = set(range(4)) - set(X.faces[0].tolist())
-        with pytest.raises(InputError, match="no face of part uses: give the truth of this mesh"):
+        with pytest.raises(
+            InputError, match="no face of part references: give the ground truth of this mesh"
+        ):
             read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
 
     def test_two_columns(self, write):
@@ -180,7 +182,7 @@ class TestReading:
         null = mesh("shrec16_partial/null/dog.off")
         paths = [data / f"shrec16_partial/holes/holes_dog_shape_1.baryc_gt{end}" for end in ("", "_sym")]
         direct, mirrored = (read_ground_truth(path, part, null).targets.positions(null) for path in paths)
-        # On the dog, standing upright and looking straight ahead, mirroring is a reflection.
+        # The dog stands upright and looks straight ahead, so mirroring is a reflection.
         assert len(direct) == len(part.vertices)
         spread = np.abs(direct - mirrored).max(axis=0) / np.ptp(null.vertices, axis=0)
         assert spread.max() > 0.5
@@ -228,7 +230,7 @@ class TestBadFiles:
         ("name", "content", "message"),
         [
             ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
-            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a truth with one per line"),
+            ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a file with one per line"),
             ("t.txt", "1 2\n3\n", "line 2: has 1 number where 2 should be"),
             (
                 "t.txt",
@@ -293,7 +295,7 @@ class TestGeodesicError:
             np.testing.assert_allclose(result.median, np.sqrt(0.5) / 2)
             assert result.unreachable == 0
 
-    def test_the_truth_has_no_error_in_any_form(self):
+    def test_the_ground_truth_has_no_error_in_any_format(self):
         generator = np.random.default_rng(0)
         points = SurfacePoints(generator.integers(0, 8, 4), generator.dirichlet([1, 1, 1], 4))
         assert geodesic_error(Y, points, GroundTruth.of_all_vertices(points)).errors.tolist() == [0] * 4
@@ -346,7 +348,7 @@ class TestGeodesicError:
         assert len(first.errors) == 40
         np.testing.assert_array_equal(first.errors, again.errors)
         assert (first.source_vertices != other.source_vertices).any()
-        # Without replacement: all of them are all, in another order.
+        # Drawing all rows without replacement only changes their order.
         most = geodesic_error(Y, pointwise_map, truth, number_of_samples=1000)
         np.testing.assert_array_equal(np.sort(most.errors), np.sort(everything.errors))
         assert (np.bincount(first.source_vertices) <= 10).all()
@@ -382,11 +384,11 @@ class TestGeodesicError:
             ([0, 1, 2], ([], []), "has no rows"),
         ],
     )
-    def test_what_does_not_fit(self, pointwise_map, truth, message):
+    def test_arguments_that_do_not_fit_are_refused(self, pointwise_map, truth, message):
         with pytest.raises(InputError, match=message):
             geodesic_error(Y, pointwise_map, GroundTruth(*(np.array(part, dtype=np.int64) for part in truth)))
 
-    def test_samples_must_be_some(self):
+    def test_at_least_one_sample_is_needed(self):
         with pytest.raises(InputError, match="0 samples cannot be evaluated"):
             geodesic_error(Y, [0], GroundTruth.of_all_vertices(np.array([0])), number_of_samples=0)
 
@@ -409,7 +411,7 @@ class TestStatistics:
         heights = error.correspondence_quality_curve(steps[:-1])
         assert error.area_under_curve(largest) == pytest.approx((heights * np.diff(steps)).sum() / largest)
 
-    def test_in_words_and_as_json(self):
+    def test_as_text_and_as_json(self):
         error = self.error([0.1, 0.2, np.inf, 0.0])
         assert str(error) == (
             "mean 0.10000, median 0.15000, 25.0% within 0.02, 25.0% within 0.05, 50.0% within 0.1, area under the "
@@ -446,9 +448,9 @@ class TestStatistics:
             coverage(Y, [9])
 
 
-def test_errors_that_others_measured_for_the_same_maps(shared):
-    # Published with the maps: means over 1000 vertices of their choice, with exact distances. Ours are over
-    # other rows of the same truth, so that only sampling lies between.
+def test_errors_agree_with_published_errors_of_the_same_maps(shared):
+    # The published means are over 1000 chosen vertices, with exact distances. Our means are over other rows of the
+    # same ground truth, so only the sampling differs.
     published = {
         ("002", "007"): {
             "T0": 362,
@@ -478,7 +480,7 @@ def test_errors_that_others_measured_for_the_same_maps(shared):
                 assert abs(errors.mean() - mean) < 3.5 * standard_error, (a, b, name)
 
 
-def test_vertices_without_a_truth_take_the_nearest_ones():
+def test_vertices_without_ground_truth_take_that_of_the_nearest_vertex():
     mesh = bumpy_mesh(2)
     known = np.arange(0, 162, 2)
     found = GroundTruth(known, known + 1).everywhere(mesh)

@@ -7,7 +7,7 @@ from synthetic import body_with_arms, sphere_mesh
 from jaxsmw import creature_pair
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.repair.extremities import extremities, likely_pairings
+from jaxsmw.repair.extremities import extremities, plausible_pairings
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_the_true_pairing_is_among_the_likeliest(creature):
     true = np.sort(reach, axis=1)[:, 0] < 0.1 * pair.target.area**0.5
     assert true.sum() >= 3  # ends that are ends on both
     best = dict(zip(np.flatnonzero(true), reach.argmin(axis=1)[true], strict=True))
-    pairings = likely_pairings(x, y, 72)  # of 720
+    pairings = plausible_pairings(x, y, 72)  # of 720
     assert any(all(dict(pairing).get(a) == b for a, b in best.items()) for pairing in pairings)
 
 
@@ -59,7 +59,7 @@ def test_neither_unit_nor_numbering_matters(creature):
 
 def test_pairings_are_one_to_one_and_turn_round(creature):
     _, x, y = creature
-    there, back = likely_pairings(x, y, 5), likely_pairings(y, x, 5)
+    there, back = plausible_pairings(x, y, 5), plausible_pairings(y, x, 5)
     assert len(there) == 5
     for pairing in there:
         assert len(set(pairing[:, 0])) == len(set(pairing[:, 1])) == min(len(x.vertices), len(y.vertices))
@@ -76,7 +76,7 @@ def test_separate_pieces_have_ends_of_their_own():
     )
     ends = extremities(apart)
     assert (ends.vertices < n).any() and (ends.vertices >= n).any() and np.isinf(ends.distances).any()
-    (pairing, *_) = likely_pairings(ends, ends, 1)
+    (pairing, *_) = plausible_pairings(ends, ends, 1)
     np.testing.assert_array_equal(pairing[:, 0], pairing[:, 1])
 
 

@@ -21,7 +21,7 @@ M, K, D = 250, 12, 5
 def pair():
     """A shape with descriptors; a copy of it in another order, whose features are mixed and disturbed."""
     generator = np.random.default_rng(0)
-    x = random_spectrum(M, K).describe(jnp.asarray(generator.normal(size=(M, D))))
+    x = random_spectrum(M, K).with_descriptors(jnp.asarray(generator.normal(size=(M, D))))
     order = generator.permutation(M)
     mixing = np.linalg.qr(generator.normal(size=(K, K)))[0]
     y = Spectrum(
@@ -81,7 +81,7 @@ def test_is_what_its_definition_says(pair, partial):
         t = cdist(a, b @ matrix.T, "mahalanobis", VI=precision).argmin(axis=1)
         matrix_back, precision_back = predicted(yy, xy.T, xx)
         back = cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back).argmin(axis=1)
-    found = refine(x, y, start, refiner=FeatureRegression(partial=partial), iterations=2, history=True)
+    found = refine(x, y, start, refiner=FeatureRegression(), iterations=2, partial=partial, history=True)
     np.testing.assert_array_equal(found.pointwise_map, t)
     np.testing.assert_allclose(found.functional_map, matrix[:K, :K], atol=1e-10)
     distances = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t]
@@ -96,7 +96,9 @@ def test_mends_a_copy_whose_features_are_mixed(pair):
     found = refine(x, y, start, refiner=FeatureRegression(), iterations=5)
     assert found.result == RESULTS.successful
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
-    blind = refine(x.describe(None), y.describe(None), start, refiner=FeatureRegression(), iterations=5)
+    blind = refine(
+        x.with_descriptors(None), y.with_descriptors(None), start, refiner=FeatureRegression(), iterations=5
+    )
     assert np.mean(np.asarray(blind.pointwise_map) == truth) < np.mean(
         np.asarray(found.pointwise_map) == truth
     )
@@ -130,9 +132,7 @@ def test_does_not_stop_before_the_last_level(pair):
 def test_samples_ask_and_all_vertices_answer(pair):
     x, y, start, truth = pair
     samples = jnp.arange(0, M, 2), jnp.arange(1, M, 2)
-    found = refine(
-        x, y, start, refiner=FeatureRegression(), iterations=4, samples_x=samples[0], samples_y=samples[1]
-    )
+    found = refine(x, y, start, refiner=FeatureRegression(), iterations=4, samples=(samples[0], samples[1]))
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
@@ -143,7 +143,9 @@ def test_patches_decide_by_eigenvectors_alone(pair):
         refine(x, y, start, refiner=FeatureRegression(search=search), iterations=1).pointwise_map
         for search in ("exhaustive", "patches")
     ]
-    blind = refine(x.describe(None), y.describe(None), start, refiner=FeatureRegression(), iterations=1)
+    blind = refine(
+        x.with_descriptors(None), y.with_descriptors(None), start, refiner=FeatureRegression(), iterations=1
+    )
     np.testing.assert_array_equal(maps[1], blind.pointwise_map)
     assert np.mean(np.asarray(maps[0]) == truth) > np.mean(np.asarray(maps[1]) == truth)
 
@@ -162,24 +164,26 @@ def test_vmap_is_the_loop(pair):
 
 def test_rows_that_are_not_those_of_the_vertices_are_refused(pair):
     x, _, _, _ = pair
-    with pytest.raises(ValueError, match=rf"descriptors have shape \(3, 2\), .* each of the {M} vertices"):
-        x.describe(jnp.zeros((3, 2)))
-    with pytest.raises(ValueError, match=r"positions have shape .* a row of 3 numbers"):
-        x.place(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
+    with pytest.raises(
+        ValueError, match=rf"descriptors have shape \(3, 2\); one row per vertex .*\({M}, d\)"
+    ):
+        x.with_descriptors(jnp.zeros((3, 2)))
+    with pytest.raises(ValueError, match=rf"positions have shape .*; one row per vertex .*\({M}, 3\)"):
+        x.with_positions(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
 
 
 def test_descriptors_that_are_no_numbers_are_reported(pair):
     x, y, start, _ = pair
-    broken = x.describe(x.descriptors.at[3, 1].set(jnp.nan))
+    broken = x.with_descriptors(x.descriptors.at[3, 1].set(jnp.nan))
     found = refine(broken, y, start, refiner=FeatureRegression())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()
 
 
 def test_what_cannot_work_is_refused(pair):
     x, y, start, _ = pair
-    with pytest.raises(ValueError, match="X has 5 descriptors and Y 0"):
-        refine(x, y.describe(None), start, refiner=FeatureRegression())
-    with pytest.raises(ValueError, match="needs an eigenvector"):
+    with pytest.raises(ValueError, match="X has 5 descriptors and Y has 0"):
+        refine(x, y.with_descriptors(None), start, refiner=FeatureRegression())
+    with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         FeatureRegression((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):
         FeatureRegression(search="quick")

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxsmw.core.banks.filters import (
+from jaxsmw.core.banks import (
     CubicSpline,
     FilterBank,
+    FrameBounds,
     Gabor,
     HalfCosine,
     Heat,
@@ -17,8 +18,10 @@ from jaxsmw.core.banks.filters import (
     Meyer,
     SpectralDistribution,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from jaxsmw.core.frames import FrameBounds, frame_bounds, frame_function, tighten
 
 EIGENVALUES = jnp.asarray(np.cumsum(np.random.default_rng(0).uniform(0, 2, 40)) - 0.5).at[0].set(0)
 COVERING = [

@@ -1,4 +1,4 @@
-"""The functional map's formulas against the sums over scales and vertices that they stand for."""
+"""The formulas of functional maps agree with the sums over scales and vertices that they replace."""
 
 import jax
 import jax.numpy as jnp
@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import Meyer
-from jaxsmw.core.frames import frame_function
+from jaxsmw.core.banks import Meyer, frame_function
 from jaxsmw.core.functional_map import (
     QuadraticEnergy,
+    WaveletProblem,
     dual_eigenvectors,
     encode,
     multiscale_kernel,
-    wavelet_energy,
 )
 from jaxsmw.core.spectrum import Spectrum
 
@@ -69,30 +68,30 @@ def test_kernel_is_the_sum_over_scales(pair):
 
 
 def stacked(pair, pointwise_map, convention, norm):
-    """What every vertex of X feeds to C and should get back, and its weight, straight from the definition."""
+    """Returns the input, output and weight of every vertex of X, straight from the definition."""
     x, y = pair
     p = permutation_matrix(pointwise_map)
     areas_x = np.asarray(x.vertex_areas)
     if convention == "pullback":
-        fed, returned = p @ y.eigenvectors, np.asarray(x.eigenvectors)
+        inputs, outputs = p @ y.eigenvectors, np.asarray(x.eigenvectors)
     else:  # columns of Phi_X^+ and of Phi_Y^+ P^T
-        fed = (np.asarray(x.eigenvectors).T * areas_x).T
-        returned = p @ (np.asarray(y.eigenvectors) * np.asarray(y.vertex_areas)[:, None])
+        inputs = (np.asarray(x.eigenvectors).T * areas_x).T
+        outputs = p @ (np.asarray(y.eigenvectors) * np.asarray(y.vertex_areas)[:, None])
     if norm == "frobenius":
-        return fed, returned, np.ones(M)
+        return inputs, outputs, np.ones(M)
     if convention == "pushforward":
-        fed, returned = (columns / np.sqrt(areas_x)[:, None] for columns in (fed, returned))
-        return fed, returned, np.ones(M)
-    return fed, returned, areas_x
+        inputs, outputs = (columns / np.sqrt(areas_x)[:, None] for columns in (inputs, outputs))
+        return inputs, outputs, np.ones(M)
+    return inputs, outputs, areas_x
 
 
 def tall_system(pair, pointwise_map, g_x, g_y, convention, norm):
-    """All scales and vertices below each other: rows C-independent of any algebra on moments."""
-    fed, returned, weights = stacked(pair, pointwise_map, convention, norm)
+    """Returns both sides of the linear system with one row per scale and vertex, without any moments."""
+    inputs, outputs, weights = stacked(pair, pointwise_map, convention, norm)
     g_in, g_out = (g_y, g_x) if convention == "pullback" else (g_x, g_y)
     root = np.sqrt(weights)[:, None]
-    left = np.concatenate([root * fed * np.asarray(g)[None] for g in g_in])
-    right = np.concatenate([root * returned * np.asarray(g)[None] for g in g_out])
+    left = np.concatenate([root * inputs * np.asarray(g)[None] for g in g_in])
+    right = np.concatenate([root * outputs * np.asarray(g)[None] for g in g_out])
     return left, right
 
 
@@ -108,7 +107,7 @@ CASES = [
 def case(request, pair, pointwise_map):
     convention, norm, tight = request.param
     g_x, g_y = (responses(spectrum, tight=tight) for spectrum in pair)
-    energy = wavelet_energy(pointwise_map, *pair, g_x, g_y, convention=convention, norm=norm)
+    energy = WaveletProblem(*pair, g_x, g_y, convention).energy(pointwise_map, norm=norm)
     return energy, tall_system(pair, pointwise_map, g_x, g_y, convention, norm)
 
 
@@ -127,14 +126,14 @@ def test_minimizer_is_the_least_squares_solution_of_the_tall_system(case):
     np.testing.assert_allclose(energy.condition_number(), condition, rtol=1e-8)
 
 
-def test_nothing_scores_below_the_minimizer(case):
+def test_no_map_has_less_energy_than_the_minimizer(case):
     energy, _ = case
     generator = np.random.default_rng(1)
     best = energy.minimizer()
     np.testing.assert_allclose(jax.grad(energy)(best), 0, atol=1e-9)
     for size in (1e-3, 1e-1, 1.0):
         assert energy(best + size * generator.normal(size=best.shape)) > energy(best)
-    # Gradient descent from elsewhere comes closer and closer, never below.
+    # Gradient descent from another map comes closer and closer to the minimiser, but never below.
     c = jnp.asarray(generator.normal(size=best.shape))
     step = 1 / jnp.linalg.eigvalsh(energy.gram)[-1]
     before = jnp.inf
@@ -145,7 +144,7 @@ def test_nothing_scores_below_the_minimizer(case):
 
 
 def test_closed_forms(pair, pointwise_map):
-    """The four solutions as one derives them one by one, without the common form."""
+    """The minimiser agrees with four formulas that were derived separately."""
     x, y = pair
     g_x, g_y = (responses(spectrum, tight=False) for spectrum in pair)
     areas_x = np.asarray(x.vertex_areas)
@@ -155,7 +154,7 @@ def test_closed_forms(pair, pointwise_map):
     frame_x = np.asarray(frame_function(g_x))
 
     def solve(convention, norm):
-        return wavelet_energy(pointwise_map, x, y, g_x, g_y, convention=convention, norm=norm).minimizer()
+        return WaveletProblem(x, y, g_x, g_y, convention).energy(pointwise_map, norm=norm).minimizer()
 
     k_yx = np.asarray(g_y).T @ np.asarray(g_x)
     expected = (inverse_y @ p.T @ phi_x * k_yx) / frame_x[None]
@@ -186,9 +185,8 @@ def test_padding_changes_nothing(pair, pointwise_map):
     longer = jnp.pad(pointwise_map, (0, 7), constant_values=3)
     for convention in ("pullback", "pushforward"):
         for norm in ("area", "frobenius"):
-            options = {"convention": convention, "norm": norm}
-            plain = wavelet_energy(pointwise_map, x, y, g_x, g_y, **options)
-            other = wavelet_energy(longer, padded, y, g_x, g_y, **options)
+            plain = WaveletProblem(x, y, g_x, g_y, convention).energy(pointwise_map, norm=norm)
+            other = WaveletProblem(padded, y, g_x, g_y, convention).energy(longer, norm=norm)
             for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(other), strict=True):
                 np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
 
@@ -206,28 +204,28 @@ def test_energies_add_and_scale():
     np.testing.assert_allclose(total(c), first(c) + 0.3 * second(c), rtol=1e-12)
 
 
-def test_tight_update_minimises_the_energy_where_the_fed_vectors_are_orthonormal(pair, pointwise_map):
-    """Remark 4.1: in the pushforward convention for any T, as Phi_X is orthonormal and the frame Parseval."""
+def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair, pointwise_map):
+    """Remark 4.1 holds for any T in the pushforward convention: Phi_X is orthonormal and the frame Parseval."""
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)
-    energy = wavelet_energy(pointwise_map, x, y, g_x, g_y, convention="pushforward")
+    energy = WaveletProblem(x, y, g_x, g_y, "pushforward").energy(pointwise_map)
     np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
     np.testing.assert_allclose(energy.condition_number(), 1, atol=1e-12)
-    # For a permuted copy of one shape the pullback is such a case too.
+    # In the pullback convention the remark holds for a permuted copy of one shape.
     order = jnp.asarray(np.random.default_rng(5).permutation(M))
     copy = Spectrum(x.eigenvalues, x.eigenvectors[order], x.vertex_areas[order], x.mask)
     inverse = jnp.argsort(order)
     update = encode(inverse, x, copy) * multiscale_kernel(g_x, g_x)
-    energy = wavelet_energy(inverse, x, copy, g_x, g_x)
+    energy = WaveletProblem(x, copy, g_x, g_x).energy(inverse)
     np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
-    # There the energy is what is left of k_X: the wavelets of a copy are preserved exactly.
+    # There the energy of the identity is zero, because the wavelets of a copy are preserved exactly.
     np.testing.assert_allclose(energy(jnp.eye(K_X)), 0, atol=1e-12)
 
 
 def test_energy_of_the_zero_map(pair, pointwise_map):
     x, y = pair
     g_x, g_y = responses(x), responses(y)
-    energy = wavelet_energy(pointwise_map, x, y, g_x, g_y)(jnp.zeros((K_X, K_Y)))
+    energy = WaveletProblem(x, y, g_x, g_y).energy(pointwise_map)(jnp.zeros((K_X, K_Y)))
     np.testing.assert_allclose(energy, jnp.sum(frame_function(g_x)), rtol=1e-12)
     np.testing.assert_allclose(energy, K_X, rtol=1e-12)

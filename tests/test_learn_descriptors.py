@@ -18,9 +18,9 @@ import learning
 from learn_descriptors import (
     LOSSES,
     DescriptorNetwork,
-    Pair,
     Shape,
     Sizes,
+    TrainingPair,
     described,
     draw,
     load,
@@ -30,7 +30,8 @@ from learn_descriptors import (
 )
 from learning import train
 
-from jaxsmw import InputError, creature_pair, farthest_point_samples, make_mesh
+from jaxsmw import InputError, creature_pair, make_mesh
+from jaxsmw.geometry import farthest_point_samples
 
 SMALL = Sizes(waves=8, width=12, blocks=2, filters=4, outputs=6)
 SAMPLES, EIGENVECTORS = 90, 20
@@ -67,7 +68,7 @@ def pair(creatures, spectra):
     ]
     x, y = (Shape(s.sample(jnp.asarray(c)), p) for s, c, p in zip(spectra, chosen, positions, strict=True))
     targets = creatures.true_map[chosen[0]]
-    return Pair(x, y, jnp.asarray(meshes[1].vertices[targets] / meshes[1].area ** 0.5))
+    return TrainingPair(x, y, jnp.asarray(meshes[1].vertices[targets] / meshes[1].area ** 0.5))
 
 
 @pytest.fixture(scope="module")
@@ -217,9 +218,9 @@ def test_damaged_files_are_named(network, pair, tmp_path):
 def test_what_is_no_input_is_refused(network, pair, spectra, tmp_path):
     x, _ = spectra
     with pytest.raises(ValueError, match="no descriptors, where 352 are needed"):
-        network(x.describe(None))
+        network(x.with_descriptors(None))
     with pytest.raises(ValueError, match="10 descriptors, where 352"):
-        network(x.describe(x.descriptors[:, :10]))
+        network(x.with_descriptors(x.descriptors[:, :10]))
     for wrong in ({"width": 0}, {"blocks": 1.5}, {"filters": True}):
         with pytest.raises(ValueError, match=f"at least one of its {next(iter(wrong))}"):
             Sizes(**wrong)

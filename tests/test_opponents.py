@@ -1,4 +1,4 @@
-"""The opponents do what their papers say: against plain NumPy, and on cases with a known answer."""
+"""The compared methods equal plain NumPy programs of their papers, and solve cases with a known result."""
 
 from dataclasses import replace
 
@@ -10,19 +10,23 @@ from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.opponents import METHODS, PreparedPair, Refined, Start, ZoomOut
+from jaxsmw.evaluation.opponents.base import MethodInput
+from jaxsmw.evaluation.opponents.initial_map import Unrefined
 from jaxsmw.evaluation.opponents.peers import installed_peers
+from jaxsmw.evaluation.opponents.presets import Refined
+from jaxsmw.evaluation.opponents.registry import METHODS
+from jaxsmw.evaluation.opponents.zoomout import ZoomOut
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 
 M, N, K = 200, 180, 40
 
 
 @pytest.fixture
-def pair() -> PreparedPair:
+def pair() -> MethodInput:
     generator = np.random.default_rng(0)
     x, y = random_spectrum(M, K, seed=1), random_spectrum(N, K, seed=2)
     samples = tuple(jnp.asarray(generator.choice(n, 80, replace=False)) for n in (M, N))
-    return PreparedPair(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
+    return MethodInput(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
 
 
 def nearest(queries, database) -> np.ndarray:
@@ -31,7 +35,7 @@ def nearest(queries, database) -> np.ndarray:
 
 def test_zoomout_is_iterative_upsampling(pair):
     x, y = pair.spectrum_x, pair.spectrum_y
-    t = np.asarray(pair.start)
+    t = np.asarray(pair.initial_map)
     for k in (10, 15, 20, 25):
         a, b = np.asarray(x.eigenvectors[:, :k]), np.asarray(y.eigenvectors[:, :k])
         c = (a * np.asarray(x.vertex_areas)[:, None]).T @ b[t]
@@ -41,11 +45,11 @@ def test_zoomout_is_iterative_upsampling(pair):
     np.testing.assert_array_equal(found, t)
 
 
-def test_zoomout_on_samples_searches_all_at_the_end(pair):
+def test_zoomout_on_samples_searches_all_vertices_at_the_end(pair):
     x, y = pair.spectrum_x, pair.spectrum_y
     s_x, s_y = (np.asarray(vertices[:60]) for vertices in pair.samples)
     phi, psi = np.asarray(x.eigenvectors), np.asarray(y.eigenvectors)
-    c = (phi[:, :10] * np.asarray(x.vertex_areas)[:, None]).T @ psi[np.asarray(pair.start), :10]
+    c = (phi[:, :10] * np.asarray(x.vertex_areas)[:, None]).T @ psi[np.asarray(pair.initial_map), :10]
     t = nearest(phi[s_x, :10], psi[s_y, :10] @ c.T)
     for k in (10, 15, 20):
         c = np.linalg.lstsq(phi[s_x, :k], psi[s_y[t], :k])[0]
@@ -57,7 +61,7 @@ def test_zoomout_on_samples_searches_all_at_the_end(pair):
 
 def test_spectral_icp_takes_the_nearest_rotation(pair):
     icp = METHODS["icp"]
-    x, y, t = pair.spectrum_x, pair.spectrum_y, np.asarray(pair.start)
+    x, y, t = pair.spectrum_x, pair.spectrum_y, np.asarray(pair.initial_map)
     for _ in range(4):
         c = (np.asarray(x.eigenvectors) * np.asarray(x.vertex_areas)[:, None]).T @ np.asarray(y.eigenvectors)[
             t
@@ -68,33 +72,33 @@ def test_spectral_icp_takes_the_nearest_rotation(pair):
     np.testing.assert_array_equal(found, t)
 
 
-def test_all_methods_mend_a_noisy_copy():
-    """X is Y with its vertices in another order, and a tenth of the start is wrong."""
+def test_all_methods_repair_a_noisy_initial_map():
+    """X is Y with its vertices in another order, and a tenth of the initial map is wrong."""
     generator = np.random.default_rng(0)
     y = compute_spectrum(bumpy_mesh(3), 120)
     n = len(y.mask)
     order = generator.permutation(n)
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
-    x = x.place(y.positions[order], y.normals[order])
-    start = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
+    x = x.with_positions(y.positions[order], y.normals[order])
+    initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
-    pair = PreparedPair(
-        x, y, jnp.asarray(start), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
+    pair = MethodInput(
+        x, y, jnp.asarray(initial_map), (jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples))
     )
     for name, method in METHODS.items():
         if method.both_directions or method.partial_only:
-            continue  # needs meshes: tests/test_bcicp.py, tests/test_partial_functional_maps.py
+            continue  # because the method needs meshes: tests/test_bcicp.py, tests/test_partial_functional_maps.py
         if isinstance(method, ZoomOut):
-            method = replace(method, step=50)  # every size is compiled
+            method = replace(method, step=50)  # because every size is compiled
         found, result = method(pair)
         assert result == RESULTS.successful
         wrong = np.mean(np.asarray(found) != order)
-        assert wrong > 0.08 if isinstance(method, Start) else wrong < 0.02, name
+        assert wrong > 0.08 if isinstance(method, Unrefined) else wrong < 0.02, name
 
 
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
-    """Padding and unused vertices are kept from them, and their maps count the same vertices as ours."""
+    """The peers see neither padding nor unreferenced vertices, and their maps use our vertex numbers."""
     peers = installed_peers()
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")
@@ -102,17 +106,17 @@ def test_other_libraries_run_the_same_zoomout():
     order = generator.permutation(300)
     y = random_spectrum(300, 120, seed=1)
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
-    start = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
+    initial_map = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
     samples = (jnp.arange(200), jnp.arange(200))
-    expected, _ = METHODS["zoomout"](PreparedPair(x, y, start, samples))
-    # One vertex in front that no face uses, and padding behind.
+    expected, _ = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
+    # An unreferenced vertex at the beginning, and padding at the end.
     x, y = (
         Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
         for s in (x.pad(320), y.pad(310))
     )
-    shifted = jnp.roll(jnp.pad(start + 1, (0, 20)), 1)
+    shifted = jnp.roll(jnp.pad(initial_map + 1, (0, 20)), 1)
     for name, peer in peers.items():
-        found, result = peer(PreparedPair(x, y, shifted, samples))
+        found, result = peer(MethodInput(x, y, shifted, samples))
         assert result == RESULTS.successful
         found = np.asarray(found)[1:301] - 1
         assert np.mean(found != order) < 0.02

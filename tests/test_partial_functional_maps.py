@@ -1,4 +1,4 @@
-"""Partial functional maps: the energies against their plain statements, the whole on a body cut in two."""
+"""Partial functional maps: the energies equal plain NumPy programs, and the method matches a cut shape."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,41 +17,46 @@ from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.opponents import partial_functional_maps as steps
-from jaxsmw.evaluation.opponents.opponents import METHODS, PreparedPair, suited_methods
+from jaxsmw.evaluation.opponents.base import MethodInput
 from jaxsmw.evaluation.opponents.partial_functional_maps import (
     PartialMap,
     SurfaceGradient,
     partial_functional_map,
 )
+from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import paired_spectra
+from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 
 K, D = 40, 8
 
 
 class Case:
-    """A body Y, what is left of it above a plane as X in another order, and a start that is often wrong."""
+    """A full shape Y, its part above a plane as X in another vertex order, and a noisy initial map."""
 
     def __init__(self) -> None:
         generator = np.random.default_rng(0)
-        self.whole = creature("quadruped", vertices=1200, pose="stand", seed=3)
-        centers = self.whole.vertices[self.whole.faces].mean(axis=1)
-        kept = self.whole.faces[centers[:, 2] > np.quantile(centers[:, 2], 0.4)]
+        self.full = creature("quadruped", vertices=1200, pose="stand", seed=3)
+        centers = self.full.vertices[self.full.faces].mean(axis=1)
+        kept = self.full.faces[centers[:, 2] > np.quantile(centers[:, 2], 0.4)]
         self.truth = generator.permutation(np.unique(kept))
-        number = np.full(len(self.whole.vertices), -1)
+        number = np.full(len(self.full.vertices), -1)
         number[self.truth] = np.arange(len(self.truth))
-        self.part: Mesh = make_mesh(self.whole.vertices[self.truth], number[kept])
-        spectra = paired_spectra(self.part, self.whole, K, partial=True)
-        self.x, self.y = describe(self.part, self.whole, *spectra, D, partial=True)
-        self.covered = np.isin(np.arange(len(self.whole.vertices)), self.truth)
+        self.partial: Mesh = make_mesh(self.full.vertices[self.truth], number[kept])
+        pair = Pair(self.partial, self.full, True)
+        self.x, self.y = describe(pair, *paired_spectra(pair, K), D)
+        self.covered = np.isin(np.arange(len(self.full.vertices)), self.truth)
         wrong = generator.random(len(self.truth)) < 0.3
-        self.start = np.where(wrong, generator.integers(0, len(self.whole.vertices), len(wrong)), self.truth)
+        self.initial_map = np.where(
+            wrong, generator.integers(0, len(self.full.vertices), len(wrong)), self.truth
+        )
 
-    def matched(self, x: Spectrum, y: Spectrum, start: np.ndarray, turns: int = 2) -> PartialMap:
-        gradient = SurfaceGradient.of(self.whole, y)
-        return compiled(partial_functional_map)(x, y, gradient, jnp.asarray(start), turns=turns)
+    def matched(self, x: Spectrum, y: Spectrum, initial_map: np.ndarray, iterations: int = 2) -> PartialMap:
+        gradient = SurfaceGradient.of(self.full, y)
+        return compiled(partial_functional_map)(
+            x, y, gradient, jnp.asarray(initial_map), iterations=iterations
+        )
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +66,10 @@ def case() -> Case:
 
 @pytest.fixture(scope="module")
 def found(case) -> PartialMap:
-    return case.matched(case.x, case.y, case.start)
+    return case.matched(case.x, case.y, case.initial_map)
 
 
-def test_fidelity_and_map_energy_are_what_the_paper_says():
+def test_fidelity_and_map_energy_are_those_of_the_paper():
     generator = np.random.default_rng(0)
     c, a, b = (generator.normal(size=shape) for shape in ((5, 8), (5, 4), (8, 4)))
     weights = generator.random((5, 8))
@@ -82,7 +87,7 @@ def test_fidelity_and_map_energy_are_what_the_paper_says():
 def test_weights_are_distances_from_a_slanted_diagonal():
     k_x, k_y = 4, 10
     weights = np.asarray(steps.slanted_weights(k_x, k_y))
-    # Column i and row j of ours are row i and column j of the paper's.
+    # Our column i and row j are row i and column j of the paper.
     normal = np.array([1, k_x / k_y, 0]) / np.hypot(1, k_x / k_y)
     for row in range(k_x):
         for column in range(k_y):
@@ -93,7 +98,7 @@ def test_weights_are_distances_from_a_slanted_diagonal():
 
 
 def flat() -> tuple[Mesh, Spectrum]:
-    """A square of side 3, and its spectrum for side 1 with two padded vertices."""
+    """Returns a square of side 3, and its spectrum for side 1 with two padded vertices."""
     vertices, faces = grid_mesh(9, 9)
     mesh = make_mesh(3 * vertices, faces)
     return mesh, jaxsmw.compute_spectrum(mesh, 5).pad(len(vertices) + 2)
@@ -123,7 +128,7 @@ def test_derivatives_are_those_of_differences():
     v, along = (jnp.asarray(generator.random(n)) for _ in range(2))
     slope = (energy(v + 1e-6 * along) - energy(v - 1e-6 * along)) / 2e-6
     assert jnp.vdot(jax.grad(energy)(v), along) == pytest.approx(float(slope), rel=1e-5)
-    # Where a column or a gradient vanishes the norm has a derivative, zero.
+    # Where a column or a gradient vanishes, the derivative of the norm is zero.
     assert (jax.grad(gradient.total_variation)(jnp.ones(n)) == 0).all()
 
 
@@ -137,17 +142,19 @@ def test_the_covered_region_and_the_map_are_recovered(case, found):
     np.testing.assert_allclose(gram, np.eye(len(gram)), atol=1e-9)
 
     def distance(pointwise_map) -> np.ndarray:
-        there = case.whole.vertices[np.asarray(pointwise_map)] - case.whole.vertices[case.truth]
-        return np.linalg.norm(there, axis=1) / np.sqrt(case.whole.area)
+        difference = case.full.vertices[np.asarray(pointwise_map)] - case.full.vertices[case.truth]
+        return np.linalg.norm(difference, axis=1) / np.sqrt(case.full.area)
 
-    assert distance(found.pointwise_map).mean() < 0.03 < 0.1 < distance(case.start).mean()
+    assert distance(found.pointwise_map).mean() < 0.03 < 0.1 < distance(case.initial_map).mean()
 
 
 def test_padding_does_not_matter(case):
-    m, n = len(case.truth), len(case.whole.vertices)
-    # Not to rounding, which many steps towards a minimum that is not reached multiply.
-    plain = case.matched(case.x, case.y, case.start, turns=1)
-    padded = case.matched(case.x.pad(m + 9), case.y.pad(n + 5), np.pad(case.start, (0, 9)), turns=1)
+    m, n = len(case.truth), len(case.full.vertices)
+    # Equality is approximate because many steps towards a minimum amplify rounding errors.
+    plain = case.matched(case.x, case.y, case.initial_map, iterations=1)
+    padded = case.matched(
+        case.x.pad(m + 9), case.y.pad(n + 5), np.pad(case.initial_map, (0, 9)), iterations=1
+    )
     assert np.mean(np.asarray(padded.pointwise_map[:m] == plain.pointwise_map)) > 0.99
     np.testing.assert_allclose(padded.functional_map, plain.functional_map, atol=1e-6)
     np.testing.assert_allclose(padded.region[:n], plain.region, atol=1e-3)
@@ -164,59 +171,67 @@ def test_signs_do_not_matter(case):
         )
         for spectrum in (case.x, case.y)
     ]
-    plain, again = (case.matched(*spectra, case.start, turns=1) for spectra in ((case.x, case.y), flipped))
+    plain, again = (
+        case.matched(*spectra, case.initial_map, iterations=1) for spectra in ((case.x, case.y), flipped)
+    )
     assert np.mean(np.asarray(again.pointwise_map == plain.pointwise_map)) > 0.99
     np.testing.assert_allclose(again.region, plain.region, atol=1e-3)
 
 
 def test_bad_numbers_are_reported(case):
-    broken = case.x.describe(case.x.descriptors.at[3, 2].set(jnp.nan))
-    bad_start = np.full_like(case.start, len(case.whole.vertices))
+    broken = case.x.with_descriptors(case.x.descriptors.at[3, 2].set(jnp.nan))
+    bad_map = np.full_like(case.initial_map, len(case.full.vertices))
     for arguments, expected in [
-        ((broken, case.y, case.start), RESULTS.nonfinite_spectrum),
-        ((case.x, case.y, bad_start), RESULTS.invalid_initial_map),
-        ((case.x.describe(case.x.descriptors * 1e200), case.y, case.start), RESULTS.nonfinite_functional_map),
+        ((broken, case.y, case.initial_map), RESULTS.nonfinite_spectrum),
+        ((case.x, case.y, bad_map), RESULTS.invalid_initial_map),
+        (
+            (case.x.with_descriptors(case.x.descriptors * 1e200), case.y, case.initial_map),
+            RESULTS.nonfinite_functional_map,
+        ),
     ]:
         bad = case.matched(*arguments)
         assert bad.result == expected
         assert (np.asarray(bad.pointwise_map) == -1).all()
 
 
-def test_what_does_not_fit_is_refused(case):
+def test_arguments_that_do_not_fit_are_refused(case):
     for x, y, options, message in [
-        (case.x, case.y, {"turns": 0}, "at least 1 turn"),
-        (case.x.describe(None), case.y, {}, "number of descriptors"),
-        (case.x, case.y.describe(case.y.descriptors[:, :3]), {}, "number of descriptors"),
+        (case.x, case.y, {"iterations": 0}, "at least 1 iteration"),
+        (case.x.with_descriptors(None), case.y, {}, "number of descriptors"),
+        (case.x, case.y.with_descriptors(case.y.descriptors[:, :3]), {}, "number of descriptors"),
     ]:
         with pytest.raises(ValueError, match=message):
             partial_functional_map(
-                x, y, SurfaceGradient.of(case.whole, y), jnp.asarray(case.start), **options
+                x, y, SurfaceGradient.of(case.full, y), jnp.asarray(case.initial_map), **options
             )
 
 
-def test_a_part_may_have_more_eigenvectors(case):
-    found = case.matched(case.x, case.y.truncate(10), case.start, turns=1)
+def test_the_partial_shape_may_have_more_eigenvectors(case):
+    found = case.matched(case.x, case.y.truncate(10), case.initial_map, iterations=1)
     assert case.x.eigenvalues.shape > (10,) and found.functional_map.shape == (10, 10)
-    expected = case.matched(case.x.truncate(10), case.y.truncate(10), case.start, turns=1)
+    expected = case.matched(case.x.truncate(10), case.y.truncate(10), case.initial_map, iterations=1)
     np.testing.assert_array_equal(found.pointwise_map, expected.pointwise_map)
 
 
-def test_the_method_is_for_parts_only():
-    part, whole = (DataPair("x", "y", Path("x.off"), Path("y.off"), partial=kind) for kind in (True, False))
-    METHODS["pfm"].check([part])
-    with pytest.raises(InputError, match="parts of shapes"):
-        METHODS["pfm"].check([part, whole])
-    assert "pfm" in suited_methods([part])
-    assert "pfm" not in suited_methods([whole]) and "pfm" not in suited_methods([part, whole])
+def test_the_method_is_for_partial_shapes_only():
+    partial, full = (DataPair("x", "y", Path("x.off"), Path("y.off"), partial=kind) for kind in (True, False))
+    METHODS["pfm"].check([partial])
+    with pytest.raises(InputError, match="matches partial shapes only"):
+        METHODS["pfm"].check([partial, full])
+    assert "pfm" in suited_methods([partial])
+    assert "pfm" not in suited_methods([full]) and "pfm" not in suited_methods([partial, full])
 
 
-def test_the_method_sees_what_a_pair_has(case):
-    x, y = case.x.describe(case.x.descriptors[:, :4]), case.y.describe(case.y.descriptors[:, :4])
+def test_the_method_uses_the_prepared_pair(case):
+    x, y = (
+        case.x.with_descriptors(case.x.descriptors[:, :4]),
+        case.y.with_descriptors(case.y.descriptors[:, :4]),
+    )
     samples = jnp.arange(50), jnp.arange(50)
-    meshes = case.part, case.whole
-    pair = PreparedPair(case.x, case.y, jnp.asarray(case.start), samples, meshes=meshes, partial=True)
-    method = replace(METHODS["pfm"], number_of_eigenvectors=K, number_of_descriptors=4, turns=1)
+    meshes = case.partial, case.full
+    pair = MethodInput(case.x, case.y, jnp.asarray(case.initial_map), samples, meshes=meshes, partial=True)
+    method = replace(METHODS["pfm"], number_of_eigenvectors=K, number_of_descriptors=4, iterations=1)
     mapped, result = method(pair)
-    expected = case.matched(x, y, case.start, turns=1)
+    expected = case.matched(x, y, case.initial_map, iterations=1)
     assert result == RESULTS.successful
     np.testing.assert_array_equal(mapped, expected.pointwise_map)

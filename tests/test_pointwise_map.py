@@ -10,7 +10,8 @@ from jaxsmw.core.pointwise_map import (
     search_patches,
     spectral_embeddings,
 )
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiner import Problem
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 
 
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
@@ -23,7 +24,7 @@ def test_decode_finds_the_nearest_and_the_objective_is_their_distance(convention
     distances = cdist(queries, database) ** 2
     np.testing.assert_array_equal(t, distances.argmin(axis=1))
     refiner = WaveletPreservation(convention=convention)
-    problem = refiner.prepare(x, y)
+    problem = refiner.prepare(Problem(x, y))
     objective = refiner.objective(problem, functional_map, t)
     np.testing.assert_allclose(objective, np.asarray(x.vertex_areas) @ distances.min(axis=1), rtol=1e-10)
     worse = refiner.objective(problem, functional_map, t.at[0].set((t[0] + 1) % 30))

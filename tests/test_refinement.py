@@ -12,11 +12,13 @@ import pytest
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline, FilterBank, Meyer
+from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import Refiner, WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
@@ -217,7 +219,7 @@ def test_history_is_what_it_says(pair):
         c = refine(x, y, start, iterations=i + 1).functional_map
         energy = refiner.problem(x, y).energy(maps[i])(c)
         np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
-        objective = refiner.objective(refiner.prepare(x, y), c, maps[i + 1])
+        objective = refiner.objective(refiner.prepare(Problem(x, y)), State(c), maps[i + 1])
         np.testing.assert_allclose(history.objective[i], objective, rtol=1e-9)
         np.testing.assert_array_equal(history.pointwise_maps[i], maps[i + 1])
     assert refine(x, y, start).history is None
@@ -247,14 +249,14 @@ def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
     for _ in range(3):
         t = decode(c, x.sample(samples_x), y.sample(samples_y))
         c = kernel * np.linalg.lstsq(x.eigenvectors[samples_x], y.eigenvectors[samples_y][t])[0]
-    refined = refine(x, y, start, iterations=4, samples_x=samples_x, samples_y=samples_y, history=True)
+    refined = refine(x, y, start, iterations=4, samples=(samples_x, samples_y), history=True)
     np.testing.assert_allclose(refined.functional_map, c, atol=1e-10)
     np.testing.assert_array_equal(refined.pointwise_map, decode(jnp.asarray(c), x, y))
     assert np.isnan(refined.history.changed[jnp.asarray([0, 3])]).all()
     assert np.isfinite(refined.history.changed[1:3]).all()
     assert refined.history.pointwise_maps is None
-    with pytest.raises(ValueError, match="both shapes"):
-        refine(x, y, start, samples_x=samples_x)
+    with pytest.raises((ValueError, TypeCheckError), match="samples"):
+        refine(x, y, start, samples=(samples_x,))
 
 
 def test_vmap_over_pairs_equals_a_loop():
@@ -355,7 +357,7 @@ def test_a_failure_sticks(pair):
 def test_too_few_samples_are_named(pair):
     x, y, start, _ = pair
     few = jnp.arange(5)
-    refined = refine(x, y, start, samples_x=few, samples_y=few)
+    refined = refine(x, y, start, samples=(few, few))
     assert refined.result == RESULTS.nonfinite_functional_map
 
 
@@ -385,9 +387,9 @@ def test_a_new_refiner_plugs_in(pair):
     """Spectral ICP's half-step in place of the filter: the loop knows nothing of wavelets."""
 
     class Orthogonal(WaveletPreservation):
-        def update(self, problem, pointwise_map, previous):
-            u, _, vt = jnp.linalg.svd(encode(pointwise_map, problem.spectrum_x, problem.spectrum_y))
-            return u @ vt, RESULTS.successful
+        def update(self, prepared, pointwise_map, previous):
+            u, _, vt = jnp.linalg.svd(encode(pointwise_map, prepared.spectrum_x, prepared.spectrum_y))
+            return State(u @ vt), RESULTS.successful
 
     x, y, start, truth = pair
     assert issubclass(Orthogonal, Refiner)
@@ -446,8 +448,8 @@ for call in (
     lambda: Registration(35),
     lambda: print(Registration(tuple(np.array([35, 60]))).levels, Stage(iterations=np.int64(2)).iterations),
     lambda: Stage(iterations=True),
-    lambda: Stage(mending="accurate"),
-    lambda: refine(x, x, start, samples_x=[1], samples_y=[1]),
+    lambda: jaxsmw.Preset((Stage(),), repair="accurate"),
+    lambda: refine(x, x, start, samples=([1], [1])),
     lambda: jaxsmw.compute_spectrum("mesh.off", 3),
     lambda: jaxsmw.match("mesh.off", "mesh.off"),
     lambda: jaxsmw.compute_spectrum(jaxsmw.make_mesh(np.eye(3), [[0, 1, 2]]), 2, laplacian="Robust"),
@@ -465,7 +467,7 @@ def test_what_is_of_another_kind_is_named():
         [sys.executable, "-c", _OF_ANOTHER_KIND], check=True, capture_output=True, text=True
     )
     assert said.stdout.splitlines() == [
-        "the refiner is <class 'jaxsmw.core.refinement.WaveletPreservation'>, but a Refiner is needed",
+        "the refiner is <class 'jaxsmw.core.refiners.wavelet_preservation.WaveletPreservation'>, but a Refiner is needed",
         "the refiner is 'paper', but a Refiner is needed",
         "the spectrum of Y is None, but a Spectrum is needed",
         "the initial map is list, but an array is needed",
@@ -475,7 +477,7 @@ def test_what_is_of_another_kind_is_named():
         "the levels are 35, but a tuple of whole numbers is needed",
         "(35, 60) 2",
         "iterations is True; give a whole number.",
-        "mending is 'accurate'; give a Stage.",
+        "repair is 'accurate'; give RepairSettings.",
         "the samples of X is list, but an array is needed",
         "the mesh is 'mesh.off', but a Mesh is needed",
         "source mesh: 'mesh.off' is the name of a file: read it with jaxsmw.read_mesh first.",

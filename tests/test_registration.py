@@ -10,9 +10,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiner import Problem
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration, _nearest_rotations
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
@@ -93,13 +95,13 @@ def test_is_what_its_definition_says(pair, number_of_descriptors):
     x, y, start, *_ = pair
     if number_of_descriptors:
         generator = np.random.default_rng(2)
-        x, y = (s.describe(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
+        x, y = (s.with_descriptors(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
     refiner = Registration((20,))
     found = refine(x, y, start, refiner=refiner, iterations=2, history=True)
     t, queries, database = defined(x, y, np.asarray(start), (20, K))
     np.testing.assert_array_equal(found.pointwise_map, t)
     for points, expected in zip(
-        refiner.embeddings(refiner.prepare(x, y), found.updated), (queries, database), strict=True
+        refiner.embeddings(refiner.prepare(Problem(x, y)), found.state), (queries, database), strict=True
     ):
         np.testing.assert_allclose(points, expected, atol=1e-8)
     distances = np.sum((queries - database[t]) ** 2, axis=1)
@@ -137,7 +139,7 @@ def test_a_body_that_only_moved_is_found_again(pair):
     assert found.result == RESULTS.successful
     np.testing.assert_array_equal(found.pointwise_map, truth)
     # Each lies where the other does.
-    queries, database = Registration().embeddings(Registration().prepare(x, y), found.updated)
+    queries, database = Registration().embeddings(Registration().prepare(Problem(x, y)), found.state)
     np.testing.assert_allclose(queries, np.asarray(database)[truth], atol=1e-6)
 
 
@@ -204,7 +206,7 @@ def test_signs_and_padding_and_vmap(pair):
 
 def test_patches_find_the_same(pair):
     x, y, start, *_ = pair
-    x, y = (s.describe(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
+    x, y = (s.with_descriptors(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
     maps = [
         refine(x, y, start, refiner=Registration(search=search)).pointwise_map
         for search in ("exhaustive", "patches")
@@ -216,7 +218,7 @@ def test_samples_ask_and_all_vertices_answer(pair):
     x, y, start, truth, _ = pair
     generator = np.random.default_rng(1)
     samples = [jnp.asarray(generator.choice(len(truth), 300, replace=False)) for _ in "xy"]
-    found = refine(x, y, start, refiner=Registration((20,)), samples_x=samples[0], samples_y=samples[1])
+    found = refine(x, y, start, refiner=Registration((20,)), samples=(samples[0], samples[1]))
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
 
 
@@ -228,8 +230,8 @@ def test_a_part_keeps_its_size(pair):
     part = make_mesh(mesh.vertices[used], faces.reshape(-1, 3))
     y = compute_spectrum(part, 10).scale(part.area / mesh.area)
     spread = []
-    for refiner in (Registration(partial=True), Registration()):
-        prepared = refiner.prepare(x, y).prepared
+    for partial in (True, False):
+        prepared = Registration().prepare(Problem(x, y, partial=partial))
         positions = np.asarray(prepared.all_x.points)[used, :3], np.asarray(prepared.all_y.points)[:, :3]
         spread.append([np.linalg.norm(points[1:] - points[:-1], axis=1) for points in positions])
     np.testing.assert_allclose(spread[0][1], spread[0][0], rtol=1e-9)
@@ -242,7 +244,7 @@ def test_float32_stays_float32_and_agrees(pair):
         jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, s) for s in (x, y)
     ]
     found = refine(*single, start, refiner=Registration((20, 40)), iterations=4)
-    assert {leaf.dtype for leaf in jax.tree.leaves(found.updated)} == {
+    assert {leaf.dtype for leaf in jax.tree.leaves(found.state)} == {
         np.dtype(np.float32),
         np.dtype(np.int32),
     }
@@ -266,18 +268,18 @@ def test_nothing_but_constants_to_go_by(pair):
 def test_what_cannot_work_is_refused(pair):
     x, y, start, *_ = pair
     bare = Spectrum(y.eigenvalues, y.eigenvectors, y.vertex_areas, y.mask)
-    with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.place"):
+    with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.with_positions"):
         refine(x, bare, start, refiner=Registration())
-    placed = refine(x, bare.place(y.positions, y.normals), start, refiner=Registration())
+    placed = refine(x, bare.with_positions(y.positions, y.normals), start, refiner=Registration())
     np.testing.assert_array_equal(
         placed.pointwise_map, refine(x, y, start, refiner=Registration()).pointwise_map
     )
-    with pytest.raises(ValueError, match="X has 2 descriptors and Y 0"):
-        refine(x.describe(x.eigenvectors[:, :2]), y, start, refiner=Registration())
-    with pytest.raises(ValueError, match="needs an eigenvector"):
+    with pytest.raises(ValueError, match="X has 2 descriptors and Y has 0"):
+        refine(x.with_descriptors(x.eigenvectors[:, :2]), y, start, refiner=Registration())
+    with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         Registration((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):
         Registration(search="quick")
-    broken = x.place(x.positions.at[3, 1].set(jnp.nan), x.normals)
+    broken = x.with_positions(x.positions.at[3, 1].set(jnp.nan), x.normals)
     found = refine(broken, y, start, refiner=Registration())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()

@@ -24,9 +24,9 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from synthetic import grid_mesh, random_spectrum, sphere_mesh
 
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.functional_map import encode
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum

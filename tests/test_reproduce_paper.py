@@ -1,4 +1,4 @@
-"""The paper's comparisons as one command: what it derives, measures and says when something fails."""
+"""The comparisons of the paper as one command: derived data sets, results, and reports of failures."""
 
 import re
 import shutil
@@ -15,14 +15,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import reproduce_paper
 
 from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents.opponents import METHODS
+from jaxsmw.evaluation.opponents.registry import METHODS
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    """Three poses of no body at all, laid out like a remeshed set beside something that is none."""
+    """Three deformed bumpy spheres in the layout of a remeshed set, and a directory that is no data set."""
     directory = tmp_path_factory.mktemp("data")
     (directory / "papers").mkdir()
     (directory / "bumps" / "off").mkdir(parents=True)
@@ -36,7 +36,7 @@ def data(tmp_path_factory) -> Path:
     return directory
 
 
-def test_every_other_setting_is_a_setting_of_its_method():
+def test_every_changed_setting_belongs_to_its_method():
     found = reproduce_paper.other_settings()
     assert found["mwp: k = 200, iterations = 10"].iterations == 10
     assert found["mwp: k = 200, iterations = 10"].number_of_eigenvectors == 200
@@ -45,7 +45,7 @@ def test_every_other_setting_is_a_setting_of_its_method():
 
 
 @pytest.mark.parametrize("name", reproduce_paper.MESHINGS)
-def test_other_meshings_keep_the_truth(data, tmp_path, name):
+def test_other_meshes_keep_the_ground_truth(data, tmp_path, name):
     data_set = open_data_set(data / "bumps")
     pair = data_set.pairs[0]
     derived = reproduce_paper.derive(tmp_path, [pair], name, reproduce_paper.MESHINGS[name])
@@ -65,7 +65,7 @@ def test_other_meshings_keep_the_truth(data, tmp_path, name):
 
 @pytest.fixture
 def command(tmp_path, monkeypatch):
-    """The command in this process, with two methods; gives its exit code."""
+    """Runs the command in this process with two methods, and returns its exit code."""
     some = {name: METHODS[name] for name in ("start", "mwp")}
     monkeypatch.setattr(reproduce_paper, "methods", lambda *_: some)
     monkeypatch.setattr(reproduce_paper, "open_executor", lambda *_: ThreadPoolExecutor(1))
@@ -90,7 +90,7 @@ def test_one_command_gives_all_tables(command, data, tmp_path, capsys):
     assert (tmp_path / "paper" / "table1" / "bumps" / "curves.png").stat().st_size > 1000
 
 
-def test_what_failed_is_said_after_all_the_rest(command, data, tmp_path, capsys):
+def test_failures_are_reported_at_the_end(command, data, tmp_path, capsys):
     for name in ("a", "b"):
         shutil.copytree(data / "bumps", tmp_path / "data" / name)
     for file in (tmp_path / "data" / "a" / "off").iterdir():

@@ -8,7 +8,6 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
 from jaxsmw.core.search import (
-    approximate_nearest_neighbor,
     make_patches,
     nearest_neighbor,
     nearest_neighbor_in_patches,
@@ -192,38 +191,3 @@ def test_search_in_patches_never_stores_all_distances():
     patches = [jax.eval_shape(partial(make_patches, size=s, rank=5), points, mask) for s in (128, 128)]
     memory = jax.jit(nearest_neighbor_in_patches).lower(points, points, *patches).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 200e6
-
-
-@pytest.mark.parametrize(("noise", "recall"), [(0.0, 0.99), (0.3, 0.9)])
-def test_approximate_search_rarely_misses(embedding, noise, recall):
-    """Of a good map, and of a poor one, whose points lie between lists."""
-    generator = np.random.default_rng(0)
-    turned, _ = np.linalg.qr(np.eye(30) + noise * generator.normal(size=(30, 30)) / np.sqrt(30))
-    database = jnp.asarray(embedding @ (turned * generator.uniform(0.1, 1, 30)))
-    mask = jnp.asarray(generator.random(len(database)) < 0.7)
-    found = jax.jit(approximate_nearest_neighbor)(embedding, database, database_mask=mask)
-    wanted = nearest_neighbor(embedding, database, database_mask=mask)
-    assert mask[found].all()
-    assert (found == wanted).mean() > recall
-    distances = [jnp.linalg.norm(embedding - database[rows], axis=1).mean() for rows in (found, wanted)]
-    np.testing.assert_allclose(*distances, rtol=0.005)
-
-
-def test_approximate_search_under_vmap_and_again(embedding):
-    both = jnp.stack([embedding, embedding * jnp.linspace(1, 0.1, 30)[None, :]])
-    looped = jnp.stack([approximate_nearest_neighbor(embedding, database) for database in both])
-    np.testing.assert_array_equal(jax.vmap(approximate_nearest_neighbor, (None, 0))(embedding, both), looped)
-
-
-def test_approximate_search_of_bad_numbers_finds_no_row(embedding):
-    found = approximate_nearest_neighbor(embedding, embedding.at[3, 4].set(jnp.nan))
-    np.testing.assert_array_equal(found, 2562)
-    found = approximate_nearest_neighbor(embedding.at[3, 4].set(jnp.nan), embedding)
-    assert found[3] == 2562 and (found[:3] < 2562).all()
-
-
-@pytest.mark.parametrize("rows", [1, 3, 10])
-def test_approximate_search_among_few(embedding, rows):
-    database = embedding[:rows]
-    found = approximate_nearest_neighbor(embedding, database)
-    assert (found == nearest_neighbor(embedding, database)).mean() > 0.9

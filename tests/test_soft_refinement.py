@@ -9,9 +9,10 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import Logarithm, Meyer, Warped
-from jaxsmw.core.functional_map import encode, wavelet_energy
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.banks import Logarithm, Meyer, Warped
+from jaxsmw.core.functional_map import WaveletProblem, encode
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
 from jaxsmw.core.soft_refinement import WaveletPreservationLayer, refine_softly
@@ -103,7 +104,8 @@ def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
     np.testing.assert_allclose(soft, hard, atol=1e-14)
     g = Meyer(4)(x.eigenvalues, x.eigenvalues)
     for norm in ("area", "frobenius"):
-        energies = (wavelet_energy(t, x, y, g, g, convention=convention, norm=norm) for t in (start, one))
+        problem = WaveletProblem(x, y, g, g, convention)
+        energies = (problem.energy(t, norm=norm) for t in (start, one))
         expected, found = (energy(hard) for energy in energies)
         np.testing.assert_allclose(found, expected)
 
@@ -420,7 +422,7 @@ def test_settings_that_do_not_exist(pair):
     with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
         refine_softly(x, y, start[:-3])
     short = Softmax()(x.eigenvectors[3:], y.eigenvectors, x.vertex_areas[3:], y.vertex_areas)
-    with pytest.raises(ValueError, match="maps 117 points to 120"):
+    with pytest.raises(ValueError, match="from 117 to 120 points, but the shapes have 120 and 120"):
         refine_softly(x, y, short)
     with pytest.raises(ValueError, match="Sinkhorn needs at least 1 iteration"):
         Sinkhorn(iterations=0)

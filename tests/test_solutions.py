@@ -9,10 +9,10 @@ from jax.test_util import check_grads
 from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
-from jaxsmw.core.banks.filters import CubicSpline, FilterBank, Meyer
-from jaxsmw.core.frames import frame_function
+from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer, frame_function
 from jaxsmw.core.functional_map import QuadraticEnergy
-from jaxsmw.core.refinement import WaveletPreservation, refine
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import (
     DescriptorPair,
@@ -81,12 +81,12 @@ def objective(c, pair, pointwise_map, weights, descriptors, *, convention="pullb
         total += weights["orthogonality"] * jnp.sum((gram - jnp.eye(len(gram))) ** 2)
     x_out = convention == "pullback"
     if weights["descriptor_preservation"]:
-        f_out, f_in = descriptors.coefficients_x, descriptors.coefficients_y
+        f_out, f_in = descriptors.x.coefficients, descriptors.y.coefficients
         f_out, f_in = (f_out, f_in) if x_out else (f_in, f_out)
         scale = k_out / jnp.sum(f_out**2)
         total += weights["descriptor_preservation"] * scale * jnp.sum((c @ f_in - f_out) ** 2)
     if weights["descriptor_commutativity"]:
-        d_out, d_in = descriptors.operators_x, descriptors.operators_y
+        d_out, d_in = descriptors.x.operators, descriptors.y.operators
         d_out, d_in = (d_out, d_in) if x_out else (d_in, d_out)
         scale = k_out / jnp.sum(d_out**2)
         commutators = sum(jnp.sum((c @ d_in[i] - d_out[i] @ c) ** 2) for i in range(D))
@@ -389,13 +389,14 @@ def test_descriptors_in_the_eigenbases(pair):
     coefficients = np.random.default_rng(0).normal(size=(K_X, 2))
     values = x.eigenvectors @ coefficients
     projected = DescriptorPair.project(values, values, x, x, operators=True)
-    np.testing.assert_allclose(projected.coefficients_x, coefficients, atol=1e-12)
+    np.testing.assert_allclose(projected.x.coefficients, coefficients, atol=1e-12)
     # Multiplication by a function, seen in the basis, is a symmetric matrix; by one it is the identity.
-    np.testing.assert_allclose(projected.operators_x, projected.operators_x.transpose(0, 2, 1), atol=1e-12)
+    operators = projected.x.operators
+    np.testing.assert_allclose(operators, operators.transpose(0, 2, 1), atol=1e-12)
     ones = jnp.ones((M, 1))
-    identity = DescriptorPair.project(ones, ones, x, x, operators=True).operators_x[0]
+    identity = DescriptorPair.project(ones, ones, x, x, operators=True).x.operators[0]
     np.testing.assert_allclose(identity, np.eye(K_X), atol=1e-12)
-    assert DescriptorPair.project(values, values, x, x).operators_x is None
+    assert DescriptorPair.project(values, values, x, x).x.operators is None
 
 
 def test_descriptors_alone_find_the_functional_map_of_a_copy(pair):

@@ -1,4 +1,4 @@
-"""Settings of modules: how they become arrays, and checks made when a module is built."""
+"""Conversions and checks of the settings of modules and functions."""
 
 from __future__ import annotations
 
@@ -6,37 +6,44 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
-Function = TypeVar("Function", bound=Callable)
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
-    """A continuous setting as an array of the default float type, so that it is traced."""
+    """Returns a continuous setting as an array of the default float type, so that JAX traces the setting."""
     return jnp.asarray(value, dtype=float)
 
 
-def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Whether there is neither NaN nor infinity in any array of a pytree."""
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """Returns whether all numbers in the floating-point arrays of a pytree are finite."""
     inexact = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """**Raises:** `ValueError` if the value of an option is none of the choices."""
+    """Checks an option that is one of several words.
+
+    **Raises:** `ValueError` if the value is not one of the choices.
+    """
     if value not in choices:
         raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
 
 
-def check_kind(name: str, value: Any, *kinds: type) -> None:
-    """**Raises:** `TypeError` if an argument is of none of these kinds."""
+def check_kind(name: str, value: object, *kinds: type) -> None:
+    """Checks the type of an argument.
+
+    **Raises:** `TypeError` if the value is not an instance of one of the kinds. The message names the first.
+    """
     if isinstance(value, kinds):
         return
     shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
@@ -48,46 +55,50 @@ def check_kind(name: str, value: Any, *kinds: type) -> None:
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Check a parameter; not its value while it is traced and has none yet.
+    """Checks a numerical parameter of a module. Only the shape of a traced parameter is checked.
 
-    **Raises:** `ValueError` if it has another number of dimensions, or is not finite and strictly between
-    the limits.
+    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if a number in the parameter
+    is not finite or not strictly between the limits.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
-    # On the host, because under jit even a comparison of constants is traced.
+    # The comparison uses NumPy because jit traces even comparisons of JAX constants.
     host = np.asarray(value)
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {limits}, not {host}")
 
 
-def counts_iterations(function: Function) -> Function:
-    """Let a compiled function take any integer as its `iterations`, and nothing else.
+def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """Decorates a compiled function so that `iterations` may be an integer of any type, but nothing else.
 
-    Outside of `equinox.filter_jit`, which would trace a NumPy integer.
+    The decorator belongs outside of `equinox.filter_jit`, which would trace a NumPy integer.
 
-    **Raises:** (by the function returned) `TypeError` for what is no integer, or has no value yet as it is
-    traced; `ValueError` for fewer than one.
+    **Raises:** The decorated function raises `TypeError` if `iterations` is not an integer or is traced, and
+    `ValueError` if it is below 1.
     """
 
     @functools.wraps(function, updated=())
-    def checked(*arguments: Any, **options: Any) -> Any:
+    def checked(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:
         if "iterations" in options:
-            given = options["iterations"]
-            try:
-                iterations = operator.index(given)
-            except TypeError:
-                raise TypeError(
-                    f"{function.__name__} needs a whole number of iterations that is known when it is "
-                    f"compiled, such as 3, not {given!r}"
-                ) from None
-            if iterations < 1:
-                raise ValueError(f"{function.__name__} needs at least 1 iteration, not {iterations}")
-            options["iterations"] = iterations
+            options["iterations"] = _whole_number(function.__name__, options["iterations"])
         return function(*arguments, **options)
 
-    return checked  # type: ignore[return-value]
+    return checked
+
+
+def _whole_number(caller: str, iterations: object) -> int:
+    """Returns the number of iterations as a Python integer; see `counts_iterations` for the errors."""
+    try:
+        number = operator.index(iterations)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(
+            f"{caller} needs a whole number of iterations that is known when it is compiled, such as 3, "
+            f"not {iterations!r}"
+        ) from None
+    if number < 1:
+        raise ValueError(f"{caller} needs at least 1 iteration, not {number}")
+    return number

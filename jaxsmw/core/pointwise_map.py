@@ -1,19 +1,14 @@
-"""Functional maps read back as pointwise maps."""
+"""How a pointwise map is recovered from a functional map."""
 
 from __future__ import annotations
 
 import jax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.core.functional_map import Convention
+from jaxsmw.choices import Search
+from jaxsmw.core.functional_map import Convention, out_and_in
 from jaxsmw.core.products import product
-from jaxsmw.core.search import (
-    Patches,
-    approximate_nearest_neighbor,
-    make_patches,
-    nearest_neighbor,
-    nearest_neighbor_in_patches,
-)
+from jaxsmw.core.search import Patches, make_patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 
@@ -25,18 +20,19 @@ def spectral_embeddings(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """The two point sets among which a functional map looks for nearest neighbours.
+    """Returns two point sets in which a vertex of X lies close to its match on Y.
 
-    Pullback: `Phi_X` and `Phi_Y C^T`. Pushforward: `Phi_X C^T` and `Phi_Y`. The choice is not innocent: a
-    filtered C shrinks what it maps. Shrunken *queries* (pushforward) all fall near the few database points
-    of small norm, which become hubs that attract everything; a shrunken *database* (pullback) keeps its
-    order as seen from any query. On real pairs this makes the difference between a good map and none.
+    The embeddings are `Phi_X` and `Phi_Y C^T` in the pullback convention, and `Phi_X C^T` and `Phi_Y` in the
+    pushforward convention. The convention matters because a filtered C shrinks the vectors that it maps. In
+    the pushforward convention the *queries* shrink. They all come close to the few database points of small
+    norm, which become hubs that attract most queries. In the pullback convention the *database* shrinks, but
+    seen from any query its order stays the same. On real pairs, pullback maps are good and pushforward maps
+    fail.
 
-    **Returns:** One row per vertex of X (the queries), one per vertex of Y (the database).
+    **Returns:** The queries, one row per vertex of X, and the database, one row per vertex of Y.
     """
-    if convention == "pullback":
-        return spectrum_x.eigenvectors, product(spectrum_y.eigenvectors, functional_map.T)
-    return product(spectrum_x.eigenvectors, functional_map.T), spectrum_y.eigenvectors
+    rows_out, rows_in = out_and_in(convention, spectrum_x.eigenvectors, spectrum_y.eigenvectors)
+    return out_and_in(convention, rows_out, product(rows_in, functional_map.T))
 
 
 def decode(
@@ -46,21 +42,21 @@ def decode(
     *,
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
-    approximate: bool = False,
 ) -> Int32[Array, " m"]:
-    """The pointwise map T: X -> Y of a functional map, by nearest neighbours (Algorithm 1, step 3).
+    """Returns the pointwise map T: X -> Y of a functional map, by nearest neighbours (Algorithm 1, step 3).
 
-    For each vertex of X the vertex of Y, masked ones excluded, that is nearest in `spectral_embeddings`;
-    found faster where `search_patches` of the two shapes are given, or nearly always if approximately
-    (`approximate_nearest_neighbor`).
+    T maps each vertex of X to the unmasked vertex of Y that is nearest in `spectral_embeddings`.
+
+    **Arguments:**
+
+    - `patches`: the `search_patches` of X and Y, which make the search faster on large shapes.
 
     **Returns:** One vertex of Y per vertex of X, (m,).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     if patches is not None:
         return nearest_neighbor_in_patches(queries, database, *patches)
-    search = approximate_nearest_neighbor if approximate else nearest_neighbor
-    return search(queries, database, database_mask=spectrum_y.mask)
+    return nearest_neighbor(queries, database, database_mask=spectrum_y.mask)
 
 
 def decode_to_triangles(
@@ -71,29 +67,29 @@ def decode_to_triangles(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """The map X -> Y of a functional map, to points anywhere on the triangles of Y.
+    """Returns the map X -> Y of a functional map, to points anywhere on the triangles of Y.
 
-    Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017: for each vertex of X the point
-    nearest in `spectral_embeddings`, where those of Y's vertices are joined by Y's triangles. Neighbours on a
-    fine X need not share a vertex of a coarse Y, so that what is carried along the map, such as a texture,
-    comes out smooth. Takes about as long as ten searches of all by `decode`, a second for 5000 vertices, and
-    grows like them with the product of the sizes.
+    Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The triangles of Y span a
+    surface in the `spectral_embeddings` of Y. Each vertex of X is mapped to the nearest point of this
+    surface. Neighbouring vertices of a fine X need not share a vertex of a coarse Y, so that textures and
+    other functions stay smooth when the map transfers them. The time is about ten times that of an exhaustive
+    `decode`: a second for 5000 vertices, growing with the product of the sizes.
 
     **Arguments:**
 
     - `faces_y`: the triangles of Y.
 
-    **Returns:** A face of Y for each vertex of X (m,), and barycentric weights (m, 3) for its corners.
+    **Returns:** A face of Y for each vertex of X (m,), and the barycentric weights (m, 3) of its corners.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_point_on_triangles(queries, database, faces_y)
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Patches of both shapes for `decode`, whatever the functional map.
+    """Returns patches of both shapes for `decode`. The same patches serve all functional maps.
 
-    Those of Y grow with the square root of its number of vertices, which balances the work for each patch
-    with that for its points; so the search takes about the power 1.5 of the number of vertices.
+    The patches of Y grow with the square root of its number of vertices. Then the work per patch and the work
+    per point are balanced, and the time of a search grows with the number of vertices to the power 1.5.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
@@ -103,8 +99,13 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     )
 
 
-def chosen_patches(search: str, spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches] | None:
-    """`search_patches` where a method is to search `"patches"`, or `"auto"` and they pay; None elsewhere."""
+def chosen_patches(
+    search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> tuple[Patches, Patches] | None:
+    """Returns the `search_patches` of a `search` setting, or None for an exhaustive search.
+
+    The setting `"patches"` always uses patches. `"auto"` uses patches where they are faster.
+    """
     sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
     pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
     if search == "patches" or (search == "auto" and pays):
@@ -112,8 +113,10 @@ def chosen_patches(search: str, spectrum_x: Spectrum, spectrum_y: Spectrum) -> t
     return None
 
 
-# From so many vertices on (in the geometric mean of both shapes) patches save more than compiling them takes.
+# Above this number of vertices (the geometric mean of both shapes), patches save more time than they take to
+# compile.
 _PATCHES_FROM = 15_000
-# Measured with scripts/benchmark_speed.py.
+# The best sizes as measured with scripts/benchmark_speed.py: vertices per patch of X, and the rank and size
+# of patches of Y.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

@@ -1,10 +1,10 @@
-"""The one matrix product of the core."""
+"""The matrix product that the core uses everywhere."""
 
 from functools import partial
 
 import jax.numpy as jnp
 from jax import lax
 
-# GPUs would otherwise multiply in less than float32: rankings and differences of squares would lose digits,
-# and singular systems pass for regular ones.
+# By default GPUs multiply in lower precision than float32. Rankings and differences of squares would then
+# lose digits, and singular systems would look regular.
 product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)

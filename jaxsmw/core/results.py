@@ -1,58 +1,61 @@
-"""How a computation ended: a value that travels through jit and vmap, with a sentence for each failure."""
+"""The outcome of a computation: a value for jit and vmap, with a sentence for each failure."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Bool
 
 
 class RESULTS(eqx.Enumeration):
-    """How a refinement ended; each failure carries the sentence to show a person."""
+    """The outcome of a refinement. `RESULTS[result]` is a sentence for the user."""
 
-    successful = "The refinement went through: all numbers are finite."
+    successful = "The refinement succeeded: all numbers are finite."
     nonfinite_spectrum = (
-        "A spectrum holds NaN or infinity, so nothing was refined; recompute it and check the mesh it is of."
+        "A spectrum contains NaN or infinite numbers, so no map was refined. Check the mesh of that spectrum "
+        "and compute the spectrum again."
     )
     invalid_initial_map = (
-        "The initial map names target vertices that do not exist or are masked, so nothing was refined; it "
-        "needs one index from 0 to n - 1 per source vertex."
+        "The initial map contains vertices of Y that do not exist or are masked, so no map was refined. Give "
+        "one index from 0 to n - 1 for each vertex of X."
     )
     nonfinite_functional_map = (
-        "The functional map, or what determines it, became NaN or infinite: look at the filter bank's "
-        "responses, the weights, the descriptors and, of soft maps, the temperature, which must be positive. "
-        "In float32 it can be overflow (scale the surfaces to area 1, or use float64); with the "
-        "least-squares pseudo-inverse it can be that there are fewer samples than eigenvectors, or samples "
-        "that do not tell the eigenvectors apart."
+        "The functional map became NaN or infinite. Check the responses of the filter bank, the weights, the "
+        "descriptors, and the temperature of soft maps, which must be positive. In float32 numbers can "
+        "overflow: scale the surfaces to area 1, or use float64. The least-squares pseudo-inverse needs at "
+        "least as many samples as eigenvectors, at vertices where the eigenvectors are linearly independent."
     )
     undetermined_functional_map = (
-        "Nothing determines a part of the functional map, to working precision: at an eigenvalue the frame "
-        "function of the filter bank (or, without wavelets, all that the descriptors hold) vanishes beside "
-        "its largest value. Use a bank that covers the whole spectrum (mostly the lowest band is missing, "
-        "for which a low-pass filter helps, or the highest), descriptors without their mean and of like "
-        "size, fewer eigenvectors, float64, or solution=Filtering(), which solves nothing."
+        "A part of the functional map is undetermined to working precision. With wavelets, the frame "
+        "function of the filter bank vanishes at an eigenvalue: use a filter bank that covers the whole "
+        "spectrum (usually the lowest band is missing, which a low-pass filter adds, or the highest band). "
+        "Without wavelets, the descriptors do not determine the map: use descriptors of zero mean and "
+        "similar size. In both cases fewer eigenvectors, float64 or solution=Filtering(), which solves no "
+        "system, may help."
     )
     singular_system = (
-        "The least-squares problem for the functional map is singular, to working precision: the pointwise "
-        "map reaches too few target vertices to tell the eigenvectors apart; use a better initial map, more "
-        "samples, fewer eigenvectors, float64, or solution=Filtering(), which solves nothing."
+        "The least-squares problem for the functional map is singular to working precision: the pointwise "
+        "map reaches too few vertices of Y to tell the eigenvectors apart. Use a better initial map, more "
+        "samples, fewer eigenvectors, float64, or solution=Filtering(), which solves no system."
     )
     fixed_point_not_reached = (
-        "The soft refinement did not come to rest, so that its implicit derivatives mean little; give it "
-        "more iterations, a larger tolerance or a higher temperature, or differentiate through iterations."
+        "The soft refinement did not reach a fixed point, so its implicit derivatives are unreliable. Use "
+        "more iterations, a larger tolerance or a higher temperature, or differentiate through the "
+        "iterations."
     )
     solver_not_converged = (
-        "The iterative solver for the functional map did not reach its tolerance; give it more max_steps, a "
+        "The iterative solver for the functional map did not reach its tolerance. Use more max_steps, a "
         "larger tolerance, float64, or smaller weights for orthogonality and commutativity."
     )
 
 
-def where(condition: Bool[Array, ""] | bool, if_true: Any, if_false: Any) -> Any:
-    """One result or the other. Type checkers take the members of an Enumeration for plain strings."""
-    return RESULTS.where(condition, if_true, if_false)
+def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
+    """Returns one of two results, depending on a condition.
+
+    `str` is in the types because type checkers take the members of an Enumeration for strings.
+    """
+    return RESULTS.where(condition, if_true, if_false)  # type: ignore[arg-type]
 
 
 def sentence(result: RESULTS) -> str:
-    """What a result means, for a person."""
+    """Returns the sentence that explains a result to the user."""
     return RESULTS[result]  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Nearest neighbours: exact, among all rows or leaving out most of them; and approximate."""
+"""Exact nearest neighbours: by comparison with all points, or by patches, most of which can be skipped."""
 
 from __future__ import annotations
 
@@ -16,12 +16,17 @@ from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
 from jaxsmw.core.products import product
 
-# Queries scored at once, and database rows per chunk. Measured on two CPU cores (scripts/benchmark_speed.py):
-# a block of scores has to stay in the cache, and a maximum over a chunk vectorises where an argmax does not.
+# The number of queries per block and of database rows per chunk, measured on two CPU cores with
+# scripts/benchmark_speed.py. The scores of a block have to fit into the cache. A maximum over a chunk is
+# vectorised, an argmax is not.
 _BLOCK = 128
 _CHUNK = 64
-# In how long runs maxima are taken of chunks, and in how many parts of boxes.
+# Maxima over chunks are computed in runs of this length, maxima over boxes in this number of parts.
 _RUN, _PARTS = 8, 16
+# Patches are compact in this number of coordinates, and their directions settle in this number of iterations.
+_COORDINATES, _POWER_ITERATIONS = 6, 4
+# The number of patches per step of the search. One matrix product compares a block with this many patches.
+_GROUP = 4
 
 
 def nearest_neighbor(
@@ -30,18 +35,18 @@ def nearest_neighbor(
     *,
     database_mask: Bool[Array, " n"] | None = None,
 ) -> Int32[Array, " m"]:
-    """For every query the index of the nearest database row, exactly, in Euclidean distance.
+    """Returns the index of the database row that is nearest to each query, exactly, in Euclidean distance.
 
-    Ties go to the lowest index. Queries are searched in blocks, so that nothing of size m x n is ever
-    stored. Within a block two levels keep the work near that of the matrix product alone: the best score
-    of every chunk of database rows, then the best rows of the two best chunks, of which the true
-    distances decide. (Scores `q·b - |b|²/2` lose digits where `|b|` is large against the distance: in
-    float32 the second candidate is what makes the result agree with an exact search.)
+    Ties go to the lowest index. The queries are searched in blocks, so that no array of size m x n is stored.
+    Within a block, two levels keep the work close to that of the matrix product alone: the best score of
+    every chunk of database rows, then the best rows of the two best chunks. The true distances decide between
+    these two rows. (The scores `q·b - |b|²/2` lose digits if `|b|` is large compared to the distance. In
+    float32 the second candidate makes the result agree with an exact search.)
 
     **Arguments:**
 
     - `queries`, `database`: points in d dimensions.
-    - `database_mask`: rows with False are never chosen. If all are False the result is meaningless.
+    - `database_mask`: False for rows that are never chosen. If all are False, the result is meaningless.
     """
     n = database.shape[0]
     chunks = -(-n // _CHUNK)
@@ -53,7 +58,7 @@ def nearest_neighbor(
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         products = product(rows, block.T)
-        # Queries last: a maximum over chunks then runs over them side by side.
+        # With the queries last, a maximum over chunks is computed for neighbouring queries at once.
         scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, _BLOCK)
         chunk_scores = _maximum(scores, 1, _CHUNK // _RUN)
         best_chunks = _two_best(chunk_scores)
@@ -70,7 +75,10 @@ def in_blocks(
     queries: Float[Array, "m d"],
     size: int,
 ) -> Shaped[Array, "m ..."]:
-    """What a search finds for all queries, given to it so many at a time; to the last zeros are added."""
+    """Returns the results of a search for all queries. The search gets blocks of `size` queries.
+
+    The last block is padded with zeros.
+    """
     m, d = queries.shape
     blocks = -(-m // size)
     padded = jnp.pad(queries, ((0, blocks * size - m), (0, 0)))
@@ -79,19 +87,19 @@ def in_blocks(
 
 
 def _maximum(values: Array, axis: int, parts: int) -> Array:
-    """The maximum along an axis, first of so many parts of it side by side: on CPUs a tenth faster.
+    """Returns the maximum along an axis. The axis is first folded into parts, which saves a tenth on CPUs.
 
-    Parts may overlap.
+    The parts may overlap.
     """
     size = values.shape[axis]
     width = -(-size // parts)
     starts = (min(part * width, size - width) for part in range(parts))
-    pieces = (lax.slice_in_dim(values, start, start + width, axis=axis) for start in starts)
-    return jnp.max(functools.reduce(jnp.maximum, pieces), axis=axis)
+    folded = (lax.slice_in_dim(values, start, start + width, axis=axis) for start in starts)
+    return jnp.max(functools.reduce(jnp.maximum, folded), axis=axis)
 
 
 def _two_best(scores: Float[Array, "s block"]) -> Int[Array, "2 block"]:
-    """Which of some scores are the largest and the second largest of each query."""
+    """Returns the indices of the largest and the second largest score of each query."""
     first = jnp.argmax(scores, axis=0)
     is_first = jnp.arange(scores.shape[0])[:, None] == first[None, :]
     return jnp.stack([first, jnp.argmax(jnp.where(is_first, -jnp.inf, scores), axis=0)])
@@ -104,7 +112,7 @@ def _nearest(
     masked: Bool[Array, "c block"],
     n: int,
 ) -> Int[Array, " block"]:
-    """The row of each query's nearest candidate by true distance, the lowest of equals; n if all are NaN."""
+    """Returns the row of the candidate nearest to each query, the lowest row of equals, n if all are NaN."""
     distances = jnp.sum((queries[None, :, :] - candidates) ** 2, axis=2)
     distances = jnp.where(masked, jnp.inf, distances)
     nearest = jnp.min(distances, axis=0, keepdims=True)
@@ -112,17 +120,17 @@ def _nearest(
 
 
 class Patches(eqx.Module):
-    """Points that lie close together, in groups of equal size.
+    """Groups of equal size of points that lie close together.
 
-    On a surface a patch of neighbouring vertices varies, in spectral embedding, along few directions: the
-    eigenfunctions are smooth, and the patch is small against their wavelengths.
+    On a surface, a patch of neighbouring vertices varies along few directions in its spectral embedding,
+    because the eigenfunctions are smooth and the patch is small compared to their wavelengths.
 
     **Attributes:**
 
-    - `rows`: (p, s), the points of each patch, ascending; where masked, padding.
-    - `mask`: (p, s), False for padding and for points that were masked.
-    - `variations`: (p, r, s), combinations of a patch's points that give the r directions in which it
-      varies most.
+    - `rows`: (p, s), the indices of the points of each patch, ascending; padding where masked.
+    - `mask`: (p, s), False for padding and for masked points.
+    - `variations`: (p, r, s), linear combinations of the points of a patch. They give the r directions in
+      which the patch varies most.
     """
 
     rows: Int32[Array, "p s"]
@@ -131,21 +139,39 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Halve points, again and again, along the one of their first coordinates in which they vary most.
+    """Divides points into patches: halves all groups repeatedly, along the coordinate of largest variance.
+
+    Only the first coordinates of the points are considered.
 
     **Arguments:**
 
-    - `points`: for surfaces their eigenvectors, whose first ones are coordinates along the body.
-    - `mask`: False for points that do not count.
-    - `size`: wanted number of points in a patch; from 0.7 to 1.4 times as many are taken.
-    - `rank`: number of `variations`; queries need none.
+    - `points`: the points. For surfaces these are the eigenvectors, whose first columns are coordinates along
+      the body.
+    - `mask`: False for points to be ignored.
+    - `size`: the wanted number of points per patch. Patches have 0.7 to 1.4 times as many.
+    - `rank`: the number r of `variations`. Patches of queries need none.
     """
     n = points.shape[0]
     levels = max(0, round(math.log2(n / size)))
     width = -(-n // 2**levels)
     total = width * 2**levels
-    coordinates = jnp.pad(points[:, :_ORDERED_BY], ((0, total - n), (0, 0)))
-    mask = jnp.pad(mask, (0, total - n))
+    rows = _halved(
+        jnp.pad(points[:, :_COORDINATES], ((0, total - n), (0, 0))), jnp.pad(mask, (0, total - n)), levels
+    )
+    valid = jnp.pad(mask, (0, total - n))[rows]
+    # Ascending rows let the first of several equals be the lowest. Padding comes last.
+    rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
+    rows = jnp.minimum(rows, n - 1)
+    if rank == 0:
+        return Patches(rows, valid, jnp.zeros((len(rows), 0, width), points.dtype))
+    return Patches(rows, valid, _variations(points[rows], valid, rank))
+
+
+def _halved(
+    coordinates: Float[Array, "total c"], mask: Bool[Array, " total"], levels: int
+) -> Int32[Array, " total"]:
+    """Returns the order of points in which each of 2^levels equal parts of the order is a patch."""
+    total, dtype = coordinates.shape[0], coordinates.dtype
 
     def halve(level: Int[Array, ""], rows: Int32[Array, " total"]) -> Int32[Array, " total"]:
         group = jnp.arange(total) // (total >> level)
@@ -154,48 +180,42 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
         def sums(values: Float[Array, "total ..."]) -> Float[Array, "groups ..."]:
             return jax.ops.segment_sum(values, group, 2**levels, indices_are_sorted=True)
 
-        counts = jnp.maximum(sums(valid.astype(points.dtype)), 1)[:, None]
+        counts = jnp.maximum(sums(valid.astype(dtype)), 1)[:, None]
         means = sums(jnp.where(valid[:, None], here, 0)) / counts
         squares = sums(jnp.where(valid[:, None], (here - means[group]) ** 2, 0))
         along = here[jnp.arange(total), jnp.argmax(squares, axis=1)[group]]
         _, _, ordered = lax.sort([group, jnp.where(valid, along, jnp.inf), rows], num_keys=2)
         return ordered
 
-    # One sort to compile, whatever the number of levels.
-    rows = lax.fori_loop(0, levels, halve, jnp.arange(total, dtype=jnp.int32))
-    valid = mask[rows]
-    # Ascending, so that the first of equals in a patch is the lowest; padding comes last.
-    rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
-    rows = jnp.minimum(rows, n - 1)
-    if rank == 0:
-        return Patches(rows, valid, jnp.zeros((len(rows), 0, width), points.dtype))
-    _, deviations = _centered(points[rows], valid)
+    # The loop compiles one sort, whatever the number of levels.
+    return lax.fori_loop(0, levels, halve, jnp.arange(total, dtype=jnp.int32))
+
+
+def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: int) -> Float[Array, "p r s"]:
+    """Returns the `variations` of patches by power iteration."""
+    _, deviations = _centered(points, mask)
     products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 
-    def settle(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
+    def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The first coordinate of a surface, constant, says nothing of where on a patch a point is: it comes last.
-    d = points.shape[1]
+    # The first coordinate of a surface is constant and does not distinguish points, so it comes last.
+    _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
-    return Patches(rows, valid, lax.fori_loop(0, _POWER_ITERATIONS, settle, start))
-
-
-# Coordinates that patches are compact in, and turns in which their directions settle.
-_ORDERED_BY, _POWER_ITERATIONS = 6, 4
+    return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)
 
 
 def _centered(
     points: Float[Array, "p s d"], mask: Bool[Array, "p s"]
 ) -> tuple[Float[Array, "p d"], Float[Array, "p s d"]]:
-    """The mean of each group, and what its points are away from it, zero where masked."""
+    """Returns the mean of each group, and the deviations of its points from the mean, zero where masked."""
     counts = jnp.maximum(jnp.sum(mask, axis=1), 1).astype(points.dtype)
     center = jnp.sum(jnp.where(mask[..., None], points, 0), axis=1) / counts[:, None]
     return center, jnp.where(mask[..., None], points - center[:, None, :], 0)
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """For each group vectors of length 1, at right angles, that span the same and perhaps more."""
+    """Returns orthonormal vectors for each group, whose span contains the given vectors."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -205,20 +225,21 @@ def nearest_neighbor_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> Int32[Array, " m"]:
-    """The same as `nearest_neighbor`, and as exact, for points that patches describe well.
+    """Returns the same rows as `nearest_neighbor`, faster if patches describe the points well.
 
-    A patch of the database lies in a box: r axes through its center, plus a distance that no point of it
-    exceeds from the space that they span. From that follows how near to a query any of its points can be,
-    at the price of r + 1 products for the whole patch. The most promising patch gives a candidate; only
-    patches that could hold something nearer, to any query of a patch, are searched. Bounds allow for
-    rounding. Where points are spread evenly in all dimensions, all patches are, at more cost than by
-    `nearest_neighbor`.
+    A patch of the database lies in a box: r axes through the centre of the patch, and the largest distance of
+    its points from the space that the axes span. The box gives a lower bound on the distance from a query to
+    all points of the patch, for the price of r + 1 products. The patch with the smallest bound gives a first
+    candidate. Then the search skips all patches that cannot hold a nearer point for any query of a patch of
+    queries. The bounds allow for rounding, so that the result is exact. If the points are spread evenly in
+    all dimensions, no patch is skipped, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
     - `queries`, `database`: points in d dimensions.
-    - `query_patches`, `database_patches`: `make_patches` of them, or of what they are a linear image of.
-      Points that are masked there are never chosen, and what is found for such queries means nothing.
+    - `query_patches`, `database_patches`: the `make_patches` of these points, or of points from which these
+      points follow by a linear map. Masked points of the database are never chosen. The results for masked
+      queries are meaningless.
     """
     found, _ = search_in_patches(queries, database, query_patches, database_patches)
     return found
@@ -230,78 +251,35 @@ def search_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> tuple[Int32[Array, " m"], Int32[Array, " p"]]:
-    """`nearest_neighbor_in_patches`, and how many patches of the database each one of the queries needed."""
-    queries, database = lax.stop_gradient((queries, database))  # whole numbers have no derivatives
+    """Returns `nearest_neighbor_in_patches`, and the number of searched patches for each patch of queries."""
+    queries, database = lax.stop_gradient((queries, database))  # indices have no derivatives
     boxes = _boxes(database, database_patches)
-    patches, size, d = boxes.points.shape
-    rank = boxes.low.shape[1]
-    axes = jnp.concatenate([jnp.swapaxes(boxes.axes, 0, 1).reshape(rank * patches, d), boxes.center])
-    offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
-    center_norms = jnp.sum(boxes.center**2, axis=1)
-    low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # Sums of d products, and the dozen operations that are made of them, each rounded.
-    precision = 2 * (d + 12) * jnp.finfo(queries.dtype).eps
-    radius = boxes.radius * (1 + precision)
-    steps = -(-patches // _GROUP)
+    tables = _bound_tables(boxes)
+    vertices = database_patches.rows.reshape(-1)
 
     def search(patch: tuple[Array, Array]) -> tuple[Int32[Array, " block"], Int32[Array, ""]]:
         block, counts = queries[patch[0]], patch[1]
-        each = jnp.arange(block.shape[0])
-        products = product(axes, block.T)
-        norms = center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
-        squared = norms - 2 * products[rank * patches :]
-        along = []
-        for i in range(rank):  # a sum over an array's axis would not be vectorised
-            along.append(products[i * patches : (i + 1) * patches] - offsets[i, :, None])
-            outside = along[i] - jnp.clip(along[i], low[i], high[i])
-            squared = squared + (outside**2 - along[i] ** 2)
-        squared = jnp.where(boxes.counts[:, None], squared, jnp.inf)
-        bounds = jnp.sqrt(jnp.maximum(squared - precision * norms, 0)) - radius[:, None]
-
-        smallest = -_maximum(-squared, 0, _PARTS)  # and then where, which is three times as fast as argmin
-        is_smallest = squared == smallest[None, :]
-        promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)
-        there = jnp.stack([axis[promising, each] for axis in along], axis=1)
-        beside = jnp.sum((boxes.local[promising] - there[:, None, :]) ** 2, axis=2)
-        beside = jnp.where(jnp.isinf(boxes.half_norms[promising]), jnp.inf, beside)
-        candidates = boxes.points[promising, jnp.argmin(beside, axis=1)]
-        reach = jnp.sqrt(jnp.sum((block - candidates) ** 2, axis=1)) * (1 + precision)
+        squared, bounds, along = _bounds(tables, block, boxes.counts)
+        reach = _distance_to_promising_patch(boxes, block, squared, along) * (1 + tables.precision)
         needed = jnp.any((bounds <= reach[None, :]) & counts[None, :], axis=1)
-        listed = jnp.nonzero(needed, size=steps * _GROUP, fill_value=patches)[0].astype(jnp.int32)
-
-        def look(state: _Found) -> _Found:
-            group = lax.dynamic_slice(listed, (state.step * _GROUP,), (_GROUP,))
-            points = boxes.points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
-            half_norms = boxes.half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
-            scores = product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
-            merged = jnp.concatenate([state.scores, jnp.max(scores, axis=1)])
-            best = _two_best(merged)
-            fresh = jnp.maximum(best - 2, 0)
-            rows = group[fresh] * size + jnp.argmax(scores[fresh, :, each[None, :]], axis=2).astype(jnp.int32)
-            rows = jnp.where(best < 2, jnp.take_along_axis(state.rows, jnp.minimum(best, 1), axis=0), rows)
-            return _Found(state.step + 1, jnp.take_along_axis(merged, best, axis=0), rows)
-
-        nothing = jnp.full((2, block.shape[0]), -jnp.inf, queries.dtype)
-        start = _Found(jnp.asarray(0, jnp.int32), nothing, jnp.full(nothing.shape, 0, jnp.int32))
+        rows, masked = _two_best_rows(boxes, block, needed)
+        points = boxes.points.reshape(-1, boxes.points.shape[2])[rows]
         number = jnp.sum(needed, dtype=jnp.int32)
-        found = lax.while_loop(lambda state: state.step * _GROUP < number, look, start)
-        points = boxes.points.reshape(patches * size, d)[found.rows]
-        vertices = database_patches.rows.reshape(-1)[found.rows]
-        return _nearest(block, points, vertices, jnp.isinf(found.scores), database.shape[0]), number
+        return _nearest(block, points, vertices[rows], masked, database.shape[0]), number
 
     found, numbers = lax.map(search, (query_patches.rows, query_patches.mask))
-    # Padding and masked queries are written nowhere.
+    # Rows of padding and masked queries are out of range, so that the scatter drops them.
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
     kept = jnp.where(query_patches.mask, query_patches.rows, queries.shape[0])
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
 
 
-# Patches searched in one step: enough for a product that is worth its while.
-_GROUP = 4
-
-
 class _Boxes(NamedTuple):
-    """Where each patch is: within `radius` of a box along orthonormal `axes` through its `center`."""
+    """The location of each patch: within `radius` of a box along orthonormal `axes` through its `center`.
+
+    `local` holds the coordinates of the points along the axes, `low` and `high` their range. `counts` is
+    False for patches without points.
+    """
 
     points: Float[Array, "p s d"]
     half_norms: Float[Array, "p s"]
@@ -315,6 +293,7 @@ class _Boxes(NamedTuple):
 
 
 def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
+    """Returns the boxes of all patches of a database."""
     points = database[patches.rows]
     half_norms = jnp.where(patches.mask, 0.5 * jnp.sum(points**2, axis=2), jnp.inf)
     center, deviations = _centered(points, patches.mask)
@@ -326,60 +305,111 @@ def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
     return _Boxes(points, half_norms, center, axes, local, low, high, radius, jnp.any(patches.mask, axis=1))
 
 
+class _BoundTables(NamedTuple):
+    """The boxes of all patches, arranged so that one matrix product gives all bounds.
+
+    `axes` holds the first axes of all patches, then their second axes and so on, and the centers last.
+    """
+
+    axes: Float[Array, "rows d"]
+    offsets: Float[Array, "r p"]
+    center_norms: Float[Array, " p"]
+    low: Float[Array, "r p 1"]
+    high: Float[Array, "r p 1"]
+    radius: Float[Array, " p"]
+    precision: np.floating
+
+
+def _bound_tables(boxes: _Boxes) -> _BoundTables:
+    """Returns the tables that `_bounds` needs."""
+    patches, rank, d = boxes.axes.shape
+    axes = jnp.concatenate([jnp.swapaxes(boxes.axes, 0, 1).reshape(rank * patches, d), boxes.center])
+    offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
+    center_norms = jnp.sum(boxes.center**2, axis=1)
+    low, high = boxes.low.T[..., None], boxes.high.T[..., None]
+    # A bound is made of sums of d products and about a dozen operations. Each of them rounds.
+    precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
+    return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
+
+
+def _bounds(
+    tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
+) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
+    """Returns how far each query of a block is from each patch.
+
+    **Returns:** The squared distances to the boxes without their radius, lower bounds on the distances to the
+    points, and the coordinates of the queries along each axis.
+    """
+    rank, patches = tables.offsets.shape
+    products = product(tables.axes, block.T)
+    norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
+    squared = norms - 2 * products[rank * patches :]
+    along = []
+    for i in range(rank):  # XLA does not vectorise a sum over an axis of an array
+        along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
+        outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
+        squared = squared + (outside**2 - along[i] ** 2)
+    squared = jnp.where(counts[:, None], squared, jnp.inf)
+    bounds = jnp.sqrt(jnp.maximum(squared - tables.precision * norms, 0)) - tables.radius[:, None]
+    return squared, bounds, along
+
+
+def _distance_to_promising_patch(
+    boxes: _Boxes,
+    block: Float[Array, "block d"],
+    squared: Float[Array, "p block"],
+    along: list[Float[Array, "p block"]],
+) -> Float[Array, " block"]:
+    """Returns the distance from each query to one point of the nearest box.
+
+    The point is nearest in the coordinates along the axes of the box.
+    """
+    patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
+    # The smallest value and then its position take a third of the time of argmin.
+    smallest = -_maximum(-squared, 0, _PARTS)
+    is_smallest = squared == smallest[None, :]
+    promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)
+    there = jnp.stack([axis[promising, each] for axis in along], axis=1)
+    beside = jnp.sum((boxes.local[promising] - there[:, None, :]) ** 2, axis=2)
+    beside = jnp.where(jnp.isinf(boxes.half_norms[promising]), jnp.inf, beside)
+    candidates = boxes.points[promising, jnp.argmin(beside, axis=1)]
+    return jnp.sqrt(jnp.sum((block - candidates) ** 2, axis=1))
+
+
 class _Found(NamedTuple):
-    """The two best candidates of different patches so far, by score and by row among all patches' rows."""
+    """The two best candidates so far, from different patches: scores, and rows of the flattened patches."""
 
     step: Int32[Array, ""]
     scores: Float[Array, "2 block"]
     rows: Int32[Array, "2 block"]
 
 
-def approximate_nearest_neighbor(
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
-    *,
-    database_mask: Bool[Array, " n"] | None = None,
-) -> Int32[Array, " m"]:
-    """For nearly every query the index of the nearest database row, by FAISS on the host, in float32.
+def _two_best_rows(
+    boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
+) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
+    """Searches the needed patches, a few at a time, for two candidates per query from different patches.
 
-    Database rows in lists around k-means centers; of each query the lists of the four nearest centers are
-    searched (Jégou, Douze, Schmid, "Product quantization for nearest neighbor search", TPAMI 2011, without
-    the quantization). On spectral embeddings of surfaces, for a good map, 99.7 to 99.9 % of the queries find
-    the nearest row, the others one at nearly the same distance; for a poor map fewer do. Under `vmap`
-    examples are searched one after the other.
-
-    **Arguments:**
-
-    - `queries`, `database`: points in d dimensions.
-    - `database_mask`: rows with False are never chosen. If all are False the result is meaningless.
-
-    **Raises:** `ImportError` at the first search if FAISS is not installed (`pip install faiss-cpu`).
+    **Returns:** Rows of the flattened patches, and whether a candidate is masked or missing.
     """
-    queries, database = lax.stop_gradient((queries, database))  # whole numbers have no derivatives
-    if database_mask is None:
-        database_mask = jnp.ones(database.shape[0], bool)
-    shape = jax.ShapeDtypeStruct(queries.shape[:1], jnp.int32)
-    return jax.pure_callback(_search_lists, shape, queries, database, database_mask, vmap_method="sequential")
+    patches, size, d = boxes.points.shape
+    each = jnp.arange(block.shape[0])
+    steps = -(-patches // _GROUP)
+    listed = jnp.nonzero(needed, size=steps * _GROUP, fill_value=patches)[0].astype(jnp.int32)
 
+    def look(state: _Found) -> _Found:
+        group = lax.dynamic_slice(listed, (state.step * _GROUP,), (_GROUP,))
+        points = boxes.points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
+        half_norms = boxes.half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
+        scores = product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
+        merged = jnp.concatenate([state.scores, jnp.max(scores, axis=1)])
+        best = _two_best(merged)
+        fresh = jnp.maximum(best - 2, 0)
+        rows = group[fresh] * size + jnp.argmax(scores[fresh, :, each[None, :]], axis=2).astype(jnp.int32)
+        rows = jnp.where(best < 2, jnp.take_along_axis(state.rows, jnp.minimum(best, 1), axis=0), rows)
+        return _Found(state.step + 1, jnp.take_along_axis(merged, best, axis=0), rows)
 
-def _search_lists(queries: Array, database: Array, mask: Array) -> np.ndarray:
-    import faiss
-
-    allowed = np.flatnonzero(mask)
-    rows = np.ascontiguousarray(np.asarray(database)[allowed], np.float32)
-    if not np.isfinite(rows).all() or not len(rows):
-        return np.full(len(queries), len(mask), np.int32)  # no row, as the exact searches say
-    number = min(len(rows), round(_LISTS * len(rows) ** 0.5))
-    dimensions = rows.shape[1]
-    lists = faiss.IndexIVFFlat(faiss.IndexFlatL2(dimensions), dimensions, number)
-    lists.cp.niter, lists.cp.min_points_per_centroid = _TURNS, 1
-    lists.train(rows[:: max(1, len(rows) // (_PER_LIST * number))])
-    lists.add(rows)
-    lists.nprobe = _SEARCHED
-    _, found = lists.search(np.ascontiguousarray(queries, np.float32), 1)
-    # -1, the last here, is for queries that are no numbers.
-    return np.append(allowed, len(mask))[found[:, 0]].astype(np.int32)
-
-
-# Lists for each square root of the number of rows; how k-means goes to them; how many are searched.
-_LISTS, _TURNS, _PER_LIST, _SEARCHED = 3, 5, 40, 4
+    nothing = jnp.full((2, block.shape[0]), -jnp.inf, block.dtype)
+    start = _Found(jnp.asarray(0, jnp.int32), nothing, jnp.full(nothing.shape, 0, jnp.int32))
+    number = jnp.sum(needed, dtype=jnp.int32)
+    found = lax.while_loop(lambda state: state.step * _GROUP < number, look, start)
+    return found.rows, jnp.isinf(found.scores)

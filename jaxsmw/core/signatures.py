@@ -1,8 +1,8 @@
-"""Spectral signatures: what a vertex looks like to heat, to waves and to wavelets.
+"""Spectral signatures: vertex descriptors from heat, waves and wavelets.
 
-All three are `f_t(x) = sum_i w_t(lambda_i) phi_i(x)^2 / sum_i w_t(lambda_i)` with weights that pass some band
-of eigenvalues; on a surface of area 1 each dimension has the area-weighted mean 1. They are invariant to
-eigenvector signs, and blind to the difference of left and right.
+All three are `f_t(x) = sum_i w_t(lambda_i) phi_i(x)² / sum_i w_t(lambda_i)`, with weights w_t that pass a
+band of eigenvalues. On a surface of area 1, each dimension has the area-weighted mean 1. The signatures do
+not depend on the signs of eigenvectors. They cannot distinguish left from right.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.products import product
 from jaxsmw.core.spectrum import Spectrum
 
 
 def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Heat kernel signature at log-spaced times (Sun, Ovsjanikov, Guibas 2009).
+    """Returns the heat kernel signature at log-spaced times (Sun, Ovsjanikov, Guibas 2009).
 
-    Times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`, lambda_min the smallest positive
-    eigenvalue. NaN where none is positive.
+    The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`, where lambda_min is the smallest
+    positive eigenvalue. The result is NaN if no eigenvalue is positive.
     """
     smallest, largest = _positive_range(spectrum)
     times = 4 * jnp.log(10.0) / jnp.geomspace(largest, smallest, dimensions)
@@ -28,13 +28,14 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
 
 def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Wave kernel signature at evenly spaced logarithmic energies (Aubry, Schlickewei, Cremers 2011).
+    """Returns the wave kernel signature at evenly spaced logarithmic energies.
 
-    Gaussians of width 7 steps, centred from `log lambda_min + 2 width` to `log lambda_max - 2 width`.
+    Aubry, Schlickewei, Cremers 2011. The weights are Gaussians with a width of 7 steps and centres from
+    `log lambda_min + 2 width` to `log lambda_max - 2 width`.
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
-    # The centres keep 2 widths of 7 steps away from both ends: 28 steps more than between them.
+    # Both ends are 2 widths of 7 steps away from the nearest centre: 28 steps in addition to those between.
     width = 7 * (high - low) / (dimensions - 1 + 28)
     energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
     positive = spectrum.eigenvalues >= smallest
@@ -44,15 +45,15 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
 
 def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Squared norms of the Meyer wavelets centred at each vertex, at log-spaced scales.
+    """Returns the squared norms of the Meyer wavelets centred at each vertex, at log-spaced scales.
 
-    A spectral-wavelet signature in the sense of Li and Ben Hamza 2013, with the band-pass kernel of the
-    MWP paper's frame in place of theirs. It passes `peak / 2` to `2 peak`, with peaks from lambda_min to
-    `lambda_max / 2`.
+    This is a spectral wavelet signature in the sense of Li and Ben Hamza 2013, but with the band-pass kernel
+    of the MWP paper's frame. The kernel passes eigenvalues from `peak / 2` to `2 peak`. The peaks run from
+    lambda_min to `lambda_max / 2`.
     """
     smallest, largest = _positive_range(spectrum)
     peaks = jnp.geomspace(smallest, largest / 2, dimensions)
-    # Of three Meyer filters on [0, 2 peak] the middle one is that band.
+    # The middle one of three Meyer filters on [0, 2 peak] passes this band.
     wavelets = jax.vmap(lambda peak: Meyer(3)(spectrum.eigenvalues, 2 * peak[None])[1])(peaks)
     return _signature(spectrum, wavelets**2)
 
@@ -62,7 +63,7 @@ def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Flo
 
 
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The smallest positive and the largest eigenvalue; each component has one that is zero."""
+    """Returns the smallest positive and the largest eigenvalue. Each component has an eigenvalue zero."""
     largest = spectrum.eigenvalues[-1]
     positive = spectrum.eigenvalues > 1e-6 * largest
     return jnp.min(jnp.where(positive, spectrum.eigenvalues, largest)), largest

@@ -1,12 +1,13 @@
-"""Soft maps: what a point corresponds to, spread over several, so that it can be differentiated.
+"""Soft maps: a point corresponds to several points with shares of its area, which can be differentiated.
 
-A `Recovery` makes one of two point sets: `Softmax` by distances alone, `NearestFew` among the nearest only,
-`Sinkhorn` so that every point gives and takes its share.
+A `Recovery` makes a soft map from two point sets. `Softmax` uses the distances alone, `NearestFew` only the
+nearest points, and `Sinkhorn` makes every point give and receive its share.
 """
 
 from __future__ import annotations
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,28 +20,29 @@ from jaxsmw.core.checks import as_parameter, check_between
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
-# Queries whose distances to all database rows are had at once.
+# The number of queries per block. Distances from one block to all database rows are in memory at once.
 _BLOCK = 128
 
 
 class SoftMap(eqx.Module):
     """A transport plan between two point sets: how much of each query's area goes to each database row.
 
-    `P_ij = a_i b_j exp(g_j - |q_i - y_j|² / temperature) / (the same without a_i, summed over j)`, never
-    stored as a whole. Its rows sum to the queries' areas exactly, its columns to the database's as far as
-    `residual` says.
+    The plan is `P_ij = a_i w_ij / sum_j w_ij` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. It is
+    never stored as a whole. Its rows sum to the areas of the queries exactly. Its columns sum to the areas of
+    the database rows up to the `residual`.
 
     **Attributes:**
 
     - `queries`, `database`: the points q (m, d) and y (n, d), up to a common shift.
-    - `query_areas`, `database_areas`: a (m,) and b (n,), of sum 1; zero for points that do not count. A query
-      of zero area gets what any other in its place would get.
-    - `potentials`: g (n,), without unit: the higher, the more a row is sought after; 0 for rows of zero area.
-    - `temperature`: in the points' squared unit.
-    - `residual`: the share of the area, from 0 to 1, that arrives where there is too much already; NaN where
-      nobody looked (`Softmax`).
-    - `converged`: whether that is at most the tolerance; False if a number went wrong, or nobody looked.
-    - `iterations`: how many were done.
+    - `query_areas`, `database_areas`: a (m,) and b (n,), each of sum 1, zero for points that do not count. A
+      query of zero area still gets the shares that its position implies.
+    - `potentials`: g (n,), without unit. A high potential raises the share of a row. Zero for rows of zero
+      area.
+    - `temperature`: the temperature, in squared units of the points.
+    - `residual`: the share of the total area, from 0 to 1, that arrives at rows with too much area already.
+      NaN if the residual was not computed (`Softmax`).
+    - `converged`: whether the residual is at most the tolerance. False if it is NaN.
+    - `iterations`: the number of iterations.
     """
 
     queries: Float[Array, "m d"]
@@ -55,7 +57,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """The mean of functions over where each query's area goes; of positions, for example, or colours."""
+        """Returns the mean of functions on Y over each query's shares, for example of colours."""
         functions = jnp.asarray(functions_on_y, self.database.dtype)
         if functions.ndim != 2 or functions.shape[0] != self.database.shape[0]:
             raise ValueError(
@@ -71,58 +73,58 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """The likeliest database row of each query: the one that gets most of it per area.
+        """Returns the most probable database row of each query: the row with the largest share per area.
 
-        (The one that gets most in all would be, between neighbours, the one of the larger area.)
+        (The largest share itself would favour the larger of two neighbouring vertices.)
         """
         everywhere = jnp.where(self.database_areas > 0, self.potentials, -jnp.inf)
 
-        def likeliest(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
+        def most_probable(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
             densities = _log_kernel(self.database, block, self.temperature) + everywhere[:, None]
             return jnp.argmax(densities, axis=0).astype(jnp.int32)
 
-        return in_blocks(likeliest, self.queries, _BLOCK)
+        return in_blocks(most_probable, self.queries, _BLOCK)
 
 
 class SparseSoftMap(eqx.Module):
-    """A soft map of which few database rows are known for each query.
+    """A soft map with a few database rows per query.
 
     **Attributes:**
 
-    - `rows`: (m, t), the nearest first.
-    - `shares`: (m, t), of sum 1.
+    - `rows`: (m, t), the database rows of each query, nearest first.
+    - `shares`: (m, t), the shares of these rows; each line sums to 1.
     """
 
     rows: Int32[Array, "m t"]
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """The mean of functions over each query's rows."""
+        """Returns the mean of functions on Y over each query's shares."""
         functions = jnp.asarray(functions_on_y, self.shares.dtype)
         if functions.ndim != 2:
             raise ValueError(f"functions on Y have shape {functions.shape}, where (n, p) is needed")
-        # One after the other, as all of them take t times the memory.
+        # The rows are processed one after another: all at once would need t times the memory.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """The nearest database row of each query."""
+        """Returns the nearest database row of each query."""
         return self.rows[:, 0]
 
 
 PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
-"""T: X -> Y, one vertex of Y for each of X, or a soft map from X to Y."""
+"""T: X -> Y, one vertex of Y per vertex of X, or a soft map from X to Y."""
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Functions on Y as functions on X: `P f`, P of size m x n never being stored."""
+    """Returns functions on Y as functions on X, `P f`, without storing P (m x n)."""
     if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):
         return pointwise_map.pull_back(functions_on_y)
     return functions_on_y[pointwise_map]
 
 
 class Recovery(eqx.Module):
-    """How a soft map follows from the distances between two point sets."""
+    """A way to compute a soft map from the distances between two point sets."""
 
     @abc.abstractmethod
     def __call__(
@@ -132,15 +134,15 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """The soft map from the queries to the database; rows of zero area get nothing."""
+        """Returns the soft map from the queries to the database. Rows of zero area get no share."""
 
 
 class Softmax(Recovery):
-    """Each row gets of a query what its area times `exp(-distance² / temperature)` is among all rows'.
+    """Soft maps with shares proportional to the area of a row times `exp(-distance² / temperature)`.
 
     **Arguments:**
 
-    - `temperature`: positive, in the units of `sinkhorn`.
+    - `temperature`: a positive number, in the units of `sinkhorn`.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -156,31 +158,21 @@ class Softmax(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
         """See `Recovery`."""
-        queries, database, a, b, scale = _prepared(
-            queries, database, query_areas, database_areas, self.temperature
-        )
-        return SoftMap(
-            queries,
-            database,
-            a,
-            b,
-            jnp.zeros_like(b),
-            scale,
-            jnp.asarray(jnp.nan, b.dtype),
-            jnp.asarray(False),
-            jnp.asarray(0, jnp.int32),
-        )
+        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+        b = transport.database_areas
+        unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
+        return transport.soft_map(jnp.zeros_like(b), unknown, jnp.asarray(False), no_iterations)
 
 
 class NearestFew(Recovery):
-    """`Softmax` among the nearest rows alone; which ones these are is not differentiated.
+    """`Softmax` among the nearest rows of each query only. The choice of these rows is not differentiated.
 
-    Fast in float32; in float64 sorting takes most of the time on CPUs.
+    `NearestFew` is fast in float32. In float64 sorting takes most of the time on CPUs.
 
     **Arguments:**
 
-    - `number`: how many; if there are fewer of positive area, a query's other shares are zero.
-    - `temperature`: positive, in the units of `sinkhorn`.
+    - `number`: the number of rows per query. If fewer rows have positive area, the other shares are zero.
+    - `temperature`: a positive number, in the units of `sinkhorn`.
     """
 
     number: int = eqx.field(static=True, default=10)
@@ -199,9 +191,8 @@ class NearestFew(Recovery):
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
         """See `Recovery`."""
-        queries, database, _, b, scale = _prepared(
-            queries, database, query_areas, database_areas, self.temperature
-        )
+        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+        queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
 
@@ -210,19 +201,19 @@ class NearestFew(Recovery):
             return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
 
         rows = in_blocks(nearest, settled_queries, _BLOCK)
-        # One after the other, as all differences take t times the memory.
+        # The rows are processed one after another: all differences at once would need t times the memory.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
-        exponents = -jnp.stack(squares, axis=1) / scale
+        exponents = -jnp.stack(squares, axis=1) / temperature
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
 
 
 class Sinkhorn(Recovery):
-    """Soft maps by `sinkhorn`: every row gets its share.
+    """Soft maps by `sinkhorn`: every database row gets the share that its area implies.
 
     **Arguments:**
 
-    - `temperature`: positive, in the units of `sinkhorn`.
-    - `iterations`, `tolerance`: see there.
+    - `temperature`: a positive number, in the units of `sinkhorn`.
+    - `iterations`, `tolerance`: see `sinkhorn`.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -266,41 +257,57 @@ def sinkhorn(
     iterations: int = 200,
     tolerance: float | Float[Array, ""] = 0.01,
 ) -> SoftMap:
-    """The entropy-regularised optimal transport between two point sets, by Sinkhorn's iterations.
+    """Returns the entropy-regularised optimal transport between two point sets, by Sinkhorn's iterations.
 
-    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013: of all plans that
-    spread the queries' areas over the database's the one of least mean squared distance, less `temperature`
-    times entropy. Where nearest neighbours crowd on some rows and leave out others, here each gets its share.
-    What is iterated on is the logarithm of Sinkhorn's factors, and distances are computed anew in every
-    iteration, in blocks of queries: nothing of size m x n is ever stored, nor for derivatives, which go
+    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. Among all plans
+    that spread the areas of the queries over the areas of the database, this plan minimises the mean squared
+    distance minus `temperature` times the entropy. Nearest neighbours crowd on some rows and leave out
+    others; here every row gets its share.
+
+    The iterations update the logarithms of Sinkhorn's factors. Each iteration computes the distances again,
+    in blocks of queries, so that no array of size m x n is stored. This also holds for derivatives, which go
     through all iterations.
 
     **Arguments:**
 
     - `queries`, `database`: points in d dimensions.
-    - `query_areas`, `database_areas`: in any unit: both sides are scaled to sum 1. A point of zero area
-      gives and takes nothing, and changes nothing for others.
-    - `temperature`: positive, in units of the area-weighted mean squared distance from queries to their
-      nearest database rows; if that is less than `sqrt(eps)` times the mean square of the queries about
-      their mean, eps being the float type's, in units of this. The lower, the sharper, the more iterations;
-      below the rounding errors of squared distances, eps times that mean square, nothing becomes sharper: it
-      is as if it were so much, and has no derivative but zero.
-    - `iterations`: at most so many; those after convergence are skipped (not under `vmap`, where they do
-      nothing).
-    - `tolerance`: on `SoftMap.residual`.
+    - `query_areas`, `database_areas`: areas in any unit. Both sides are scaled to sum 1. Points of zero area
+      neither give nor receive, and do not affect other points.
+    - `temperature`: a positive number. Its unit is the area-weighted mean squared distance from queries to
+      their nearest database rows, but at least `sqrt(eps)` times the area-weighted variance of the queries,
+      where eps is the precision of the float type. Lower temperatures give sharper maps and need more
+      iterations. Temperatures below the rounding errors of squared distances, eps times the variance, act
+      like that value and have derivative zero.
+    - `iterations`: the largest number of iterations. Iterations after convergence are skipped; under `vmap`
+      they run but change nothing.
+    - `tolerance`: the tolerance of `SoftMap.residual`.
 
-    **Returns:** A `SoftMap`. Nothing is raised for bad numbers or want of iterations: see its `converged`.
+    **Returns:** A `SoftMap`. Bad numbers and missing convergence raise no error: check `converged`.
 
     **Raises:** `ValueError` for fewer than one iteration.
     """
     if iterations < 1:
         raise ValueError(f"sinkhorn needs at least 1 iteration, not {iterations}")
-    queries, database, query_areas, database_areas = map(
-        jnp.asarray, (queries, database, query_areas, database_areas)
-    )
-    queries, database, a, b, scale = _prepared(
-        queries, database, query_areas, database_areas, jnp.asarray(temperature)
-    )
+    arrays = map(jnp.asarray, (queries, database, query_areas, database_areas, temperature))
+    transport = _normalized(*arrays)
+    potentials, residual, done = _sinkhorn_potentials(transport, iterations, tolerance)
+    return transport.soft_map(potentials, residual, residual <= tolerance, done)
+
+
+class _SinkhornState(NamedTuple):
+    """Potentials, the next potentials, the residual of the former, and the number of iterations."""
+
+    potentials: Float[Array, " n"]
+    following: Float[Array, " n"]
+    residual: Float[Array, ""]
+    iterations: Int32[Array, ""]
+
+
+def _sinkhorn_potentials(
+    transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]
+) -> tuple[Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]:
+    """Returns the potentials of `sinkhorn`, their residual, and the number of iterations."""
+    queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape
     log_b, rest = _log(b), -m % _BLOCK
     blocks = (
@@ -308,67 +315,86 @@ def sinkhorn(
         jnp.pad(a, (0, rest)).reshape(-1, _BLOCK),
     )
 
-    def turn(potentials: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The potentials that follow, and the residual of those given."""
+    def update(potentials: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """Returns the next potentials, and the residual of the given potentials."""
 
         def add(arrived: Float[Array, " n"], block: tuple[Array, Array]) -> tuple[Float[Array, " n"], None]:
-            log_shares = _log_kernel(database, block[0], scale) + (log_b + potentials)[:, None]
+            log_shares = _log_kernel(database, block[0], temperature) + (log_b + potentials)[:, None]
             return arrived + product(jax.nn.softmax(log_shares, axis=0), block[1]), None
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
-        # What arrives can be too little to tell from nothing; then the potential rises in several turns.
+        # The arriving area can underflow to zero. Then the potential rises over several iterations.
         least = jnp.finfo(dtype).tiny
         wanting = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + wanting, jnp.sum(jnp.abs(arrived - b)) / 2
 
-    def step(state: _State, _: None) -> tuple[_State, None]:
-        def go_on() -> _State:
-            _, potentials, _, done = state
-            following, residual = jax.checkpoint(turn)(potentials)
-            return potentials, following, residual, done + 1
+    def step(state: _SinkhornState, _: None) -> tuple[_SinkhornState, None]:
+        def go_on() -> _SinkhornState:
+            following, residual = jax.checkpoint(update)(state.following)
+            return _SinkhornState(state.following, following, residual, state.iterations + 1)
 
-        return lax.cond(state[2] <= tolerance, lambda: state, go_on), None
+        return lax.cond(state.residual <= tolerance, lambda: state, go_on), None
 
     zeros = jnp.zeros_like(b)
-    start = zeros, zeros, jnp.asarray(jnp.inf, dtype), jnp.asarray(0, jnp.int32)
-    (potentials, _, residual, done), _ = lax.scan(step, start, None, length=iterations)
-    return SoftMap(queries, database, a, b, potentials, scale, residual, residual <= tolerance, done)
-
-
-_State = tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]
-"""Potentials, those that follow, the residual of the former, and how many iterations were done."""
+    initial = _SinkhornState(zeros, zeros, jnp.asarray(jnp.inf, dtype), jnp.asarray(0, jnp.int32))
+    last, _ = lax.scan(step, initial, None, length=iterations)
+    return last.potentials, last.residual, last.iterations
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Logarithms; -inf for zero, without the infinite derivative."""
+    """Returns logarithms: -inf for zero, with derivative zero instead of infinity."""
     return jnp.where(areas > 0, jnp.log(jnp.where(areas > 0, areas, 1)), -jnp.inf)
 
 
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Squared distances, negative, in units of temperature, up to a constant of each query.
+    """Returns `-distance² / temperature` up to a constant per query.
 
-    Queries last, as sums over the database then run over them side by side, in half the time.
+    The queries come last. Then sums over the database are computed for neighbouring queries at once, which
+    halves the time.
     """
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
 
-def _prepared(
+class _Transport(NamedTuple):
+    """Two point sets with areas, and a temperature, in the form that all recoveries use.
+
+    The points have a common origin near their centre. The areas sum to 1. The temperature is in squared units
+    of the points.
+    """
+
+    queries: Float[Array, "m d"]
+    database: Float[Array, "n d"]
+    query_areas: Float[Array, " m"]
+    database_areas: Float[Array, " n"]
+    temperature: Float[Array, ""]
+
+    def soft_map(
+        self,
+        potentials: Float[Array, " n"],
+        residual: Float[Array, ""],
+        converged: Bool[Array, ""],
+        iterations: Int32[Array, ""],
+    ) -> SoftMap:
+        """Returns the soft map with the given potentials."""
+        points, areas = (self.queries, self.database), (self.query_areas, self.database_areas)
+        return SoftMap(*points, *areas, potentials, self.temperature, residual, converged, iterations)
+
+
+def _normalized(
     queries: Float[Array, "m d"],
     database: Float[Array, "n d"],
     query_areas: Float[Array, " m"],
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
-) -> tuple[
-    Float[Array, "m d"], Float[Array, "n d"], Float[Array, " m"], Float[Array, " n"], Float[Array, ""]
-]:
-    """What every recovery computes with.
+) -> _Transport:
+    """Returns the `_Transport` between two point sets, from a temperature in the units of `sinkhorn`.
 
-    Points about their centre, so that squares of coordinates do not drown distances; areas of sum 1; and the
-    temperature in the points' squared unit, from one in units of the mean squared nearest distance. NaN if it
-    is not positive, as steps of training may make it: then so is what follows. Not below what squared
-    distances are rounded by: exponents would be nothing but rounding errors, and derivatives overflow.
+    Points far from the origin would lose distances to rounding; hence the shift to the centre. A temperature
+    that is not positive, as a training step can produce, becomes NaN, and so does the result. A temperature
+    below the rounding errors of squared distances is raised: exponents would consist of rounding errors, and
+    derivatives would overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
@@ -378,7 +404,7 @@ def _prepared(
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     eps = jnp.finfo(queries.dtype).eps
     unit = jnp.maximum(unit, eps**0.5 * spread)
-    unit = jnp.where(unit > 0, unit, 1)  # all in one place, met exactly: any unit does
+    unit = jnp.where(unit > 0, unit, 1)  # any unit will do if all points coincide
     relative = temperature.astype(queries.dtype)
     absolute = jnp.maximum(relative * unit, eps * spread)
-    return queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan)
+    return _Transport(queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan))

@@ -1,24 +1,28 @@
-"""Refinement that can be differentiated: soft maps between the updates of the functional map."""
+"""Differentiable refinement, with soft maps between the updates of the functional map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_choice, check_kind, counts_iterations
-from jaxsmw.core.refinement import WaveletPreservation, check_spectra, checked, diagnose
+from jaxsmw.core.refinement import check_spectra, checked, diagnose
+from jaxsmw.core.refiner import Problem, State
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
+Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
+"""One iteration: the functional map that follows from a functional map, and how its computation ended."""
 
 
 class SoftRefinement(eqx.Module):
@@ -27,10 +31,11 @@ class SoftRefinement(eqx.Module):
     **Attributes:**
 
     - `functional_map`: C.
-    - `soft_map`: the soft map X -> Y that follows from it.
-    - `result`: a member of `RESULTS`; compare with `RESULTS.successful`.
-    - `iterations`: how many functional maps were made after the first.
-    - `change`: how much the last one changed C, relative to its Frobenius norm: 0 at a fixed point.
+    - `soft_map`: the soft map X -> Y that is recovered from C.
+    - `result`: a member of `RESULTS`; compare it with `RESULTS.successful`.
+    - `iterations`: the number of functional maps after the first.
+    - `change`: the change of C in the last iteration relative to its Frobenius norm. It is 0 at a fixed
+      point.
     """
 
     functional_map: Float[Array, "k_out k_in"]
@@ -53,37 +58,39 @@ def refine_softly(
     differentiation: Differentiation = "checkpointed",
     tolerance: float = 1e-4,
 ) -> SoftRefinement:
-    """Algorithm 1 with soft maps in place of nearest neighbours, differentiable in all that it is given.
+    """Refines a map by Algorithm 1 with soft maps instead of nearest neighbours.
 
-    Spectra, start if it is soft, parameters of the bank, weights and descriptors of the solution, and the
-    temperature. Nothing of size m x n is stored, nor for derivatives.
+    The outcome is differentiable in the spectra, a soft initial map, the parameters of the bank, the weights
+    and descriptors of the solution, and the temperature. No array of size m x n is stored, not even for
+    derivatives.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_map`: the start, a pointwise map or a soft one from X to Y.
-    - `refiner`: how functional maps follow from maps; its `search` is not used.
-    - `recovery`: how soft maps follow from functional ones. Low temperatures are nearer to `jaxsmw.refine`,
-      with larger and less telling derivatives.
-    - `iterations`: how many functional maps are made after the first, at least 1; with `"implicit"` at most
-      so many.
-    - `differentiation`: how derivatives are had.
-        - `"unrolled"`: back through all iterations, as automatic differentiation does.
-        - `"checkpointed"`: the same derivatives; what they need within an iteration is computed anew.
-        - `"implicit"`: iterate up to a fixed point C = F(C, θ), where `dC = (I - dF/dC)^-1 dF/dθ dθ`
-          (implicit function theorem), by `optimistix.fixed_point`; the linear system is solved by GMRES, its
-          products being derivatives of one iteration. Takes no more memory for more iterations, and the
-          start has no derivative.
-    - `tolerance`: with `"implicit"`, on changes of C beside its largest entry, and of the linear solver.
+    - `pointwise_map`: the initial map, a pointwise map or a soft map from X to Y.
+    - `refiner`: how functional maps follow from soft maps. Its `search` is not used.
+    - `recovery`: how soft maps follow from functional maps. Lower temperatures are closer to `jaxsmw.refine`,
+      but their derivatives are larger and less informative.
+    - `iterations`: the number of functional maps after the first, at least 1. With `"implicit"` this is the
+      largest number.
+    - `differentiation`: how derivatives are computed.
+        - `"unrolled"`: automatic differentiation through all iterations.
+        - `"checkpointed"`: the same derivatives, with less memory: intermediate values within an iteration
+          are computed again.
+        - `"implicit"`: iterations up to a fixed point C = F(C, θ), where `dC = (I - dF/dC)^-1 dF/dθ dθ` by
+          the implicit function theorem. `optimistix.fixed_point` iterates, and GMRES solves the linear system
+          with derivatives of one iteration. The memory does not grow with the iterations. The initial map has
+          no derivative.
+    - `tolerance`: with `"implicit"`, the tolerance of the fixed point, relative to the largest entry of C,
+      and of the linear solver.
 
-    **Returns:** A `SoftRefinement`. Nothing is raised for bad numbers: check its `result`. With `"implicit"`
-    it is `RESULTS.fixed_point_not_reached` if `iterations` were too few.
+    **Returns:** A `SoftRefinement`. Bad numbers raise no error: check `result`. With `"implicit"` and too few
+    `iterations` it is `RESULTS.fixed_point_not_reached`.
 
-    **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, another
-    `differentiation`, a start of another size, or spectra of two float types; `TypeError` for what is no
-    refiner or recovery, or iterations that are no integer. With `"implicit"`, derivatives (not the outcome)
-    raise equinox's runtime error where iterations were too few (are NaN, in forward mode), or GMRES does not
-    come to its tolerance.
+    **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, an unknown
+    `differentiation`, an initial map of the wrong size, or spectra of different float types; `TypeError` for
+    an argument of the wrong type. With `"implicit"`, reverse-mode derivatives raise equinox's runtime error
+    after too few iterations, or if GMRES does not reach its tolerance. Forward-mode derivatives are NaN then.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
@@ -91,65 +98,66 @@ def refine_softly(
     check_spectra(spectrum_x, spectrum_y)
     if not tolerance > 0:
         raise ValueError(f"refine_softly needs a positive tolerance, not {tolerance}")
-    m, n = spectrum_x.mask.shape[0], spectrum_y.mask.shape[0]
-    matches: Array | None = None
+    matches = _matches(pointwise_map, spectrum_x.mask.shape[0], spectrum_y.mask.shape[0])
+    prepared = refiner.prepare(Problem(spectrum_x, spectrum_y))
+    first, result = refiner.update(prepared, pointwise_map, None)
+    first_result = checked(first, result)
+
+    def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
+        points = refiner.embeddings(prepared, State(functional_map))
+        return recovery(*points, *_areas(spectrum_x, spectrum_y))
+
+    def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        following, how = refiner.update(prepared, recover(functional_map), State(functional_map))
+        return following.functional_map, checked(following, how)
+
+    if differentiation == "implicit":
+        loop = _to_the_fixed_point(step, first.functional_map, iterations, tolerance)
+    else:
+        step = jax.checkpoint(step) if differentiation == "checkpointed" else step
+        loop = _through_iterations(step, first.functional_map, first_result, iterations)
+    moved, norm = (
+        jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (loop.last_change, loop.functional_map)
+    )
+    result = where(first_result == RESULTS.successful, loop.result, first_result)
+    result = diagnose(spectrum_x, spectrum_y, matches, result)
+    soft_map = recover(loop.functional_map)
+    return SoftRefinement(loop.functional_map, soft_map, result, loop.iterations, moved / norm)
+
+
+def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
+    """Returns the vertices of Y that an initial map contains, or None for a dense soft map.
+
+    **Raises:** `ValueError` if the map is not between m and n points; `TypeError` if it is not a map.
+    """
     if isinstance(pointwise_map, SoftMap):
         sizes = pointwise_map.queries.shape[0], pointwise_map.database.shape[0]
         if sizes != (m, n):
             raise ValueError(
-                f"the start maps {sizes[0]} points to {sizes[1]}, but the shapes have {m} and {n} vertices"
+                f"the initial map is from {sizes[0]} to {sizes[1]} points, but the shapes have {m} and {n} "
+                "vertices"
             )
-    else:
-        sparse = isinstance(pointwise_map, SparseSoftMap)
-        matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
-        check_kind("initial map", matches, np.ndarray, jax.Array)
-        if matches.shape[0] != m or matches.ndim != 1 + sparse:
-            raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
-    problem = refiner.prepare(spectrum_x, spectrum_y)
-    start, result = refiner.update(problem, pointwise_map, None)
-    start_went = checked(start, start, result)
-
-    def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
-        points = refiner.embeddings(problem, functional_map)
-        return recovery(*points, *_areas(spectrum_x, spectrum_y))
-
-    def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        following, how = refiner.update(problem, recover(functional_map), functional_map)
-        return following, checked(following, following, how)
-
-    if differentiation == "implicit":
-        last, done, converged = _fixed_point(lambda c: step(c)[0], start, iterations, tolerance)
-        # Once more, for what the solver does not tell: how the update went, and how far it still moves.
-        before, (after, went) = last, step(lax.stop_gradient(last))
-        unsettled = (went == RESULTS.successful) & ~converged
-        went = where(unsettled, RESULTS.fixed_point_not_reached, went)
-    else:
-        turn = jax.checkpoint(step) if differentiation == "checkpointed" else step
-
-        def follow(state: _State, _: None) -> tuple[_State, None]:
-            functional_map, so_far = state[1:]
-            following, how = turn(functional_map)
-            return (functional_map, following, where(so_far == RESULTS.successful, how, so_far)), None
-
-        (before, last, went), _ = lax.scan(follow, (start, start, start_went), None, length=iterations)
-        after, done = last, jnp.asarray(iterations, jnp.int32)
-    moved, norm = (jnp.sqrt(jnp.sum(lax.stop_gradient(c) ** 2)) for c in (after - before, last))
-    went = where(start_went == RESULTS.successful, went, start_went)
-    went = diagnose(spectrum_x, spectrum_y, matches, went)
-    return SoftRefinement(last, recover(last), went, done, moved / norm)
+        return None
+    sparse = isinstance(pointwise_map, SparseSoftMap)
+    matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
+    check_kind("initial map", matches, np.ndarray, jax.Array)
+    if matches.shape[0] != m or matches.ndim != 1 + sparse:
+        raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
+    return matches
 
 
 class WaveletPreservationLayer(eqx.Module):
-    """A layer for models of one's own: features of both shapes in, functional map and soft map out.
+    """A layer for neural networks: from features of both shapes to a functional map and a soft map.
 
-    The soft map between the features is refined by `refine_softly`. It has no parameters but those of its
-    modules, which are leaves, as those of any equinox module: train them all, or freeze what is not to be
-    learned (`equinox.partition`). As a pure function of arrays it also is part of a flax or haiku model.
+    The layer computes a soft map between the features and refines this map by `refine_softly`. Its parameters
+    are the leaves of its modules, as in any equinox module. Train all of them, or freeze some with
+    `equinox.partition`. The layer is a pure function of arrays, so that flax and haiku models can use it,
+    too.
 
     **Arguments:**
 
-    - `refiner`: how functional maps follow from maps.
-    - `recovery_of_features`: how the first soft map follows from the features.
+    - `refiner`: how functional maps follow from soft maps.
+    - `recovery_of_features`: how the initial soft map follows from the features.
     - `recovery`, `iterations`, `differentiation`, `tolerance`: see `refine_softly`.
     """
 
@@ -167,15 +175,21 @@ class WaveletPreservationLayer(eqx.Module):
         spectrum_x: Spectrum,
         spectrum_y: Spectrum,
     ) -> SoftRefinement:
-        """Match two shapes by features of their vertices: near in feature space is likely the same point.
+        """Matches two shapes by the features of their vertices.
 
-        **Raises:** `ValueError` unless features are one row per vertex, of one width; see `refine_softly`.
+        **Arguments:**
+
+        - `features_x`, `features_y`: features of the vertices of X and Y. Corresponding vertices should be
+          close to each other in feature space.
+
+        **Raises:** `ValueError` if the features do not have one row per vertex, or differ in width between
+        the shapes; see also `refine_softly`.
         """
         needed = [(s.mask.shape[0], features_x.shape[-1]) for s in (spectrum_x, spectrum_y)]
         found = [features_x.shape, features_y.shape]
         if found != needed:
             raise ValueError(
-                "features have shapes {} and {}, where {} and {} are needed".format(*found, *needed)
+                "the features have shapes {} and {}, where {} and {} are needed".format(*found, *needed)
             )
         return refine_softly(
             spectrum_x,
@@ -193,50 +207,92 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
     return (jnp.where(spectrum.mask, spectrum.vertex_areas, 0) for spectrum in spectra)
 
 
+class _Loop(NamedTuple):
+    """The outcome of the iterations: the last functional map, how it still changes, and how they went."""
+
+    functional_map: Float[Array, "k_out k_in"]
+    last_change: Float[Array, "k_out k_in"]
+    result: RESULTS
+    iterations: Int32[Array, ""]
+
+
+def _through_iterations(
+    step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
+) -> _Loop:
+    """Runs a fixed number of iterations, through which derivatives are computed."""
+
+    def follow(state: _State, _: None) -> tuple[_State, None]:
+        following, how = step(state.functional_map)
+        result = where(state.result == RESULTS.successful, how, state.result)
+        return _State(state.functional_map, following, result), None
+
+    last, _ = lax.scan(follow, _State(first, first, first_result), None, length=iterations)
+    done = jnp.asarray(iterations, jnp.int32)
+    return _Loop(last.functional_map, last.functional_map - last.previous, last.result, done)
+
+
+class _State(NamedTuple):
+    """The previous functional map, the last functional map, and the first failure so far."""
+
+    previous: Float[Array, "k_out k_in"]
+    functional_map: Float[Array, "k_out k_in"]
+    result: RESULTS
+
+
+def _to_the_fixed_point(
+    step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
+) -> _Loop:
+    """Iterates up to the fixed point, at which derivatives are implicit."""
+    last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
+    # The solver reports neither the result of an update nor the last change, hence one more iteration.
+    after, result = step(lax.stop_gradient(last))
+    unsettled = (result == RESULTS.successful) & ~converged
+    return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
+
+
 def _fixed_point(
     step: Callable[[Float[Array, "k_out k_in"]], Float[Array, "k_out k_in"]],
-    start: Float[Array, "k_out k_in"],
+    first: Float[Array, "k_out k_in"],
     iterations: int,
     tolerance: float,
 ) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
-    """Where iterations come to rest, how many that took, and whether they did."""
-    import lineax as lx  # here, as importing them takes as long as an eigenbasis
+    """Returns the fixed point of an iteration, the number of iterations, and whether they converged."""
+    import lineax as lx  # imported here because the import takes as long as an eigenbasis
     import optimistix as optx
 
-    # In units of the largest entry, as what is wanted is precision relative to C as a whole; and in the
-    # default float type, since optimistix takes no float32 while jax_enable_x64 is set.
-    unit = lax.stop_gradient(jnp.max(jnp.abs(start)))
+    # The unit is the largest entry, because the tolerance is relative to C as a whole. The solver works in
+    # the default float type, because optimistix does not accept float32 while jax_enable_x64 is set.
+    unit = lax.stop_gradient(jnp.max(jnp.abs(first)))
 
     def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
-        return (step(scaled.astype(start.dtype) * unit) / unit).astype(float)
+        return (step(scaled.astype(first.dtype) * unit) / unit).astype(float)
 
     solution: optx.Solution = optx.fixed_point(
         scaled_step,
         optx.FixedPointIteration(rtol=0.0, atol=tolerance),
-        (lax.stop_gradient(start) / unit).astype(float),
+        (lax.stop_gradient(first) / unit).astype(float),
         max_steps=iterations,
         adjoint=optx.ImplicitAdjoint(lx.GMRES(tolerance, tolerance)),
         throw=False,
     )
     converged = jnp.asarray(solution.result == optx.RESULTS.successful)
-    functional_map = _known_to_rest(solution.value.astype(start.dtype) * unit, converged)
+    functional_map = _differentiable_if(converged, solution.value.astype(first.dtype) * unit)
     return functional_map, solution.stats["num_steps"].astype(jnp.int32), converged
 
 
 @jax.custom_jvp
-def _known_to_rest(
-    functional_map: Float[Array, "k_out k_in"], at_rest: Bool[Array, ""]
+def _differentiable_if(
+    converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """The same; where it is no fixed point, the formula for the derivatives of one does not hold: NaN."""
+    """Returns the functional map. Its derivative is NaN without convergence.
+
+    The formula for the implicit derivative holds at fixed points only.
+    """
     return functional_map
 
 
-@_known_to_rest.defjvp
-def _derivative_at_rest(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    functional_map, at_rest = primals
-    known = jnp.where(at_rest, 1.0, jnp.nan).astype(functional_map.dtype)
-    return functional_map, tangents[0] * known
-
-
-_State = tuple[Float[Array, "k_out k_in"], Float[Array, "k_out k_in"], RESULTS]
-"""The functional map before, the last one, and how it went so far."""
+@_differentiable_if.defjvp
+def _derivative_if(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    converged, functional_map = primals
+    known = jnp.where(converged, 1.0, jnp.nan).astype(functional_map.dtype)
+    return functional_map, tangents[1] * known

@@ -1,4 +1,4 @@
-"""The Spectrum: all that the traced core knows of a shape."""
+"""The spectrum of a shape, which is all that the traced core knows about the shape."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ from jaxtyping import Array, Bool, Float, Int
 class Spectrum(eqx.Module):
     """The first k eigenpairs of a shape's Laplace–Beltrami operator, as a pytree of arrays.
 
-    `W phi = lambda A phi` with W the positive semi-definite cotangent stiffness and A the lumped vertex
-    areas; the eigenvectors are orthonormal in the areas, `Phi^T A Phi = I`.
+    The eigenpairs solve `W phi = lambda A phi`. W is the positive semi-definite cotangent stiffness matrix
+    and A holds the lumped vertex areas. The eigenvectors are orthonormal with respect to A: `Phi^T A Phi =
+    I`.
 
-    Written for one shape. A stack of shapes of equal size (every leaf with a leading axis) goes through
-    `jax.vmap`; sizes differ, so smaller shapes are padded with vertices that have `mask` False, zero area
-    and zero eigenvectors. A vertex that no face uses is just such a vertex.
+    A `Spectrum` describes one shape. For `jax.vmap`, shapes of equal size are stacked: every leaf gets a
+    leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero eigenvectors.
+    Unreferenced vertices (no face references them) are masked, too.
 
     **Attributes:**
 
     - `eigenvalues`: (k,), ascending, in units of 1 / length².
     - `eigenvectors`: (n, k).
-    - `vertex_areas`: (n,), in units of length²; zero where masked.
-    - `mask`: (n,), True for vertices of the surface.
-    - `descriptors`: (n, d), what else is known of each vertex, or None. Comparable between shapes; zero where
-      masked. Only methods that say so look at them.
-    - `positions`, `normals`: (n, 3) each, or None: where the vertices are, in units of length, and unit
-      vectors that point outwards; zero where masked. Only methods that say so look at them.
+    - `vertex_areas`: (n,), in units of length², zero for masked vertices.
+    - `mask`: (n,), True for vertices of the surface, False for masked vertices.
+    - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
+      or None. Only some refiners use them; their documentation says so.
+    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Only some
+      refiners use them.
+    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Only some refiners use them.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -41,7 +43,7 @@ class Spectrum(eqx.Module):
     normals: Float[Array, "n 3"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
-        """The same shape with its first eigenpairs only."""
+        """Returns the shape with its first eigenpairs only."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues[:number_of_eigenvectors],
@@ -49,7 +51,7 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """The same shape with every area multiplied by a factor, every length by its square root."""
+        """Returns the shape with all areas multiplied by a factor, and all lengths by its square root."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues / factor,
@@ -58,43 +60,47 @@ class Spectrum(eqx.Module):
             positions=None if self.positions is None else self.positions * factor**0.5,
         )
 
-    def describe(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """The same shape with other descriptors, or none.
+    def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
+        """Returns the shape with the given descriptors, or with none.
 
-        **Raises:** `ValueError` if there is not a row for each vertex.
+        **Raises:** `ValueError` if the descriptors do not have one row per vertex.
         """
         self._check_rows("descriptors", descriptors)
         return dataclasses.replace(self, descriptors=descriptors)
 
-    def place(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """The same shape with these positions, in its own unit of length, and unit normals.
+    def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
+        """Returns the shape with the given vertex positions, in its unit of length, and unit normals.
 
-        **Raises:** `ValueError` if there is not a row for each vertex.
+        **Raises:** `ValueError` if the arrays do not have one row of 3 numbers per vertex.
         """
         self._check_rows("positions", positions, 3)
         self._check_rows("normals", normals, 3)
         return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
-        """The same shape with masked vertices up to a given number.
+        """Returns the shape with masked vertices appended, up to a given number of vertices.
 
-        **Raises:** `ValueError` if it has more vertices already.
+        **Raises:** `ValueError` if the shape has more vertices already.
         """
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
-            raise ValueError(f"a shape of {self.mask.shape[0]} vertices does not fit {number_of_vertices}")
+            raise ValueError(
+                f"a shape of {self.mask.shape[0]} vertices does not fit into {number_of_vertices}"
+            )
         if rows == 0:
             return self
-        return self._at_vertices(lambda field: jnp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1))))
+        return self._map_vertex_arrays(
+            lambda field: jnp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1)))
+        )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """The shape seen at some evenly spread vertices only, each standing for the same share of the area.
+        """Returns the shape at some evenly spread vertices only. Each sample gets the same share of the area.
 
-        The eigenvectors are no longer orthonormal there, so only the least-squares pseudo-inverse makes
-        sense of them.
+        The eigenvectors of the samples are no longer orthonormal. Use the least-squares pseudo-inverse for
+        samples.
         """
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
-        sampled = self._at_vertices(lambda field: field[vertices])
+        sampled = self._map_vertex_arrays(lambda field: field[vertices])
         return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
 
     def _check_rows(self, name: str, rows: Array | None, columns: int | None = None) -> None:
@@ -102,11 +108,11 @@ class Spectrum(eqx.Module):
             return
         n, shape = self.mask.shape[0], jnp.shape(rows)
         if len(shape) != 2 or shape[0] != n or columns not in (None, shape[1]):
-            row = "a row" if columns is None else f"a row of {columns} numbers"
-            raise ValueError(f"{name} have shape {shape}, but {row} is needed for each of the {n} vertices")
+            needed = f"({n}, {'d' if columns is None else columns})"
+            raise ValueError(f"the {name} have shape {shape}; one row per vertex is needed: {needed}")
 
-    def _at_vertices(self, change: Callable[[Array], Array]) -> Spectrum:
-        """The same shape with everything that it has of each vertex changed."""
+    def _map_vertex_arrays(self, change: Callable[[Array], Array]) -> Spectrum:
+        """Returns the shape with a function applied to all arrays that have one row per vertex."""
         names = [field.name for field in dataclasses.fields(self) if field.name != "eigenvalues"]
-        of_vertices = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return dataclasses.replace(self, **{name: change(field) for name, field in of_vertices.items()})
+        present = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return dataclasses.replace(self, **{name: change(field) for name, field in present.items()})

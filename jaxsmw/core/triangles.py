@@ -1,4 +1,4 @@
-"""The nearest point on a surface of triangles, in any number of dimensions."""
+"""The nearest point on a triangulated surface, in any number of dimensions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks
 
-# Queries whose distances to all triangles are had at once.
+# The number of queries per block. Distances from one block to all triangles are in memory at once.
 _BLOCK = 32
 
 
@@ -19,27 +19,28 @@ def nearest_point_on_triangles(
     *,
     face_mask: Bool[Array, " f"] | None = None,
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """For every query the point nearest to it on any of some triangles, exactly, in Euclidean distance.
+    """Returns the point on a set of triangles that is nearest to each query, exactly, in Euclidean distance.
 
-    All triangles are compared, with nothing of size m x f stored: the distance to one follows from the
-    products of the query with its corners, whatever the dimension. Where a point of several triangles is
-    nearest, such as a corner, it is given on one of them.
+    Every query is compared with all triangles, but no array of size m x f is stored. In any dimension, the
+    distance to a triangle follows from the products of the query with the corners. If the nearest point
+    belongs to several triangles, such as a corner, one of these triangles is returned.
 
     **Arguments:**
 
     - `queries`: points in d dimensions.
-    - `points`, `faces`: corners, and the three that each triangle has.
-    - `face_mask`: triangles with False are left out. If all are, the result is meaningless.
+    - `points`: the corners of the triangles.
+    - `faces`: three indices into `points` per triangle.
+    - `face_mask`: False for triangles to be ignored. If all are ignored, the result is meaningless.
 
-    **Returns:** The triangle each nearest point lies on (m,), and its barycentric weights (m, 3) for the
-    triangle's corners in their order, not negative, of sum 1.
+    **Returns:** The triangle of each nearest point (m,), and the barycentric weights (m, 3) of its corners.
+    The weights are not negative and sum to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
     lengths = product(edges, jnp.swapaxes(edges, 1, 2))
     grams = (lengths[:, 0, 0], lengths[:, 0, 1], lengths[:, 1, 1])
     starts = jnp.einsum("fed,fd->ef", edges, corners[:, 0], precision="highest")
-    # |q - a|² = |q|² + |a|² - 2 q·a, of which the first is the same for all triangles.
+    # |q - a|² = |q|² + |a|² - 2 q·a. The first term is the same for all triangles and left out.
     norms = jnp.sum(corners[:, 0] ** 2, axis=1)
     masked = jnp.zeros(len(faces), bool) if face_mask is None else ~face_mask
     columns = [value[:, None] for value in (*grams, *starts, norms)]
@@ -53,7 +54,7 @@ def nearest_point_on_triangles(
         return jnp.argmin(squared, axis=0).astype(jnp.int32)
 
     found = in_blocks(search, queries, _BLOCK)
-    # Once more from differences, in which nothing cancels.
+    # The weights are computed from differences, which are precise where products would cancel.
     away = queries - corners[found, 0]
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
     _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
@@ -68,13 +69,13 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """The nearest point `a + s u + t v` of triangles to points q, and its squared distance.
+    """Returns the squared distances from points q to triangles, and s and t of the nearest `a + s u + t v`.
 
     **Arguments:**
 
-    - `squared`: `|q - a|²`; a constant in it is one in the distance.
-    - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`, for the edges u and v from a.
-    - `uu`, `uv`, `vv`: products of these edges, or an axis of length 1 where they are the same for all.
+    - `squared`: `|q - a|²` up to an additive constant, which the returned distance keeps.
+    - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v` for the edges u and v from the corner a.
+    - `uu`, `uv`, `vv`: the products of these edges.
     """
 
     def at(s: Array, t: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Data sets in the layouts in which they circulate: which shapes there are, which pairs, and what is true.
+"""Data sets in their published layouts: shapes, pairs and ground truth.
 
-None of them comes with this library; their licences do not allow it. Where each is obtained stands in
-`docs/datasets.md`.
+No data set comes with this library, because the licences do not allow copies. `docs/datasets.md` says where
+to obtain each data set.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.map_files import IndexBase
 from jaxsmw.io.mesh_files import MESH_SUFFIXES
 
 
 @dataclass(frozen=True)
 class DataPair:
-    """Two shapes of a data set and where it says which points are the same.
+    """Two shapes of a data set, with the files of their ground truth.
 
     **Attributes:**
 
-    - `source`, `target`: names of X and Y.
-    - `source_file`, `target_file`: their meshes.
-    - `truth`: the files `read_ground_truth` reads; none where vertex i is vertex i.
-    - `mirrored_truth`: the same for the left-right mirrored body; None where there is none.
-    - `index_base`: what the indices in these files count from; None for what their form says.
-    - `partial`: whether the source is only a part of the target, in the same unit of length.
+    - `source`, `target`: the names of X and Y.
+    - `source_file`, `target_file`: the mesh files of X and Y.
+    - `truth`: the files for `read_ground_truth`; empty if vertex i of X corresponds to vertex i of Y.
+    - `mirrored_truth`: the files of the left-right mirrored ground truth; None if there are none.
+    - `index_base`: the index of the first vertex in these files; None for the default of their format.
+    - `partial`: whether the source is a partial shape of the target, in the same unit of length.
     """
 
     source: str
@@ -47,24 +47,24 @@ class DataPair:
 
     @property
     def name(self) -> str:
-        """For messages and tables."""
+        """The names of both shapes, for messages and progress bars."""
         return f"{self.source} to {self.target}"
 
     @property
     def names(self) -> tuple[str, str]:
-        """Of source and target."""
+        """The names of source and target."""
         return self.source, self.target
 
     @property
     def meshes(self) -> tuple[Path, Path]:
-        """The files of source and target."""
+        """The mesh files of source and target."""
         return self.source_file, self.target_file
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
-        """The truth about the pair, given its meshes.
+        """Returns the ground truth of the pair, or the mirrored ground truth.
 
-        **Raises:** `InputError` if a file is wrong, there is no mirrored truth, or vertices that should be
-        the same differ in number.
+        **Raises:** `InputError` if a file is wrong, if there is no mirrored ground truth, or if the meshes
+        should have the same vertices but differ in their number.
         """
         files = self.mirrored_truth if mirrored else self.truth
         if files is None:
@@ -75,21 +75,21 @@ class DataPair:
         if m != n:
             raise InputError(
                 f"{self.target_file}: has {n} vertices where {self.source_file} has {m}, but in this data "
-                "set vertex i of one is vertex i of the other: give the original files."
+                "set vertex i of one shape corresponds to vertex i of the other: give the original files."
             )
         return GroundTruth.of_all_vertices(np.arange(m))
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """What was found in a directory.
+    """The shapes and pairs in a directory.
 
     **Attributes:**
 
-    - `directory`: where.
-    - `layout`: what was recognised, in words.
-    - `pairs`: the pairs to be matched, in the set's own order where it has one.
-    - `others`: further pairs whose truth is known.
+    - `directory`: the directory.
+    - `layout`: the name of the recognised layout.
+    - `pairs`: the pairs to match, in the order of the data set's own list if there is one.
+    - `others`: further pairs with ground truth.
     """
 
     directory: Path
@@ -99,12 +99,12 @@ class DataSet:
 
     @property
     def name(self) -> str:
-        """The directory's name."""
+        """The name of the directory."""
         return self.directory.resolve().name
 
     @property
     def shapes(self) -> dict[str, Path]:
-        """The meshes that occur in pairs, by name."""
+        """The mesh files of all shapes that occur in pairs, by name."""
         found = {}
         for pair in (*self.pairs, *self.others):
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
@@ -112,48 +112,57 @@ class DataSet:
 
 
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
-    """Recognise a data set by its files.
+    """Recognises a data set by its files.
 
-    - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): meshes in one folder (`off/`,
-      `shapes/`, …), for each a `corres/NAME.vts`, perhaps `corres/NAME.sym.vts`.
-    - **SHREC'19 humans** (Melzi et al. 2019): meshes `1.obj`, … and for pairs `I_J.txt` in a folder
-      `FARMgt_txt`; or, remeshed, `I_J.map` in `corres/`.
-    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` and `cuts/` or `holes/`; pairs are part to null.
-    - **SHREC'16 topology** (Lähner et al. 2016): `kid00` and `kidNN` with `kidNN_ref.txt`; pairs are
+    - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): the meshes in one folder (`off/`,
+      `shapes/`, …), and for each mesh a `corres/NAME.vts` and optionally a `corres/NAME.sym.vts`.
+    - **SHREC'19 humans** (Melzi et al. 2019): meshes `1.obj`, … and for each pair `I_J.txt` in a folder
+      `FARMgt_txt`; in the remeshed version `I_J.map` in `corres/`.
+    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` and `cuts/` or `holes/`; the pairs are partial shape
+      to full shape.
+    - **SHREC'16 topology** (Lähner et al. 2016): `kid00`, and `kidNN` with `kidNN_ref.txt`; the pairs are
       `kidNN` to `kid00`.
-    - **FAUST registrations** `tr_reg_NNN`, **SCAPE** `meshNNN`, **TOSCA** (`cat0`, …): meshes alone, flat or
-      in one folder; vertex i is vertex i, in TOSCA within a class.
+    - **FAUST registrations** `tr_reg_NNN`, **SCAPE** `meshNNN`, **TOSCA** (`cat0`, …): meshes only, in the
+      directory or in one folder. Vertex i corresponds to vertex i, in TOSCA within a class.
 
-    Pairs are those of a list where there is one (`test_pairs.txt`, `PAIRS_list_….txt`: two names per line);
-    else all ordered pairs of different shapes, within a class where names have one (`cat0`, `cat1`).
-    A directory that holds several sets is none.
+    The pairs are those of the list that comes with a data set (`test_pairs.txt`, `PAIRS_list_….txt`: two
+    names per line). Without a list, the pairs are all ordered pairs of different shapes, within a class if
+    names have one (`cat0`, `cat1`). A directory that holds several data sets is not a data set.
 
-    **Raises:** `InputError` that says what was expected, or what is missing.
+    **Raises:** `InputError` with the expected layouts, or with the missing file.
     """
+    # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+    if not os.path.isdir(directory):
+        raise InputError(f"{directory}: is not a directory: give the directory of an unpacked data set.")
     directory = Path(directory)
-    if not directory.is_dir():
-        raise InputError(f"{directory}: is not a directory: give the one that a data set was unpacked to.")
-    inner = [folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _is_a_set(folder)]
+    try:
+        inner = [folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _is_a_set(folder)]
+        found = _recognise(directory) if len(inner) < 2 else None
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or directory}: cannot be read ({error.strerror}): check its permissions."
+        ) from error
     if len(inner) > 1:
         raise InputError(
-            f"{directory}: holds several data sets ({', '.join(folder.name for folder in inner)}): give one."
+            f"{directory}: holds several data sets ({', '.join(folder.name for folder in inner)}): give the "
+            "directory of one data set."
         )
-    found = _recognise(directory)
     if found is None:
         raise InputError(
-            f"{directory}: is not laid out like a data set that is known ({'; '.join(_EXPECTED)}): give the "
-            "directory that one was unpacked to."
+            f"{directory}: is not laid out like a known data set ({'; '.join(_EXPECTED)}): give the "
+            "directory of an unpacked data set."
         )
     layout, (pairs, others) = found
     if not pairs:
         raise InputError(
-            f"{directory}: looks like {layout}, but no two of its shapes make a pair: complete the copy."
+            f"{directory}: has the layout of {layout}, but no two of its shapes form a pair: complete "
+            "the copy."
         )
     return DataSet(directory, layout, tuple(pairs), tuple(others))
 
 
 def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
-    """The first layout that fits a directory, and its pairs."""
+    """Returns the first layout that fits a directory, and its pairs; None if no layout fits."""
     for layout, open_layout in _LAYOUTS.items():
         if (pairs := open_layout(directory)) is not None:
             return layout, pairs
@@ -179,27 +188,27 @@ _EXPECTED = (
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A sort key that puts cat2 before cat10."""
+    """Returns a sort key that puts cat2 before cat10."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", name)]
 
 
 def _meshes(directory: Path) -> dict[str, Path]:
-    """The mesh files in a directory, by name and in natural order."""
+    """Returns the mesh files in a directory, by name and in natural order."""
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
     found: dict[str, Path] = {}
     for file in sorted(files, key=lambda file: MESH_SUFFIXES.index(file.suffix.lower())):
-        found.setdefault(file.stem, file)  # of two formats of one shape the first in the list
+        found.setdefault(file.stem, file)  # two formats of one shape: the first in the list counts
     return {name: found[name] for name in sorted(found, key=_natural)}
 
 
-# Pairs to be matched and further ones whose truth is known.
+# The pairs to match, and further pairs with ground truth.
 _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Meshes with such names, in a directory or in the first folder of it that has any."""
+    """Returns the meshes with such names in a directory, or in its first folder with any such mesh."""
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
         found = {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}
@@ -209,7 +218,7 @@ def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """The pairs of a list that comes with a data set; None without one."""
+    """Returns the pairs of the list that comes with a data set; None without a list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
     if not lists:
         return None
@@ -217,11 +226,12 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 
 
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
-    """Read a list of pairs: in each line the names of source and target, with spaces or a comma between.
+    """Reads a list of pairs: the names of source and target on each line, with spaces or a comma between.
 
-    What follows a `#` does not count.
+    The rest of a line after `#` is a comment.
 
-    **Raises:** `InputError` that names the line that is not two of the shapes, or if there is no pair.
+    **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if
+    there is no pair.
     """
     path, known, pairs = Path(path), set(shapes), []
     try:
@@ -234,7 +244,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
             continue
         wrong = [name for name in names if name not in known]
         if len(names) != 2 or wrong:
-            fault = f"{wrong[0][:60]!a} is none of the shapes" if wrong else "does not name two shapes"
+            fault = f"{wrong[0][:60]!a} is not one of the shapes" if wrong else "does not name two shapes"
             raise InputError(f"{path}, line {number}: {fault}: correct the line, or complete the data set.")
         pairs.append((names[0], names[1]))
     if not pairs:
@@ -242,8 +252,42 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     return pairs
 
 
+def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataPair]:
+    """Chooses pairs of a data set.
+
+    **Arguments:**
+
+    - `wanted`: a number of pairs, drawn without replacement (all pairs if there are fewer); or the path of a
+      list of pairs with ground truth (see `read_pairs`), where repeated pairs count once; or None for all
+      pairs of the data set.
+    - `seed`: the seed of the draw.
+
+    **Returns:** The pairs, in the order of the data set or of the list.
+
+    **Raises:** `InputError` if the number is not positive, if the list cannot be read, or if a listed pair
+    has no ground truth.
+    """
+    pairs = list(data_set.pairs)
+    if wanted is None:
+        return pairs
+    if re.fullmatch(r"[+-]?\d+", wanted):
+        count = int(wanted)
+        if count < 1:
+            raise InputError(f"{count} pairs cannot be measured: ask for at least 1.")
+        rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
+        return [pairs[row] for row in np.sort(rows)]
+    known = {pair.names: pair for pair in (*pairs, *data_set.others)}
+    listed = read_pairs(wanted, data_set.shapes)
+    if unknown := [names for names in listed if names not in known]:
+        raise InputError(
+            f"{wanted}: {data_set.directory} has no ground truth for {' to '.join(unknown[0])}: remove the "
+            "pair from the list."
+        )
+    return [known[names] for names in dict.fromkeys(listed)]
+
+
 def class_of(name: str) -> str:
-    """What the name of a shape says about its kind: all but the number at its end."""
+    """Returns the class of a shape: its name without the number at the end."""
     return re.sub(r"[_-]?\d+$", "", name)
 
 
@@ -256,7 +300,7 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """The listed pairs, if there is a list, and others whose truth is known; else all of these."""
+    """Returns the listed pairs, or all pairs if there is no list, and the other pairs with ground truth."""
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)
     return [pair(*names) for names in wanted], [pair(*names) for names in others]
@@ -272,17 +316,17 @@ def _remeshed(directory: Path) -> _Pairs | None:
     shapes = next((found for found in map(_meshes, folders) if set(found) & set(plain)), {})
     if not shapes:
         raise InputError(
-            f"{directory}: has {len(plain)} .vts files in corres/, but no folder with the meshes they belong "
-            "to: put those beside it, in off/."
+            f"{directory}: has {len(plain)} .vts files in corres/, but no folder with their meshes: put the "
+            "meshes into off/ beside corres/."
         )
     if missing := [name for name in shapes if name not in plain]:
         raise InputError(
-            f"{truths / missing[0]}.vts: is missing, the ground truth of {shapes[missing[0]]}: complete the "
+            f"{truths / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: complete the "
             "copy, or remove the mesh."
         )
     if missing := [name for name in plain if name not in shapes]:
         raise InputError(
-            f"{directory}: has no mesh for {plain[missing[0]]}: complete the copy, or remove the file."
+            f"{directory}: has no mesh for {plain[missing[0]]}: complete the copy, or remove the .vts file."
         )
 
     def pair(x: str, y: str) -> DataPair:
@@ -308,7 +352,10 @@ def _shrec19(directory: Path) -> _Pairs | None:
 
     def pair(x: str, y: str) -> DataPair:
         if (x, y) not in truths:
-            raise InputError(f"{directory}: the ground truth {x}_{y} of a listed pair is missing: add it.")
+            raise InputError(
+                f"{directory}: the ground truth {x}_{y} of a listed pair is missing: add the file, or remove "
+                "the pair from the list."
+            )
         return DataPair(x, y, shapes[x], shapes[y], (truths[x, y],), index_base=1)
 
     known = [names for names in truths if set(names) <= set(shapes)]
@@ -316,27 +363,26 @@ def _shrec19(directory: Path) -> _Pairs | None:
 
 
 def _partial(directory: Path) -> _Pairs | None:
-    nulls = _meshes(directory / "null")
-    parts = {**_meshes(directory / "cuts"), **_meshes(directory / "holes")}
-    if not nulls and not parts:
+    full = _meshes(directory / "null")
+    partial = {**_meshes(directory / "cuts"), **_meshes(directory / "holes")}
+    if not full and not partial:
         return None
-    if not nulls or not parts:
-        found = "cuts/ or holes/ but no null/" if parts else "null/ but no cuts/ or holes/"
-        raise InputError(f"{directory}: has {found}: put all of them there.")
+    if not full or not partial:
+        found = "cuts/ or holes/ but no null/" if partial else "null/ but no cuts/ or holes/"
+        raise InputError(f"{directory}: has {found}: complete the copy.")
     pairs = []
-    for name, file in parts.items():
+    for name, file in partial.items():
         match = re.fullmatch(r"(?:cuts|holes)_(.+)_shape_\d+", name)
-        if match is None or match[1] not in nulls:
+        if match is None or match[1] not in full:
             raise InputError(
-                f"{file}: no full shape in {directory / 'null'} belongs to it: parts are called "
-                "cuts_NULL_shape_N or holes_NULL_shape_N."
+                f"{file}: the full shape of this partial shape is not in {directory / 'null'}: name partial "
+                "shapes cuts_FULL_shape_N or holes_FULL_shape_N, or complete the copy."
             )
         truth, mirrored = (file.with_suffix(suffix) for suffix in (".baryc_gt", ".baryc_gt_sym"))
         if not truth.is_file():
-            raise InputError(f"{truth}: is missing, the ground truth of {file}: complete the copy.")
-        null = match[1]
-        sides = (mirrored,) if mirrored.is_file() else None
-        pairs.append(DataPair(name, null, file, nulls[null], (truth,), sides, partial=True))
+            raise InputError(f"{truth}: the ground truth of {file} is missing: complete the copy.")
+        target, sides = match[1], (mirrored,) if mirrored.is_file() else None
+        pairs.append(DataPair(name, target, file, full[target], (truth,), sides, partial=True))
     return pairs, []
 
 
@@ -345,18 +391,19 @@ def _topology(directory: Path) -> _Pairs | None:
     if not shapes:
         return None
     if "kid00" not in shapes:
-        raise InputError(f"{directory}: has kids but no kid00, to which all others are matched: add it.")
+        raise InputError(f"{directory}: has no kid00, the target of all other kids: complete the copy.")
     full = shapes.pop("kid00")
     pairs = []
     for name, file in shapes.items():
         truth = file.with_name(f"{name}_ref.txt")
         if not truth.is_file():
-            raise InputError(f"{truth}: is missing, the ground truth of {file}: complete the copy.")
+            raise InputError(f"{truth}: the ground truth of {file} is missing: complete the copy.")
         pairs.append(DataPair(name, "kid00", file, full, (truth,)))
     return pairs, []
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
+    """Returns the layout of meshes with such names, in which vertex i corresponds to vertex i."""
     pattern = re.compile(names)
 
     def open_layout(directory: Path) -> _Pairs | None:
@@ -365,7 +412,7 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
             return None
         above = directory.resolve().parent
         if any((above / "corres").glob("*.vts")):
-            raise InputError(f"{directory}: holds only the meshes of a remeshed set: give {above}.")
+            raise InputError(f"{directory}: is only the mesh folder of a remeshed set: give {above}.")
 
         def pair(x: str, y: str) -> DataPair:
             return DataPair(x, y, shapes[x], shapes[y])
@@ -375,6 +422,7 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     return open_layout
 
 
+# The function of each layout returns the pairs of a directory, or None if the directory has another layout.
 _LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
     "a remeshed set": _remeshed,
     "SHREC'19 humans": _shrec19,

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.map_files import IndexBase, Table
+from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
 # How far weights in a file, printed with few digits, may lie below 0 and their sum from 1.
@@ -27,12 +28,12 @@ _WEIGHT_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """Which points of Y some vertices of X are, in truth.
+    """The true points on Y of some vertices of X.
 
     **Attributes:**
 
-    - `source_vertices`: vertices of X (p,), 0-based; each any number of times, or never.
-    - `targets`: the same points on Y (p,), as 0-based vertices or as `SurfacePoints`.
+    - `source_vertices`: 0-based vertices of X (p,); a vertex may occur several times, or never.
+    - `targets`: the true point of each source vertex (p,), as 0-based vertices of Y or as `SurfacePoints`.
     """
 
     source_vertices: Int64[np.ndarray, " p"]
@@ -42,21 +43,21 @@ class GroundTruth:
         if len(self.source_vertices) != len(self.targets):
             raise InputError(
                 f"ground truth: there are {len(self.source_vertices)} source vertices and "
-                f"{len(self.targets)} targets: give one target for each."
+                f"{len(self.targets)} targets: give one target for each source vertex."
             )
 
     @classmethod
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
-        """The targets of vertices 0, 1, … of X, in this order."""
+        """Returns the ground truth in which vertices 0, 1, … of X have these targets, in this order."""
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-        """A pointwise map X -> Y: every vertex gets the target of the nearest one that has one.
+        """Returns a map X -> Y (m,): each vertex takes the target of the nearest vertex with ground truth.
 
         **Raises:** `InputError` if the targets are not vertices.
         """
         if not isinstance(self.targets, np.ndarray):
-            raise InputError("ground truth: its targets are points on triangles, where vertices are needed.")
+            raise InputError("ground truth: its targets are points on triangles: give vertices as targets.")
         _, nearest = KDTree(mesh_x.vertices[self.source_vertices]).query(mesh_x.vertices)
         return self.targets[nearest]
 
@@ -68,28 +69,27 @@ def read_ground_truth(
     *,
     index_base: IndexBase | None = None,
 ) -> GroundTruth:
-    """Read the ground truth of a pair of meshes.
+    """Reads the ground truth of a pair of meshes.
 
-    The suffix and the number of columns tell the form:
+    The suffix and the number of columns determine the format:
 
-    - two `.vts` files, the source's first: one vertex per line, and equal lines are the same point; 1-based.
-      Two files with other suffixes are read alike, but 0-based.
+    - two `.vts` files, first the file of the source: one vertex per line; line i of both files is the same
+      point; 1-based. Two files with other suffixes have the same format, but are 0-based.
     - `.baryc_gt` or `.baryc_gt_sym`: for each source vertex a face of the target and three barycentric
       weights; 1-based.
     - two columns: a source vertex and its target vertex; 1-based.
-    - one column: for each source vertex its target vertex; 0-based, in `.mat` files 1-based, as
-      `write_pointwise_map` writes.
+    - one column: for each source vertex its target vertex; 0-based, and 1-based in `.mat` files, as written
+      by `write_pointwise_map`.
 
-    The truth of the mirrored body (`.sym.vts`, `.baryc_gt_sym`) is ground truth like any other.
+    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) are read like all others.
 
     **Arguments:**
 
-    - `paths`: one file, or the two of a pair.
+    - `paths`: one file, or the two files of a pair.
     - `mesh_x`, `mesh_y`: source X and target Y.
-    - `index_base`: what the files' indices count from, where it is not what the list says.
+    - `index_base`: the number of the first vertex and face in the files; by default that of the format.
 
-    **Returns:** A `GroundTruth`, without what the files say of vertices of X that no face uses; a warning
-    counts them.
+    **Returns:** A `GroundTruth` without unreferenced vertices of X; a warning gives their number.
 
     **Raises:** `InputError` that names the file, the line and the fault.
     """
@@ -100,11 +100,12 @@ def read_ground_truth(
         return truth
     if not used.any():
         raise InputError(
-            f"{files[0]}: is about vertices that no face of {mesh_x.name} uses: give the truth of this mesh."
+            f"{files[0]}: has only vertices that no face of {mesh_x.name} references: give the ground truth "
+            "of this mesh."
         )
     warnings.warn(
-        f"{files[0]}: {(~used).sum()} of {len(used)} points are vertices that no face of {mesh_x.name} uses; "
-        "they are left out",
+        f"{files[0]}: {(~used).sum()} of {len(used)} points are vertices that no face of {mesh_x.name} "
+        "references; these points are left out",
         stacklevel=2,
     )
     return GroundTruth(truth.source_vertices[used], truth.targets[used])
@@ -112,14 +113,14 @@ def read_ground_truth(
 
 def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None) -> GroundTruth:
     if len(files) not in (1, 2):
-        raise InputError(f"ground truth: {len(files)} files were given: give one, or the two of a pair.")
+        raise InputError(f"ground truth: {len(files)} files were given: give one file, or the two of a pair.")
 
     if len(files) == 2:
         tables = [Table(file, columns=1) for file in files]
         if tables[0].rows != tables[1].rows:
             raise InputError(
                 f"{files[1]}: has {tables[1].rows} lines where {files[0]} has {tables[0].rows}, "
-                "but equal lines should be the same point: give two files of one set."
+                "but line i of both must be the same point: give two files of one data set."
             )
         bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
         sides = zip(tables, (mesh_x, mesh_y), bases, strict=True)
@@ -139,29 +140,31 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         return GroundTruth(table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base))
     if table.columns != 1:
         raise InputError(
-            f"{file}, line 1: has {table.columns} numbers: give a truth with one per line (target vertex) "
-            "or two (source and target vertex), or with the suffix .baryc_gt four (face and weights)."
+            f"{file}, line 1: has {table.columns} numbers: give a file with one per line (target vertex), "
+            "with two (source and target vertex), or a .baryc_gt file with four (face and weights)."
         )
     table.require_rows(mesh_x)
     return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.index_base(index_base)))
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
-    """Write the points that all vertices of X are, as a `.baryc_gt` file (see `read_ground_truth`).
+    """Writes the true points of all vertices of X as a `.baryc_gt` file (see `read_ground_truth`).
 
     **Arguments:**
 
-    - `path`: the file to create or to replace; with the suffix `.baryc_gt`, or it will not be read as such.
-    - `ground_truth`: of vertices 0, 1, … of X, with `SurfacePoints` as targets. (Where the targets are
-      vertices, `write_pointwise_map` writes them.)
-    - `mesh_y`: the target Y. Faces get the numbers of its file, which counts those that reading dropped, too.
+    - `path`: the file to create or to replace; `read_ground_truth` needs the suffix `.baryc_gt`.
+    - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
+      (`write_pointwise_map` writes targets that are vertices.)
+    - `mesh_y`: the target Y. Faces are numbered as in its file, including faces that were dropped on reading.
 
-    **Raises:** `InputError` if the ground truth is another or the file cannot be written.
+    **Raises:** `InputError` if the ground truth is of another kind, or if the file cannot be written.
     """
     points = ground_truth.targets
     in_order = np.array_equal(ground_truth.source_vertices, np.arange(len(points)))
     if not isinstance(points, SurfacePoints) or not in_order:
-        raise InputError(f"{path}: a .baryc_gt file needs a point on a face for each source vertex in order.")
+        raise InputError(
+            f"{path}: a .baryc_gt file needs a point on a face for each source vertex, in order."
+        )
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii") as file:
         for face, weights in zip(
             mesh_y.face_numbers[points.faces].tolist(), points.weights.tolist(), strict=True

@@ -1,4 +1,4 @@
-"""How sure a mean is."""
+"""Means with bootstrap confidence intervals."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ RESAMPLES = 9999
 
 
 class Interval(NamedTuple):
-    """A mean difference with its bootstrap confidence interval."""
+    """A mean with the ends of its bootstrap confidence interval."""
 
     mean: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """With signs; a dash where there is no mean."""
+        """The mean and the interval with signs; a dash if the mean is NaN."""
         if np.isnan(self.mean):
             return "—"
         if np.isnan(self.low):
@@ -29,16 +29,22 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
-    """The mean of a sample and its bias-corrected and accelerated bootstrap interval (Efron 1987).
+    """Returns the mean of a sample and its bias-corrected and accelerated bootstrap interval (Efron 1987).
 
-    `seed` is of the resampling. The interval is NaN for fewer than three values, and all for none.
+    **Arguments:**
+
+    - `values`: the sample (p,).
+    - `seed`: the seed of the resampling.
+
+    **Returns:** The mean and its interval of confidence `CONFIDENCE`. For fewer than three values the
+    interval is NaN; for no values the mean is NaN, too.
     """
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
-    if len(values) < 3:  # too few to say anything
+    if len(values) < 3:  # too few for a bootstrap
         return Interval(mean, np.nan, np.nan)
-    if np.ptp(values) == 0:  # as of the default with itself
+    if np.ptp(values) == 0:  # for which the BCa interval is undefined
         return Interval(mean, mean, mean)
     found = bootstrap(
         (values,),

@@ -1,4 +1,4 @@
-"""Results on disk that survive an interruption at any moment, and are never mixed with those of others."""
+"""Result files that survive an interruption at any moment, and never mix results of different origin."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -18,36 +18,50 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
+"""One row of a journal: text by the name of its column."""
+
+Columns = Mapping[str, Callable[[str], Any]]
+"""The columns of a journal in order, each with the function that reads its text or raises a `ValueError`."""
 
 
 class Journal:
-    """A CSV file that grows by whole rows: what was appended once is there for good.
+    """A CSV file that grows by whole rows; appended rows stay.
 
-    A line that a killed process left half written is cut off when the file is opened again.
+    If a process was killed while it wrote a line, the unfinished line is cut off when the file is opened
+    again.
 
     **Arguments:**
 
-    - `path`: the file; it need not be there yet.
-    - `key`: the columns that tell rows apart. Of two rows with the same key the first counts.
+    - `path`: the file, which need not exist yet.
+    - `key`: the columns that identify a row. If two rows have the same key, the first row counts.
+    - `columns`: the columns that the file must have, each with the function that checks its values; by
+      default any columns that include the key.
+
+    **Raises:** `InputError` if the file is not such a table. The file is then left as it is.
     """
 
-    def __init__(self, path: Path, key: Sequence[str]):
+    def __init__(self, path: Path, key: Sequence[str], columns: Columns | None = None):
         self.path = path
         self.key = tuple(key)
-        self._fields: list[str] = []
+        self._fields: list[str] = [] if columns is None else list(columns)
         self._rows: dict[tuple[str, ...], Row] = {}
-        if path.exists():
+        if not path.exists():
+            return
+        try:
             contents = path.read_bytes()
-            whole = contents.rfind(b"\n") + 1
-            if whole < len(contents):
-                os.truncate(path, whole)
-            reader = csv.DictReader(io.StringIO(contents[:whole].decode()))
-            self._fields = list(reader.fieldnames or [])
-            self._remember(reader)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}): {self._cure}.") from error
+        whole = contents.rfind(b"\n") + 1
+        if whole:
+            self._read(contents[:whole], columns or {})
+        elif not _line(self._fields).encode().startswith(contents) and columns is not None:
+            raise self._fault(1, f"is not the header {','.join(self._fields)}")
+        if whole < len(contents):
+            os.truncate(path, whole)
 
     @property
     def rows(self) -> list[Row]:
-        """All rows, in the order of their keys' first appearance; every value is text."""
+        """All rows, in the order in which their keys first appeared; every value is text."""
         return list(self._rows.values())
 
     def __contains__(self, key: Sequence[Any]) -> bool:
@@ -57,33 +71,83 @@ class Journal:
         return self._rows[tuple(map(str, key))]
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Add rows, all with the same columns, and return when they are on the disk."""
+        """Adds rows with the columns of the file, and returns when the rows are on the disk.
+
+        **Raises:** `InputError` if the file has other columns, or if it cannot be written.
+        """
         if not rows:
             return
         text = io.StringIO()
-        header = not self._fields
-        self._fields = self._fields or list(rows[0])
-        writer = csv.DictWriter(text, self._fields, lineterminator="\n")
-        if header:
-            writer.writeheader()
-        writer.writerows(rows)
-        with self.path.open("ab") as file:
-            file.write(text.getvalue().encode())
-            file.flush()
-            os.fsync(file.fileno())
+        fields = self._fields or list(rows[0])
+        if other := [row for row in rows if set(row) != set(fields)]:
+            raise InputError(
+                f"{self.path}: has the columns {', '.join(fields)}, but a result has {', '.join(other[0])}: "
+                "give another --output, or remove the file."
+            )
+        writer = csv.DictWriter(text, fields, lineterminator="\n")
+        try:
+            with self.path.open("ab") as file:
+                if file.tell() == 0:
+                    writer.writeheader()
+                writer.writerows(rows)
+                file.write(text.getvalue().encode())
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be written ({error.strerror}): make room there, or give another "
+                "--output."
+            ) from error
+        self._fields = fields
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrite the file with its rows in a given order; workers side by side did not keep one."""
+        """Rewrites the file with its rows in the order of `keys`; workers finish in an arbitrary order."""
         self._rows = {tuple(map(str, key)): self._rows[tuple(map(str, key))] for key in keys}
         with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._fields, lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows)
 
+    def _read(self, contents: bytes, columns: Columns) -> None:
+        """Reads whole lines, and remembers their rows."""
+        try:
+            reader = csv.reader(io.StringIO(contents.decode(), newline=""), strict=True)
+            lines = [(reader.line_num, fields) for fields in reader]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{self.path}: is not a table of results ({error}): {self._cure}.") from error
+        _, header = lines[0]
+        if columns and header != self._fields:
+            raise self._fault(1, f"is not the header {','.join(self._fields)}")
+        if len(set(header)) < len(header) or not set(self.key) <= set(header):
+            raise self._fault(1, f"is not a header with the columns {', '.join(self.key)}")
+        self._fields = header
+        for number, fields in lines[1:]:
+            if len(fields) != len(header):
+                raise self._fault(number, f"has {len(fields)} values for {len(header)} columns")
+            for name, value in zip(header, fields, strict=True):
+                try:
+                    columns.get(name, str)(value)
+                except ValueError:
+                    raise self._fault(number, f"has {value[:40]!a} in the column {name}") from None
+        self._remember(dict(zip(header, fields, strict=True)) for _, fields in lines[1:])
+
+    def _fault(self, line: int, what: str) -> InputError:
+        return InputError(f"{self.path}, line {line}: {what}: {self._cure}.")
+
+    @property
+    def _cure(self) -> str:
+        return "restore the file, or remove it to measure its rows again"
+
     def _remember(self, rows: Iterable[Row]) -> None:
         for row in rows:
             self._rows.setdefault(tuple(row[name] for name in self.key), row)
+
+
+def _line(fields: Sequence[str]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(fields)
+    return text.getvalue()
 
 
 @contextmanager
@@ -92,23 +156,37 @@ def claimed_directory(
     provenance: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[None]:
-    """Keep other processes out of a directory while results are added to it.
+    """Keeps other processes out of a directory while results are added.
 
-    What these come from is noted in `provenance.json`, or found there to be the same. `noted` are facts
-    about the first time that may differ later.
+    The first call writes the origin of the results to `provenance.json`; later calls compare with that file.
 
-    **Raises:** `InputError` if the directory holds results that come from something else, or another
-    process is adding to it.
+    **Arguments:**
+
+    - `directory`: an existing directory.
+    - `provenance`: groups of settings that all results in the directory must share.
+    - `noted`: facts about the first call that may differ later.
+
+    **Raises:** `InputError` if the directory holds results of another origin, if `provenance.json` is
+    damaged, or if another process is adding results.
     """
+    # The operating system releases the lock however the process ends.
+    lock = FileLock(directory / ".lock", timeout=0)
     try:
-        # The operating system lets go of the lock however the process ends.
-        with FileLock(directory / ".lock", timeout=0):
-            _check_origin(directory, provenance, noted)
-            yield
+        lock.acquire()
     except Timeout:
         raise InputError(
             f"{directory}: another run is adding results: wait for its end, or give another --output."
         ) from None
+    except OSError as error:
+        raise InputError(
+            f"{directory}: cannot be locked ({error.strerror}): give another --output, or remove the "
+            "directory."
+        ) from error
+    try:
+        _check_origin(directory, provenance, noted)
+        yield
+    finally:
+        lock.release()
 
 
 def _check_origin(
@@ -117,10 +195,7 @@ def _check_origin(
     path = directory / "provenance.json"
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
-        try:
-            found = json.loads(path.read_text("utf-8"))
-        except ValueError:
-            raise InputError(f"{path}: is damaged: give another --output, or remove the directory.") from None
+        found = _read_provenance(path)
         found.pop("noted", None)
         for group in {**found, **wanted}:
             before, now = found.get(group, {}), wanted.get(group, {})
@@ -136,3 +211,13 @@ def _check_origin(
         contents = {**wanted, "noted": dict(noted)} if noted else wanted
         with atomic_write(path) as temporary:
             temporary.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
+
+
+def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(group, dict) for group in found.values()):
+        raise InputError(f"{path}: is damaged: give another --output, or remove the directory.")
+    return found

@@ -1,4 +1,4 @@
-"""How good a pointwise map is: geodesic errors, their statistics, and coverage."""
+"""The quality of a pointwise map: geodesic errors, their statistics, and coverage."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# What is usually reported, in square roots of the target's area: shares within these, curves up to the last.
+# In square roots of the target's area: the thresholds of reported shares, and the end of reported curves.
 THRESHOLDS = (0.02, 0.05, 0.1)
 LARGEST_THRESHOLD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class GeodesicError:
-    """How far from the truth a map takes each evaluated point, in square roots of the target's area.
+    """The geodesic errors of a map at some points, in square roots of the target's area.
 
     **Attributes:**
 
-    - `errors`: one for each evaluated row of the ground truth (p,); inf where the image lies on another
-      component of the target than the truth.
-    - `source_vertices`: the vertices of X they belong to (p,).
-    - `method`: how distances were computed.
+    - `errors`: the error of each evaluated row of the ground truth (p,); inf where the image and the true
+      point lie on different connected components of the target.
+    - `source_vertices`: the vertex of X for each error (p,).
+    - `method`: the method that computed the distances.
     """
 
     errors: Float64[np.ndarray, " p"]
@@ -43,18 +43,18 @@ class GeodesicError:
 
     @property
     def unreachable(self) -> float:
-        """The share of points whose image lies on another component than the truth."""
+        """The share of points whose image lies on another connected component than the true point."""
         return float(np.isinf(self.errors).mean())
 
     @property
     def mean(self) -> float:
-        """The mean over the points that are not `unreachable`: look at both; inf if there are none."""
+        """The mean over the points that are not `unreachable`; inf if all points are. Report both numbers."""
         reachable = self.errors[np.isfinite(self.errors)]
         return float(reachable.mean()) if len(reachable) else np.inf
 
     @property
     def median(self) -> float:
-        """The median over all points; an unreachable one counts as farther than any other."""
+        """The median over all points, where unreachable points have an infinite error."""
         return float(np.median(self.errors))
 
     @property
@@ -73,7 +73,7 @@ class GeodesicError:
         )
 
     def as_dictionary(self) -> dict[str, Any]:
-        """The main figures and the curve as JSON has them; None where one is infinite."""
+        """Returns the main figures and the curve for JSON; None where a figure is infinite."""
         thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
             "mean": self.mean if np.isfinite(self.mean) else None,
@@ -90,15 +90,17 @@ class GeodesicError:
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
-        """The share of points with an error of at most each threshold (Kim, Lipman and Funkhouser 2011)."""
+        """Returns the share of points with an error of at most each threshold (Kim et al. 2011)."""
         counts = np.searchsorted(np.sort(self.errors), np.asarray(thresholds), side="right")
         return counts / len(self.errors)
 
     def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
-        """The mean height of the correspondence quality curve between 0 and a largest threshold.
+        """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
 
-        Exact: the curve is a step at each error e, so its mean height is the mean of `max(0, 1 - e/largest)`.
-        1 is a perfect map.
+        The curve has a step at each error e, so its mean height is exactly the mean of
+        `max(0, 1 - e/largest)`. A perfect map has 1.
+
+        **Raises:** `InputError` if the threshold is not positive.
         """
         if not largest > 0:
             raise InputError(f"the largest threshold is {largest}: give a positive number.")
@@ -114,25 +116,25 @@ def geodesic_error(
     number_of_samples: int | None = None,
     seed: int = 0,
 ) -> GeodesicError:
-    """The geodesic distance on the target between where a map takes points and where they belong.
+    """Computes the geodesic distances on the target between the images of points and their true points.
 
-    Divided by the square root of the target's area, as everyone does since Kim, Lipman and Funkhouser (2011),
-    so that neither the unit nor the size of the body matters.
+    Distances are divided by the square root of the target's area (Kim, Lipman and Funkhouser 2011), so errors
+    do not depend on the unit or the size of a shape.
 
     **Arguments:**
 
     - `mesh_y`: the target Y.
-    - `pointwise_map`: T: X -> Y (m,): 0-based vertices of Y, or `SurfacePoints` on it.
-    - `ground_truth`: which points of Y which vertices of X are.
-    - `method`: see `jaxsmw.geometry.geodesics.geodesic_distances`.
-    - `number_of_samples`: evaluate so many rows of the ground truth, drawn without replacement; all by
-      default, and if there are no more.
-    - `seed`: of the draw.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y, or `SurfacePoints` on Y.
+    - `ground_truth`: the true points on Y of some vertices of X.
+    - `method`: the method for distances; see `jaxsmw.geometry.geodesics.geodesic_distances`.
+    - `number_of_samples`: the number of evaluated rows of the ground truth, drawn without replacement; all
+      rows by default, or if there are fewer.
+    - `seed`: the seed of the draw.
 
     **Returns:** A `GeodesicError`.
 
-    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, or if `"exact"`
-    cannot be used.
+    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, if fewer than 1
+    sample is asked for, or if the method `"exact"` is not available.
     """
     images = check_points(pointwise_map, mesh_y, "pointwise map")
     targets = check_points(ground_truth.targets, mesh_y, "ground truth")
@@ -154,7 +156,9 @@ def geodesic_error(
 
 
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
-    """The share of the target's area that belongs to vertices in the image of a map; needs no ground truth.
+    """Returns the share of the target's area that belongs to vertices in the image of a map.
+
+    The coverage needs no ground truth.
 
     **Arguments:**
 

@@ -14,11 +14,12 @@ from jaxtyping import Float64
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
+from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.coarsening import coarsen
-from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
+from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
@@ -30,15 +31,11 @@ _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this many vertices, a dense solver is as fast and always succeeds.
 _DENSE = 400
-# The number of vertices from which `"auto"` is approximate.
-_APPROXIMATE_FROM = 50_000
-
-Eigensolver = Literal["auto", "exact", "approximate"]
 
 
 def compute_spectrum(
     mesh: Mesh,
-    number_of_eigenvectors: int = 100,
+    number_of_eigenvectors: int = NUMBER_OF_EIGENVECTORS,
     *,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
@@ -86,7 +83,7 @@ def as_spectrum(
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
     # Unlike `device_put`, `jnp.asarray` would compile a program for every size.
     arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))
-    return Spectrum(*arrays).place(*map(jax.device_put, (positions, normals)))
+    return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
 
 
 def eigenpairs(
@@ -143,7 +140,7 @@ def eigenpairs(
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
     """Resolve `"auto"` for meshes that will be compared: all get the solver of the largest mesh."""
     most = max(int(mesh.used_vertices.sum()) for mesh in meshes)
-    return "exact" if most < _APPROXIMATE_FROM else "approximate"
+    return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 
 def _solve(

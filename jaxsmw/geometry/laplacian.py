@@ -10,10 +10,9 @@ import robust_laplacian
 import scipy.sparse as sp
 from jaxtyping import Float64
 
+from jaxsmw.choices import Laplacian
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-
-Laplacian = Literal["auto", "cotangent", "robust"]
 
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:

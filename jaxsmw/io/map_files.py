@@ -12,19 +12,17 @@ import os
 import re
 from pathlib import Path
 from tokenize import TokenError
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, count_of
 from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
-
-IndexBase = Literal[0, 1]
 
 
 def read_pointwise_map(

@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.presets import common_range
+from jaxsmw.pair import common_range
 from jaxsmw.report.colors import PLAIN, error_colors, position_colors, signed_colors
 from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
 from jaxsmw.report.rendering import ELEVATION, Axis, choose_azimuth, stand_pair

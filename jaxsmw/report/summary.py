@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
-from jaxsmw.core.banks.filters import FilterBank
+from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching import Correspondence, paired_spectra
-from jaxsmw.presets import SUSPICIOUS
+from jaxsmw.matching import Correspondence
+from jaxsmw.pair import Pair, paired_spectra
+from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -64,7 +65,7 @@ def write_report(
     errors: Mapping[str, GeodesicError] | None = None,
     settings: Mapping[str, Any] | None = None,
     up: Axis | None = None,
-) -> None:
+) -> list[Path]:
     """Write the pictures of a match, an interactive page and a summary to a directory.
 
     The error that is to be expected (`Correspondence.expected_error`) is among them, and if given the true
@@ -80,6 +81,8 @@ def write_report(
       of `correspondence.pointwise_map`.
     - `settings`: what else to note in the summary.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+
+    **Returns:** The files that were written.
 
     **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
     """
@@ -148,13 +151,15 @@ def write_report(
     summary = {
         "settings": dict(settings or {}),
         "result": facts,
-        "flaw": correspondence.flaw,
+        "flaw": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "provenance": provenance(),
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+    names = ("report.html", *(f"{name}.png" for name in figures), "summary.json")
+    return [directory / name for name in names]
 
 
 def write_comparison(
@@ -221,7 +226,7 @@ def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectru
         return None
     logging.getLogger("jaxsmw").info("eigenbases ...")
     try:
-        return paired_spectra(mesh_x, mesh_y, number, partial=partial)
+        return paired_spectra(Pair(mesh_x, mesh_y, partial), number)
     except InputError as error:
         warnings.warn(f"the page does without wavelets: {error}", stacklevel=3)
         return None
@@ -288,9 +293,11 @@ def summarize(
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
-    if correspondence.flaw is not None:
-        doubt = f"; above {SUSPICIOUS} limbs may be swapped" if correspondence.suspicious else ""
-        facts["flaw (1 is none)"] = f"{correspondence.flaw:.2f}{doubt}"
+    if correspondence.distortion is not None:
+        doubt = (
+            f"; above {RepairSettings().suspicious} limbs may be swapped" if correspondence.suspicious else ""
+        )
+        facts["flaw (1 is none)"] = f"{correspondence.distortion:.2f}{doubt}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
 

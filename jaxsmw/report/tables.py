@@ -1,40 +1,43 @@
-"""The results of a benchmark as people publish them: a table, curves, and a columnar file."""
+"""The results of a benchmark in publishable form: tables, curves, and a columnar file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
-from jaxsmw.evaluation.benchmark import CURVE, FIGURES, Results, Settings
+from jaxsmw.evaluation.benchmark import Results
 from jaxsmw.evaluation.datasets import DataSet
 from jaxsmw.evaluation.intervals import CONFIDENCE, Interval, mean_interval
 from jaxsmw.evaluation.journal import Row
-from jaxsmw.evaluation.opponents.opponents import Method
+from jaxsmw.evaluation.measurement import CURVE, RESULT_COLUMNS, Settings
+from jaxsmw.evaluation.opponents.base import Method
 from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
 
 REFERENCE = "mwp"
-"""The method from which the differences of all others are taken."""
+"""The method that the differences of all other methods refer to."""
 
 
 class MethodSummary(NamedTuple):
-    """One method over all pairs on which it did not fail.
+    """The figures of one method over all pairs on which the method did not fail.
 
     **Attributes:**
 
-    - `mean`, `median`: of the pairs' mean errors, x 10^-3 of the square root of the area.
-    - `difference`: of the pairs' mean errors from those of `REFERENCE`, pair by pair; NaN of itself.
-    - `within`: the mean share of points within 0.05.
-    - `area_under_curve`: its mean.
-    - `coverage`: its mean.
-    - `seconds`: the median time from start to map; NaN where maps came from elsewhere.
-    - `pipeline_seconds`: the median time with both shapes' precomputation.
-    - `failures`: how many pairs failed.
-    - `curve`: the mean correspondence quality curve at `CURVE`.
+    - `mean`, `median`: the mean and the median of the pairs' mean errors, x 10^-3 of the square root of the
+      target's area.
+    - `difference`: the mean difference of the pairs' mean errors from those of `REFERENCE`, x 10^-3; NaN for
+      `REFERENCE` itself.
+    - `within`: the mean share of points with an error of at most 0.05.
+    - `area_under_curve`: the mean area under the correspondence quality curve.
+    - `coverage`: the mean coverage of the target.
+    - `seconds`: the median time from the initial map to the result; NaN for published maps.
+    - `pipeline_seconds`: the median time including the precomputation of both shapes.
+    - `failures`: the number of pairs on which the method failed.
+    - `curve`: the mean correspondence quality curve at the thresholds `CURVE` (t,).
     """
 
     mean: float
@@ -50,7 +53,13 @@ class MethodSummary(NamedTuple):
 
 
 def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
-    """What `jaxsmw.evaluation.benchmark.run_benchmark` found, by method; `seed` is of the intervals."""
+    """Summarises the results of `jaxsmw.evaluation.benchmark.run_benchmark`, by method.
+
+    **Arguments:**
+
+    - `results`: the results.
+    - `seed`: the seed of the bootstrap intervals.
+    """
     found = {}
     reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
     for name in dict.fromkeys(row["method"] for row in results.rows):
@@ -80,7 +89,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """By pair, x 10^-3; of successful rows only."""
+    """Returns the mean errors of successful rows by pair, x 10^-3."""
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -101,6 +110,7 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
+    """Returns the seconds of precomputation of both shapes of a pair."""
     sides = {row["source"], row["target"]}
     return sum(
         float(shapes[side][column])
@@ -127,14 +137,14 @@ _COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
 
 
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """One row for each method."""
+    """Returns a Markdown table with one row for each method."""
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
     return markdown([header, *rows])
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A table of text cells; the first row is its header."""
+    """Returns a Markdown table of text cells; the first row is the header."""
     return "".join(
         "| " + " | ".join(cells) + " |\n" for cells in (rows[0], ["---"] * len(rows[0]), *rows[1:])
     )
@@ -144,7 +154,7 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """The same with booktabs rules, the smallest mean error in bold."""
+    """Returns the same table for LaTeX with booktabs rules, and the smallest mean error in bold."""
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
     lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
@@ -159,24 +169,14 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
 def write_tables(
     directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
 ) -> dict[str, MethodSummary]:
-    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`; return what they say."""
+    """Writes `summary.md`, `table.tex`, `curves.png` and `results.parquet`; returns the summaries."""
     summaries = summarize_methods(results, seed=settings.seed)
-    pairs = len({(row["source"], row["target"]) for row in results.rows})
-    machines = sorted({row["machine"] for row in results.rows})
-    start = Path(settings.init).name
-    points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     parts = [
         f"# {data_set.name}",
-        f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}), all methods from the same start "
-        f"({start}). Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, "
-        f"at {points} of the ground truth; mean and median are over the pairs on which a method did not "
-        f"fail, the difference is pair by pair, with its {CONFIDENCE:.0%} bootstrap interval. Times are "
-        f"medians over the pairs, without compilation, on {'; '.join(machines)}; local workers have one core "
-        "each."
-        + (f" {len(results.failures)} shapes or pairs could not be measured." if results.failures else ""),
+        _introduction(data_set, results, settings),
         markdown_table(summaries),
         "\n".join(f"- **{name}**: {methods[name].reference}" for name in summaries),
-        "Pair by pair: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
+        "Single pairs: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
     ]
     _write(directory / "summary.md", "\n\n".join(parts) + "\n")
     _write(directory / "table.tex", latex_table(summaries))
@@ -187,25 +187,38 @@ def write_tables(
     return summaries
 
 
+def _introduction(data_set: DataSet, results: Results, settings: Settings) -> str:
+    """Returns the paragraph above the table of `summary.md`."""
+    pairs = len({(row["source"], row["target"]) for row in results.rows})
+    points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
+    machines = "; ".join(sorted({row["machine"] for row in results.rows}))
+    sentences = [
+        f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}); all methods start from the same "
+        f"initial map ({Path(settings.init).name}).",
+        "Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, at "
+        f"{points} of the ground truth.",
+        "Mean and median are over the pairs on which a method did not fail; the difference is taken pair by "
+        f"pair and has a {CONFIDENCE:.0%} bootstrap interval.",
+        f"Times are medians over the pairs, without compilation, on {machines}; local workers have one "
+        "core each.",
+    ]
+    if results.failures:
+        sentences.append(f"{len(results.failures)} shapes or pairs could not be measured.")
+    return " ".join(sentences)
+
+
 def _write(path: Path, text: str) -> None:
     with atomic_write(path) as temporary:
         temporary.write_text(text, "utf-8")
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """All rows with their types, for pandas and polars; `curve` is a list of shares."""
+    """Writes all rows with their types, for pandas and polars; `curve` is a list of shares."""
     import pyarrow
     import pyarrow.parquet
 
-    numbers = {"seconds", *FIGURES}
-
-    def value(name: str, text: str) -> Any:
-        if name == "curve":
-            return [float(share) for share in text.split()]
-        return float(text) if name in numbers else text
-
     table = pyarrow.Table.from_pylist(
-        [{name: value(name, text) for name, text in row.items()} for row in rows]
+        [{name: RESULT_COLUMNS[name](text) for name, text in row.items()} for row in rows]
     )
     with atomic_write(path) as temporary:
         pyarrow.parquet.write_table(table, temporary)

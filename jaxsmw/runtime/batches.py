@@ -14,7 +14,9 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Shaped
 
-from jaxsmw.core.refinement import Refinement, Refiner, WaveletPreservation, refine
+from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.threads import one_blas_thread
@@ -63,6 +65,7 @@ def refine_pairs(
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
     iterations: int = 3,
     samples: Sequence[Int[Array, " _"]] | None = None,
+    partial: bool = False,
     stop_when_unchanged: bool = False,
     history: bool = False,
     batch_size: int | None = None,
@@ -86,7 +89,7 @@ def refine_pairs(
     - `pairs`: for each pair the positions of source X and target Y among the shapes. A pair may occur with
       several initial maps.
     - `pointwise_maps`: for each pair its initial T: X -> Y (m,).
-    - `refiner`, `iterations`, `stop_when_unchanged`, `history`: see `refine`.
+    - `refiner`, `iterations`, `partial`, `stop_when_unchanged`, `history`: see `refine`.
     - `samples`: for each shape the vertices to iterate on, as many of each; see `refine`.
     - `batch_size`: pairs side by side on each device. By default one on CPUs, where more would only take
       more memory, elsewhere as many as fit `memory`, at most 64.
@@ -119,7 +122,9 @@ def refine_pairs(
             )
     if batch_size is not None and batch_size < 1:
         raise ValueError(f"batch_size is {batch_size}, but at least one pair is needed in a batch")
-    settings = dict(iterations=iterations, stop_when_unchanged=stop_when_unchanged, history=history)
+    settings = dict(
+        iterations=iterations, partial=partial, stop_when_unchanged=stop_when_unchanged, history=history
+    )
     devices = jax.devices() if devices is None else devices
     mesh = Mesh(np.array(devices), ("pairs",))
     groups: dict[tuple[int, int, int, int], list[int]] = {}
@@ -194,7 +199,7 @@ def _refine_batch(refiner: Refiner, batch: Any, mesh: Mesh, settings: dict[str, 
         (spectrum_x, samples_x), (spectrum_y, samples_y), start = pair
         return refine(
             spectrum_x, spectrum_y, start,
-            refiner=refiner, samples_x=samples_x, samples_y=samples_y, **settings,
+            refiner=refiner, samples=None if samples_x is None else (samples_x, samples_y), **settings,
         )  # fmt: skip
 
     # Not `shard_map`: optimistix's solvers do not run within it. Nothing couples the pairs of a batch, so the

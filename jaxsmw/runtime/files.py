@@ -96,6 +96,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = _target(path)
     temporary = _temporary(target)
+    _unfinished.add(temporary)
     try:
         _check_target(path, target)
         temporary.touch(exist_ok=False)
@@ -106,6 +107,21 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         # The file is gone after success, and was never there if the directory does not exist.
         if os.path.lexists(temporary):
+            temporary.unlink()
+        _unfinished.discard(temporary)
+
+
+# The temporary files of all open blocks.
+_unfinished: set[Path] = set()
+
+
+def remove_unfinished() -> None:
+    """Remove the temporary files of all open blocks of `atomic_write`.
+
+    A process calls this function if it ends while a block is open.
+    """
+    for temporary in _unfinished.copy():
+        with suppress(OSError):
             temporary.unlink()
 
 

@@ -26,8 +26,9 @@ from frame_study.variants import (
     tabulate,
 )
 from jaxsmw import read_mesh
-from jaxsmw.core.banks.filters import FilterBank, Meyer
-from jaxsmw.core.refinement import Problem, Refinement, Refiner, refine
+from jaxsmw.core.banks import FilterBank, Meyer
+from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
@@ -37,7 +38,8 @@ from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching import initial_map
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import prepare
 
 DATA_SETS = ("faust_r", "tosca_r")
 # Shapes are padded to a multiple of this, so that one compiled program serves a whole data set.
@@ -76,7 +78,7 @@ class PairName(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class MeasuredPair:
     """A pair of shapes, its start and its truth, ready to be refined.
 
     **Attributes:**
@@ -114,19 +116,18 @@ def read_pair(data: Path, name: PairName) -> tuple[Mesh, Mesh, GroundTruth]:
     return mesh_x, mesh_y, read_ground_truth([truth for _, truth in files], mesh_x, mesh_y)
 
 
-def load_pair(data: Path, name: PairName, settings: Settings) -> Pair:
+def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
     """Read a pair and compute what all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
-    spectra = compute_spectrum(mesh_x, k), compute_spectrum(mesh_y, k)
-    start = initial_map(mesh_x, mesh_y, *spectra)
-    padded = pad(spectra[0]), pad(spectra[1])
+    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=k)
+    start, padded = prepared.initial_map, (pad(prepared.spectrum_x), pad(prepared.spectrum_y))
     rows = np.random.default_rng(settings.seed).permutation(len(truth.source_vertices))
     rows = rows[: settings.evaluated_points]
     sources, targets = truth.source_vertices[rows], np.asarray(truth.targets)[rows]
     different, row = np.unique(targets, return_inverse=True)
     distances = geodesic_distances(mesh_y, different) / np.sqrt(mesh_y.area)
-    return Pair(mesh_x, mesh_y, padded, pad_map(start, padded[0]), sources, targets, distances[row])
+    return MeasuredPair(mesh_x, mesh_y, padded, pad_map(start, padded[0]), sources, targets, distances[row])
 
 
 def pad(spectrum: Spectrum) -> Spectrum:
@@ -177,7 +178,9 @@ def _frames(number_of_filters: int) -> dict[str, FilterBank]:
     return frames(number_of_filters)
 
 
-def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings: Settings) -> list[Row]:
+def measure_variants(
+    pair: MeasuredPair, name: PairName, wanted: list[Variant], settings: Settings
+) -> list[Row]:
     """Refine with every variant; a row of the main table for each."""
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     start = np.asarray(pair.start)
@@ -208,7 +211,7 @@ def measure_variants(pair: Pair, name: PairName, wanted: list[Variant], settings
     return rows
 
 
-def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
+def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
     """Errors of the maps, and the shares of matches that each iteration changes and moves; or NaN."""
     m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
     row: dict[str, float] = {"error_0": pair.error(maps[0])}
@@ -223,7 +226,7 @@ def _follow(pair: Pair, maps: list[np.ndarray], successful: bool) -> Row:
 
 
 def measure_parameters(
-    pair: Pair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
+    pair: MeasuredPair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
 ) -> list[Row]:
     """Meyer, filtering, with other numbers of eigenvectors and filters; the error after each iteration."""
     if not wanted:
@@ -252,7 +255,7 @@ def measure_parameters(
 
 
 def measure_invariance(
-    pair: Pair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
+    pair: MeasuredPair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
 ) -> list[Row]:
     """How much wavelets at corresponding centres differ at corresponding points, per frame and scale.
 
@@ -314,25 +317,23 @@ def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list
 
 
 @eqx.filter_jit
-def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Problem:
-    return method.prepare(spectrum_x, spectrum_y)
+def _prepare(method: Refiner, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Prepared:
+    return method.prepare(Problem(spectrum_x, spectrum_y))
 
 
 @eqx.filter_jit
 def _update(
     method: Refiner,
-    problem: Problem,
+    prepared: Prepared,
     pointwise_map: Int32[Array, " m"],
-    previous: Float[Array, "k_out k_in"] | None,
-) -> Float[Array, "k_out k_in"]:
-    return method.update(problem, pointwise_map, previous)[0]
+    previous: State | None,
+) -> State:
+    return method.update(prepared, pointwise_map, previous)[0]
 
 
 @eqx.filter_jit
-def _search(
-    method: Refiner, problem: Problem, functional_map: Float[Array, "k_out k_in"]
-) -> Int32[Array, " m"]:
-    return method.recover(problem, functional_map)
+def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, " m"]:
+    return method.recover(prepared, state)
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
@@ -344,11 +345,11 @@ def measure_times(data: Path, names: list[PairName], wanted: list[Variant], sett
         pair = load_pair(data, name, settings)
         for variant in wanted:
             method = refiner(variant, banks[variant.frame], *pair.spectra, number_of_filters=filters)
-            problem = _prepare(method, *pair.spectra)
-            first = _update(method, problem, pair.start, None)
-            following = _search(method, problem, first)
-            candidates[variant] = partial(_update, method, problem, following, first)
-        candidates[SEARCH] = partial(_search, method, problem, first)
+            prepared = _prepare(method, *pair.spectra)
+            first = _update(method, prepared, pair.start, None)
+            following = _search(method, prepared, first)
+            candidates[variant] = partial(_update, method, prepared, following, first)
+        candidates[SEARCH] = partial(_search, method, prepared, first)
         rows += [
             {**name._asdict(), **variant._asdict(), "milliseconds": f"{1e3 * seconds:.4f}"}
             for variant, seconds in medians(candidates, _TIMED_RUNS).items()

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 from scipy.optimize import brentq
 
-from jaxsmw.core.banks.filters import (
+from jaxsmw.core.banks import (
     CubicSpline,
     ExponentialWindow,
     FilterBank,
@@ -31,15 +31,18 @@ from jaxsmw.core.banks.filters import (
     SimpleTight,
     SpectralDistribution,
     Warped,
+    frame_bounds,
+    frame_function,
+    tighten,
 )
-from jaxsmw.core.frames import frame_bounds, frame_function, tighten
 from jaxsmw.core.functional_map import Convention, multiscale_kernel
-from jaxsmw.core.refinement import WaveletPreservation
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import (
     Filtering,
     LeastSquares,
     NearestOrthogonal,
+    PreparedFiltering,
     RegularizedLeastSquares,
     Solution,
     WaveletProblem,
@@ -164,9 +167,8 @@ class BandMask(Filtering):
 
     mask: Float[Array, "k_out k_in"] = eqx.field(kw_only=True)
 
-    def prepare(self, problem: WaveletProblem) -> tuple[Array, Array]:
-        _, dual_out = super().prepare(problem)
-        return self.mask, dual_out
+    def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
+        return super().prepare(problem)._replace(kernel=self.mask)
 
 
 class Scaled(FilterBank):

@@ -1,109 +1,139 @@
-"""Refinement by regression: the features of matched vertices, each linearly from the other's."""
+"""Refinement by regression: the features of matched vertices predict each other linearly."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refinement import Problem, Samples
-from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine, check_descriptors, doubted
+from jaxsmw.core.refiner import Prepared, Problem, nearest_vertices
+from jaxsmw.core.refiners.coarse_to_fine import (
+    CoarseToFine,
+    CoarseToFineState,
+    check_descriptors,
+    partial_matching_weights,
+)
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
+from jaxsmw.core.search import Patches, nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 
-# Beside variances of features, about 1. From a third to three times of either, results hardly change.
+# Ridge of the regression and smallest residual variance, relative to features of variance about 1. Values
+# from a third to three times of either hardly change the results.
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
-class FeatureRegression(CoarseToFine):
-    """Matches along which the features of both shapes predict each other best, from coarse to fine.
+class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
+    """Finds matches along which the features of both shapes predict each other best, from coarse to fine.
 
-    The features of a vertex are its eigenvectors' values and its descriptors (`Spectrum.descriptors`), if
-    there are any. Along the matches of both directions those of X are regressed on those of Y, eigenvectors
-    on eigenvectors, which is the functional map by least squares (Ovsjanikov et al. 2012), and descriptors on
-    descriptors. The covariance of what this leaves unexplained tells how far each combination of features
-    can be trusted, and the next matches are the most likely ones: nearest in the Mahalanobis distance. The
-    same is done from Y to X. At first few eigenvectors count, then more, as in ZoomOut (Melzi et al. 2019).
+    The features of a vertex are the values of the eigenvectors and the descriptors, if the spectra have
+    descriptors. Each iteration regresses the features of X on those of Y along the matches of both
+    directions. Eigenvectors are regressed on eigenvectors, which is the functional map by least squares
+    (Ovsjanikov et al. 2012), and descriptors on descriptors. The covariance of the residuals tells how far
+    each combination of features can be trusted. The next matches are the nearest vertices in the Mahalanobis
+    distance of this covariance. The same is done from Y to X. The number of eigenvectors grows, as in ZoomOut
+    (Melzi et al. 2019).
 
-    It does not presuppose isometry, so that it ends nearer the truth than `WaveletPreservation`, if it
-    starts from a map as good as the outcome of that: docs/accuracy.md measures both.
+    The method does not assume isometry. From a map as good as the outcome of `WaveletPreservation` it ends
+    nearer to the truth: docs/accuracy.md measures both.
+
+    For partial shapes, vertices of the full shape whose matches fit badly count less
+    (`partial_matching_weights`).
 
     **Arguments:**
 
-    - `levels`: how many eigenvectors count in each iteration (of the shape with more of them; of the other in
-      proportion); after these all of them count.
-    - `partial`: for shapes of which one is a part of the other. Many vertices of the whole have no match on
-      the part: the worse one's match fits, beside the part's on average, the less it counts.
-    - `search`: how the last matches are found, among all vertices. `"exhaustive"` compares all with all;
-      `"patches"` leaves out patches of the target that are too far away, for which it looks at what
-      eigenvectors say alone; `"auto"` does that on CPUs from 15 000 vertices.
+    - `levels`: see `CoarseToFine`.
+    - `search`: how the last matches, among all vertices, are found. `"exhaustive"` compares all vertices with
+      all vertices. `"patches"` compares eigenvectors alone, without descriptors, and skips patches of the
+      target that are too far away. `"auto"` uses patches on CPUs from 15 000 vertices.
     """
 
-    def prepare(self, spectrum_x: Spectrum, spectrum_y: Spectrum, samples: Samples | None = None) -> Problem:
-        """Collect the features of the vertices to be matched, and of all, among which their matches are.
+    def prepare(self, problem: Problem) -> PreparedFeatures:
+        """Collects the features of the vertices to be matched, and of all vertices.
 
-        **Raises:** `ValueError` if only one shape has descriptors, or they differ in number.
+        **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
         """
-        check_descriptors(spectrum_x, spectrum_y)
-        all_x, all_y = _Features.of(spectrum_x), _Features.of(spectrum_y)
-        if samples is None:
+        check_descriptors(problem.spectrum_x, problem.spectrum_y)
+        all_x, all_y = _Features.of(problem.spectrum_x), _Features.of(problem.spectrum_y)
+        spectrum_x, spectrum_y = problem.query_spectra()
+        if problem.samples is None:
+            x, y = all_x, all_y
             patches = chosen_patches(self.search, spectrum_x, spectrum_y)
-            return Problem(spectrum_x, spectrum_y, _Prepared(all_x, all_y, all_x, all_y, patches))
-        spectrum_x, spectrum_y = spectrum_x.sample(samples[0]), spectrum_y.sample(samples[1])
-        sampled_x, sampled_y = _Features.of(spectrum_x), _Features.of(spectrum_y)
-        return Problem(spectrum_x, spectrum_y, _Prepared(sampled_x, sampled_y, all_x, all_y, None))
+        else:
+            x, y, patches = _Features.of(spectrum_x), _Features.of(spectrum_y), None
+        return PreparedFeatures(spectrum_x, spectrum_y, x, y, all_x, all_y, patches, problem.partial)
 
     def update(
-        self, problem: Problem, pointwise_map: Int[Array, " m"], previous: Any
+        self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Regress along the matches, and along those of the way back, which `previous` gives as well."""
-        x, y, all_x, all_y, _ = problem.prepared
+        """Regresses along the matches, and along those of the reverse map if there is a previous state."""
+        x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         iteration = jnp.asarray(0, jnp.int32)
         if previous is None:
             moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
         else:
             iteration = previous.iteration + 1
-            way_back = previous.backward.search(y, all_x)
+            reverse_map = previous.backward.search(y, all_x)
             weights_x, weights_y = x.weights, y.weights
-            if self.partial:
+            if prepared.partial:
                 residuals_x = previous.forward.residuals(x, all_y, pointwise_map)
-                residuals_y = previous.backward.residuals(y, all_x, way_back)
-                weights_x, weights_y = doubted(weights_x, residuals_x, weights_y, residuals_y)
-            forth = _Moments.along(x.values, all_y.values[pointwise_map], weights_x)
-            back = _Moments.along(all_x.values[way_back], y.values, weights_y)
-            moments = _Moments(*((a + b) / 2 for a, b in zip(forth, back, strict=True)))
-        counts_x, counts_y = self.counting_eigenvectors(problem, iteration)
-        functional_map, forward = _regress(moments, counts_x, counts_y)
-        _, backward = _regress(moments.turned, counts_y, counts_x)
-        return Regression(functional_map, forward, backward, iteration), RESULTS.successful  # type: ignore[return-value]
+                residuals_y = previous.backward.residuals(y, all_x, reverse_map)
+                weights_x, weights_y = partial_matching_weights(
+                    weights_x, residuals_x, weights_y, residuals_y
+                )
+            forward = _Moments.along(x.values, all_y.values[pointwise_map], weights_x)
+            backward = _Moments.along(all_x.values[reverse_map], y.values, weights_y)
+            moments = _Moments(*((a + b) / 2 for a, b in zip(forward, backward, strict=True)))
+        active_x, active_y = self.active_eigenvectors(prepared, iteration)
+        functional_map, prediction = _regress(moments, active_x, active_y)
+        _, reverse_prediction = _regress(moments.reversed, active_y, active_x)
+        state = Regression(functional_map, iteration, prediction, reverse_prediction)
+        return state, RESULTS.successful  # type: ignore[return-value]
 
-    def recover(self, problem: Problem, updated: Any) -> Int32[Array, " m"]:
-        """The most likely vertices."""
-        if problem.prepared.patches is None:
-            return updated.forward.search(problem.prepared.x, problem.prepared.all_y)
-        # The first coordinates depend on eigenvectors alone, in which patches are compact.
-        k = problem.spectrum_x.eigenvalues.shape[0]
-        queries, database = self.embeddings(problem, updated)
-        return nearest_neighbor_in_patches(queries[:, :k], database[:, :k], *problem.prepared.patches)
+    def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
+        """The nearest vertices in the Mahalanobis distance."""
+        if prepared.patches is None:
+            return state.forward.search(prepared.x, prepared.all_y)
+        queries, database = self._eigenvector_embeddings(prepared, state)
+        return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
-    def energy(self, problem: Problem, updated: Any, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """How uncertain predictions are; see `Regression.uncertainty`."""
-        return updated.uncertainty
+    def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
+        """The nearest vertices of X in the same space."""
+        patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
+        embed = self.embeddings if patches is None else self._eigenvector_embeddings
+        database, queries = embed(prepared, state)
+        return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
+
+    def energy(
+        self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
+    ) -> Float[Array, ""]:
+        """The uncertainty of the predictions; see `Regression.uncertainty`."""
+        return state.uncertainty
 
     def embeddings(
-        self, problem: Problem, updated: Any
+        self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
-        """Points at distances that are those of Mahalanobis, between features of X and what Y predicts."""
-        return updated.forward.embeddings(problem.prepared.x, problem.prepared.all_y)
+        """Points whose distance is the Mahalanobis distance between features of X and predictions from Y."""
+        return state.forward.embeddings(prepared.x, prepared.all_y)
+
+    def _eigenvector_embeddings(
+        self, prepared: PreparedFeatures, state: Regression
+    ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
+        """The coordinates that depend on eigenvectors alone, in which patches are compact.
+
+        These are the first ones, because the whitening is triangular.
+        """
+        k = prepared.spectrum_x.eigenvalues.shape[0]
+        queries, database = self.embeddings(prepared, state)
+        return queries[:, :k], database[:, :k]
 
 
 class _Features(NamedTuple):
-    """Of one shape's vertices: eigenvectors and descriptors, shares of the area, which are on the surface."""
+    """The vertices of one shape: eigenvectors and descriptors, shares of the area, and the mask."""
 
     values: Float[Array, "n d"]
     weights: Float[Array, " n"]
@@ -112,60 +142,59 @@ class _Features(NamedTuple):
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
         area = jnp.sum(spectrum.vertex_areas)
-        values = spectrum.eigenvectors * jnp.sqrt(area)  # of mean square 1, whatever the unit of length
+        values = spectrum.eigenvectors * jnp.sqrt(area)  # mean square 1 in every unit of length
         if spectrum.descriptors is not None:
             values = jnp.concatenate([values, spectrum.descriptors], axis=1)
         return cls(values, spectrum.vertex_areas / area, spectrum.mask)
 
 
-class _Prepared(NamedTuple):
-    """The vertices to be matched of both shapes, all of both, and patches if the search is to use them."""
+class PreparedFeatures(Prepared):
+    """The features of the vertices to be matched (`x`, `y`) and of all vertices (`all_x`, `all_y`)."""
 
     x: _Features
     y: _Features
     all_x: _Features
     all_y: _Features
     patches: tuple[Patches, Patches] | None
+    partial: bool = eqx.field(static=True)
 
 
 class Prediction(NamedTuple):
-    """What turns features of both shapes into points that are the nearer, the likelier a match."""
+    """Linear maps from the features of both shapes to points that are close together where features agree."""
 
     queries: Float[Array, "d_out d_out"]
     database: Float[Array, "d_in d_out"]
     uncertainty: Float[Array, ""]
 
     def embeddings(
-        self, asking: _Features, answering: _Features
+        self, queries: _Features, targets: _Features
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
-        """The points."""
-        return product(asking.values, self.queries), product(answering.values, self.database)
+        """The points of the query vertices and of the target vertices."""
+        return product(queries.values, self.queries), product(targets.values, self.database)
 
-    def search(self, asking: _Features, answering: _Features) -> Int32[Array, " m"]:
-        """The likeliest matches."""
-        return nearest_neighbor(*self.embeddings(asking, answering), database_mask=answering.mask)
+    def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
+        """The nearest target vertex of every query vertex."""
+        return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
 
     def residuals(
-        self, asking: _Features, answering: _Features, matches: Int[Array, " m"]
+        self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """Squared distances of matches."""
-        queries, database = self.embeddings(asking, answering)
-        return jnp.sum((queries - database[matches]) ** 2, axis=1)
+        """The squared distance of every query vertex to its match."""
+        points, database = self.embeddings(queries, targets)
+        return jnp.sum((points - database[matches]) ** 2, axis=1)
 
 
-class Regression(NamedTuple):
-    """What `FeatureRegression` hands on: a functional map, and predictions of X by Y and of Y by X."""
+class Regression(CoarseToFineState):
+    """The state of `FeatureRegression`: predictions of X from Y (`forward`) and of Y from X (`backward`)."""
 
-    functional_map: Float[Array, "k_x k_y"]
     forward: Prediction
     backward: Prediction
-    iteration: Int32[Array, ""]
 
     @property
     def uncertainty(self) -> Float[Array, ""]:
-        """The mean logarithm of what standard deviation predictions leave, over features of both shapes.
+        """The mean logarithm of the residual standard deviation, over the features of both shapes.
 
-        (Of their principal components: half the logarithm of the residual covariances' determinants.)
+        (Over their principal components: half the logarithm of the determinants of the residual covariances.)
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features
@@ -186,31 +215,32 @@ class _Moments(NamedTuple):
         return cls(product(x.T, weighted_x), product(x.T, weighted_y), product(y.T, weighted_y))
 
     @property
-    def turned(self) -> _Moments:
+    def reversed(self) -> _Moments:
         return _Moments(self.yy, self.xy.T, self.xx)
 
 
 def _regress(
-    moments: _Moments, counts_x: Bool[Array, " k_x"], counts_y: Bool[Array, " k_y"]
+    moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """The functional map, and the prediction of x by y with those eigenvectors of both that count."""
-    k_x, k_y = counts_x.shape[0], counts_y.shape[0]
+    """The functional map, and the prediction of x from y, with the active eigenvectors of both shapes."""
+    k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
-    keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (counts_x, counts_y))
+    keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
     xx = jnp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
     xy = jnp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
     yy = jnp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
-    # Eigenvectors by eigenvectors, descriptors by descriptors.
-    of_x, of_y = (jnp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
-    gram = jnp.where(of_y[:, None] == of_y[None, :], yy, 0) + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
-    cross = jnp.where(of_x[:, None] == of_y[None, :], xy, 0)
+    # Eigenvectors are regressed on eigenvectors, descriptors on descriptors.
+    eigenvectors_x, eigenvectors_y = (jnp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
+    gram = jnp.where(eigenvectors_y[:, None] == eigenvectors_y[None, :], yy, 0)
+    gram = gram + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
+    cross = jnp.where(eigenvectors_x[:, None] == eigenvectors_y[None, :], xy, 0)
     matrix = jsp.linalg.solve(gram, cross.T, assume_a="pos").T
     explained = product(matrix, xy.T)
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
     factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
-    # Triangular, so that each coordinate is of the features up to its own. One that does not count is left
-    # out: it would add the same to all distances, and its rounding.
+    # The whitening is triangular: each coordinate depends on the features up to its own. Inactive features
+    # are left out, because they would add the same amount, with its rounding error, to all distances.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

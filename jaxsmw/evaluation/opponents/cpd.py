@@ -1,26 +1,34 @@
 r"""Pointwise maps by Coherent Point Drift: the recovery of Rodolà, Moeller and Cremers (2015).
 
-E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement from functional correspondence*,
-VMV 2015, arXiv 1506.05603; A. Myronenko, X. Song, *Point set registration: Coherent Point Drift*, IEEE TPAMI
-32 (2010). Written from the papers, to be compared with.
+Written from two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement from
+functional correspondence*, VMV 2015, arXiv 1506.05603; and A. Myronenko, X. Song, *Point set registration:
+Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
-Nearest neighbours read a functional map back well if it is (nearly) a rotation of one spectral embedding onto
-the other. Where shapes are not isometric it is not, and what is left is a non-rigid registration of two point
-sets in k dimensions. The embedding that C maps (`Phi_Y C^T`, "centroids") moves, smoothly; the other
-(`Phi_X`, "data") stays. Every data point is drawn from a mixture of isotropic Gaussians around the centroids,
-one variance s for all, plus a share w of uniform noise; every vertex counts the same, whatever its area. The
-displacement combines Gaussian kernels `G` (n, n) at the centroids `Y`; for moved centroids T, EM alternates
+Nearest neighbours recover a good pointwise map if the functional map is nearly a rotation of one spectral
+embedding onto the other. For non-isometric shapes the functional map is no rotation. What remains is a
+non-rigid registration of two point sets in k dimensions: the embedding that C maps (`Phi_Y C^T`, the
+"centroids") moves smoothly, and the other embedding (`Phi_X`, the "data") stays. Each data point is drawn
+from a mixture of isotropic Gaussians around the centroids with a common variance s, and a share w of uniform
+noise. All vertices have equal weight, whatever their areas. The displacement is a combination of Gaussian
+kernels `G` (n, n) at the centroids `Y`. For moved centroids T, expectation maximisation (EM) alternates
 
     P_ji proportional to exp(-||x_i - t_j||^2 / 2 s), the noise to (2 pi s)^(d/2) w n / ((1 - w) m)
     (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y,    T = Y + G W
     s = sum_ij P_ji ||x_i - t_j||^2 / (d sum P)
 
-until the penalised likelihood stands still. The match of x is the centroid most probable for it: the nearest.
+until the penalised likelihood no longer changes. The match of x is its most probable centroid, which is the
+nearest centroid.
 
-Nothing of size m x n is stored, nor n x n. P is made a block of data points at a time. G is replaced by a
-factor `L L^T` of low rank (`kernel_factor`); then `G W = L b`, and the M-step is a ridge regression of the
-displacements on the columns of L, `(L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y)`: Woodbury's
-identity, without inverting anything small. With L of full rank it is the method itself.
+No matrix of size m x n or n x n is stored. P is computed for one block of data points at a time. G is
+replaced by a factorisation `L L^T` of low rank (`kernel_factor`). Then `G W = L b`, and the M-step is a ridge
+regression of the displacements on the columns of L,
+
+    (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
+
+This is Woodbury's identity in a form that never divides by small numbers. With L of full rank the result is
+exact.
+
+`CPD` has the settings in use: 30 eigenvectors, and 3 iterations of the functional map and its recovery.
 """
 
 from __future__ import annotations
@@ -35,27 +43,29 @@ import jax.scipy as jsp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.banks.filters import FilterBank, Identity
+from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.products import product
-from jaxsmw.core.refinement import Problem, WaveletPreservation
+from jaxsmw.core.refiner import State
+from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.evaluation.opponents.presets import Refined
 
-# Data points whose probabilities are in memory at once.
+# The number of data points whose probabilities are in memory at once.
 _BLOCK = 128
-# As in Myronenko's program: a smaller variance (of point sets of unit variance) is rounding.
+# As in Myronenko's program: for point sets of unit variance, a smaller variance is a rounding error.
 _LEAST_VARIANCE = 1e-8
 
 
 class Drift(eqx.Module):
-    """The outcome of `coherent_point_drift`.
+    """The result of `coherent_point_drift`.
 
     **Attributes:**
 
-    - `centroids`: (n, d), where they moved to, in the frame and unit of the data; masked ones mean nothing.
-    - `variance`: the last one, in squares of the data's root mean square distance from its mean.
-    - `iterations`: how many were done.
+    - `centroids`: the moved centroids (n, d), in the frame and unit of the data. Masked rows are meaningless.
+    - `variance`: the last variance s, where the root mean square distance of the data from their mean is 1.
+    - `iterations`: the number of iterations.
     """
 
     centroids: Float[Array, "n d"]
@@ -76,23 +86,26 @@ def coherent_point_drift(
     iterations: int = 150,
     tolerance: float = 1e-5,
 ) -> Drift:
-    """Move centroids smoothly until they explain the data; see the top of this module.
+    """Moves centroids smoothly until they explain the data; see the docstring of this module.
 
-    Both point sets are first brought to zero mean and unit variance, each by itself. The defaults are those
-    of Myronenko's program, but for the rank: there it is the square root of n, and the kernel exact unless
-    asked. On a real pair of 5000 vertices the error of the map was 22.4, 20.8, 20.8 (x 10^-3) for rank 70,
-    300, 1200 at k = 30, and 17.2, 11.4, 11.3 for rank 150, 600, 1200 at k = 100.
+    Each point set is first scaled to zero mean and unit variance. The defaults are those of Myronenko's
+    program, except for the rank: his program uses the exact kernel, or on request the rank sqrt(n). On a real
+    pair with 5000 vertices the map had errors of 22.4, 20.8 and 20.8 (x 10^-3) with rank 70, 300 and 1200 at
+    k = 30, and of 17.2, 11.4 and 11.3 with rank 150, 600 and 1200 at k = 100.
 
     **Arguments:**
 
-    - `data`, `centroids`: points in d dimensions; neither set may be one point only.
-    - `data_mask`, `centroids_mask`: rows with False count for nothing.
-    - `width`: beta of the papers, the standard deviation of the kernel: how far points move together.
+    - `data`, `centroids`: points in d dimensions, (m, d) and (n, d); at least two different points each.
+    - `data_mask`, `centroids_mask`: False for rows that are ignored.
+    - `width`: beta of the papers, the standard deviation of the kernel; a wider kernel moves more points
+      together.
     - `stiffness`: lambda of the papers, the weight of smoothness.
-    - `outliers`: w, the share of the data that no centroid explains; at least 0, below 1.
-    - `rank`: columns of the kernel's factor, see `kernel_factor`.
-    - `iterations`: the most that are done.
-    - `tolerance`: stop when the objective changes by less than this share of itself.
+    - `outliers`: w of the papers, the share of the data that no centroid explains; at least 0 and below 1.
+    - `rank`: the number of columns of the kernel factor; see `kernel_factor`.
+    - `iterations`: the largest number of iterations.
+    - `tolerance`: iteration stops when the relative change of the objective is below this number.
+
+    **Returns:** A `Drift`.
 
     **Raises:** `ValueError` for a number out of range.
     """
@@ -110,12 +123,12 @@ def coherent_point_drift(
 def kernel_factor(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float | Float[Array, ""], rank: int
 ) -> Float[Array, "n rank"]:
-    """A factor L of the Gaussian kernel matrix: `exp(-||p_i - p_j||^2 / 2 width^2)` is nearly `L L^T`.
+    """Returns a factor L of the Gaussian kernel: `exp(-||p_i - p_j||^2 / 2 width^2)` is nearly `L L^T`.
 
-    A Cholesky factorisation that eliminates, in each step, the point that the ones before explain worst, and
-    stops at the rank: a Nyström approximation on points spread over the set, chosen by the set alone. It
-    takes `rank` rows of the kernel matrix and about `n rank^2` operations. Columns beyond the numerical rank
-    are zero, and so are rows of masked points.
+    A Cholesky factorisation with pivoting, stopped at the rank: each step eliminates the point that the
+    earlier points explain worst. The result is a Nyström approximation on points spread over the set; no
+    point is drawn at random. The factorisation computes `rank` rows of the kernel matrix and takes about `n
+    rank^2` operations. Columns beyond the numerical rank and rows of masked points are zero.
     """
     n = points.shape[0]
     rounding = 32 * jnp.finfo(points.dtype).eps
@@ -133,8 +146,8 @@ def kernel_factor(
         row = jnp.where(unexplained > rounding, row, 0)
         return rows.at[step].set(row), (unexplained - row**2).at[pivot].set(0)
 
-    start = jnp.zeros((rank, n), points.dtype), mask.astype(points.dtype)
-    rows, _ = lax.fori_loop(0, rank, eliminate, start)
+    nothing = jnp.zeros((rank, n), points.dtype), mask.astype(points.dtype)
+    rows, _ = lax.fori_loop(0, rank, eliminate, nothing)
     return rows.T
 
 
@@ -146,14 +159,14 @@ def recover_by_drift(
     rank: int = 300,
     iterations: int = 50,
 ) -> Int32[Array, " m"]:
-    """The pointwise map T: X -> Y (m,) of a functional map, by Coherent Point Drift instead of `decode`.
+    """Returns the pointwise map X -> Y (m,) of a functional map, by Coherent Point Drift instead of `decode`.
 
-    C is in the pullback convention, `Phi_X^+ P Phi_Y`; it need not be orthogonal. The embedding of Y drifts,
-    and each vertex of X is matched with the unmasked vertex of Y that came nearest.
+    C is in the pullback convention, `Phi_X^+ P Phi_Y`, and need not be orthogonal. The embedding of Y drifts;
+    then each vertex of X is matched with the nearest unmasked vertex of Y.
 
-    The settings are those of a published run of the method on FAUST (k = 30, C from spectral ICP; the
-    `exp_teaser` of github.com/daviddao/GPU-Programming-TUM): the standard ones of `coherent_point_drift`, 50
-    iterations, after which it has come to rest or nearly.
+    The settings are those of a published run of the method on FAUST (k = 30, C from spectral ICP;
+    `exp_teaser` of github.com/daviddao/GPU-Programming-TUM): the defaults of `coherent_point_drift` and 50
+    iterations, after which the centroids hardly move.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
     drift = coherent_point_drift(
@@ -168,15 +181,15 @@ def recover_by_drift(
 
 
 class DriftRecovery(WaveletPreservation):
-    """A refiner whose pointwise maps are recovered by drift, for `jaxsmw.refine`.
+    """A refiner for `jaxsmw.refine` that recovers pointwise maps by Coherent Point Drift.
 
-    Without a filter (the default) its functional maps are `Phi_X^+ P Phi_Y`, least squares without
-    orthogonality: one iteration is the recovery, more are the refinement, of C by T and of T by C in turn.
-    (How exactly the paper updates C was not at hand; this is the update of C by least squares.)
+    Without a filter (the default) the functional maps are `Phi_X^+ P Phi_Y`: least squares, not orthogonal.
+    One iteration is the recovery of the paper. More iterations are its refinement, which updates C and T
+    alternately. (The exact update of C in the paper was not available; least squares is our choice.)
 
     **Arguments:** those of `WaveletPreservation`, and
 
-    - `rank`, `drift_iterations`: see `recover_by_drift`.
+    - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
 
     **Raises:** `ValueError` for the pushforward convention.
     """
@@ -188,15 +201,15 @@ class DriftRecovery(WaveletPreservation):
     def __check_init__(self) -> None:
         if self.convention != "pullback":
             raise ValueError(
-                f"DriftRecovery moves Phi_Y C^T: its convention is pullback, not {self.convention}"
+                f"DriftRecovery moves Phi_Y C^T, so its convention must be pullback, not {self.convention}"
             )
 
-    def recover(self, problem: Problem, functional_map: Float[Array, "k_x k_y"]) -> Int32[Array, " m"]:
+    def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
         """See `recover_by_drift`."""
         return recover_by_drift(
-            functional_map,
-            problem.spectrum_x,
-            problem.spectrum_y,
+            state.functional_map,
+            prepared.spectrum_x,
+            prepared.spectrum_y,
             rank=self.rank,
             iterations=self.drift_iterations,
         )
@@ -216,7 +229,7 @@ def _drift(
     *,
     rank: int,
 ) -> Drift:
-    """`coherent_point_drift`, compiled once per sizes and rank."""
+    """`coherent_point_drift` as one compiled program for each combination of sizes and rank."""
     x, mean, scale = _normalized(data, data_mask)
     y, _, _ = _normalized(centroids, centroids_mask)
     factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
@@ -244,21 +257,21 @@ def _drift(
         return drifting & (state.iterations < iterations)
 
     infinite = jnp.asarray(jnp.inf, x.dtype)
-    start = _State(
+    initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The mean of all squared distances: both sets have zero mean and a mean squared norm of 1.
+        # The mean of all squared distances, as both sets have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,
         iterations=jnp.asarray(0, jnp.int32),
     )
-    end = lax.while_loop(goes_on, step, start)
+    end = lax.while_loop(goes_on, step, initial)
     moved = mean[None, :] + scale * (y + product(factor, end.coefficients))
     return Drift(moved, end.variance, end.iterations)
 
 
 class _State(NamedTuple):
-    """What one iteration of EM hands to the next; the objective is that before its M-step."""
+    """The state of EM between two iterations; `objective` is the value before the last M-step."""
 
     coefficients: Float[Array, "rank d"]
     variance: Float[Array, ""]
@@ -268,7 +281,7 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """What the M-step needs of the probabilities P (n, m): `P X`, `P 1` and `P^T 1`, and their likelihood."""
+    """Sums over the probabilities P (n, m) for the M-step: `P X`, `P 1`, `P^T 1`, and the log likelihood."""
 
     weighted_data: Float[Array, "n d"]
     per_centroid: Float[Array, " n"]
@@ -279,7 +292,10 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Points with zero mean and a mean squared norm of 1, zero where masked; the mean and the scale taken."""
+    """Scales points to zero mean and a mean squared norm of 1; returns points, mean and scale.
+
+    Masked points become zero.
+    """
     count = jnp.sum(mask).astype(points.dtype)
     mean = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / count
     centered = jnp.where(mask[:, None], points - mean[None, :], 0)
@@ -295,7 +311,7 @@ def _expectation(
     variance: Float[Array, ""],
     outliers: Float[Array, ""],
 ) -> _Expected:
-    """The E-step, a block of data points at a time; logarithms are shifted so that nothing underflows."""
+    """The E-step, one block of data points at a time; shifted logarithms prevent underflow."""
     (m, d), n = data.shape, centroids.shape[0]
     dtype, blocks = data.dtype, -(-m // _BLOCK)
     density = jnp.sum(centroids_mask).astype(dtype) / jnp.sum(data_mask).astype(dtype)
@@ -332,7 +348,7 @@ def _maximization(
     factor: Float[Array, "n rank"],
     ridge: Float[Array, ""],
 ) -> Float[Array, "rank d"]:
-    """The M-step: the displacement, as coefficients of the kernel's factor."""
+    """The M-step: returns the displacement, as coefficients of the kernel factor."""
     weights = expected.per_centroid[:, None]
     gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
     wanted = product(factor.T, expected.weighted_data - weights * centroids)
@@ -340,7 +356,7 @@ def _maximization(
 
 
 def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array, "n d"]) -> Float[Array, ""]:
-    """The mean squared distance, per dimension, of the data from the centroids that explain it."""
+    """Returns the mean squared distance, per dimension, of the data from the centroids that explain them."""
     squares = (
         jnp.sum(expected.per_point[:, None] * data**2)
         + jnp.sum(expected.per_centroid[:, None] * moved**2)
@@ -348,3 +364,10 @@ def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array
     )
     explained = jnp.maximum(jnp.sum(expected.per_centroid), jnp.finfo(data.dtype).tiny)
     return jnp.abs(squares) / (explained * data.shape[1])
+
+
+CPD = Refined(
+    "Rodolà, Moeller, Cremers 2015: k = 30, 3 iterations of C and its recovery by Coherent Point Drift",
+    DriftRecovery(),
+    number_of_eigenvectors=30,
+)

@@ -1,57 +1,65 @@
-r"""Partial functional maps: a functional map and the region of a whole that a part covers, found by turns.
+r"""Partial functional maps: alternately finds a functional map and the region of Y that X covers.
 
 E. Rodolà, L. Cosmo, M. M. Bronstein, A. Torsello, D. Cremers, *Partial functional correspondence*, Computer
-Graphics Forum 36(1), 2017. Written from what the method is known to do, without the authors' program and
-without the text at hand (so no equation numbers; W and its fading are as remembered), to be compared with.
+Graphics Forum 36(1), 2017. Neither the program of the authors nor the text was available for this
+reconstruction, so no equation numbers are given, and W and its decay are from memory.
 
-X is the part, Y the whole. Functions F on X correspond to functions G on Y, but only inside the region that
-X covers: a membership function v on Y says where, through `eta(t) = (tanh(6 (t - 1/2)) + 1) / 2`. With the
-paper's C = `c.T` (ours is the pullback, functions on Y to functions on X), `A = Phi_X^+ F` and
-`B(v) = Phi_Y^+ (eta(v) G)`, the paper minimises by turns over C and over v
+X is the partial shape, Y the full shape. Functions F on X correspond to functions G on Y, but only inside the
+region of Y that X covers. A membership function v on Y describes the region: eta(v) is 1 inside and 0
+outside, with
+
+    eta(t) = (tanh(6 (t - 1/2)) + 1) / 2,    A = Phi_X^+ F,    B(v) = Phi_Y^+ (eta(v) G).
+
+The paper alternately minimises over its functional map C (the transpose of C in the code, where the pullback
+takes functions on Y to functions on X) and over v
 
     ||C A - B(v)||_{2,1}
         + mu_1 ||C * W||^2 + mu_2 sum_{i != j} (C^T C)_ij^2 + mu_3 sum_i ((C^T C)_ii - d_i)^2
         + mu_4 (area(X) - integral of eta(v))^2 + mu_5 integral of xi(v) ||grad v||
 
-where W grows with the distance from a slanted diagonal: the r-th eigenvalue of the part is about as large as
-the k-th of the whole, with r / k near the ratio of their areas, and d_i is 1 up to r and 0 above. (The first
-line is its fidelity term, the others its regularisers of the map and of the part.)
+The first line is the fidelity term; the second line regularises the map, the third the region. W grows with
+the distance from a slanted diagonal: the r-th eigenvalue of X is about as large as the k-th eigenvalue of Y,
+with r / k near the ratio of the areas. d_i is 1 up to r and 0 above.
 
-Departures from the paper, each because the method came out better, or for want of the paper's data:
+Departures from the paper. Each gave better results, or replaces a detail that was not available:
 
-- **Start.** The paper starts from v = 1 and a C that knows nothing of the pair. Here C starts from the
-  functional map of the pair's start, as all methods do.
-- **Turns.** After each minimisation over C come a few steps of spectral ICP, with the rank-r orthogonality
-  the paper has in its refinement at the end. Without them the region came out wrong: on three real
-  pairs its intersection with the true one was 39, 21 and 21 % of their union, with them 83, 81 and 43 %.
-- **Region.** v starts, at the beginning and in each minimisation, from the image of the constant function
-  under C, clipped to [0, 1], rather than from 1 or from the last v: there the derivative of eta nearly
-  vanishes, and a wrong region stays.
-- **Descriptors.** Not the 352 numbers of SHOT but its first principal components on both shapes, of mean
-  square 1, and the constant function. SHOT itself consists of numbers that are nowhere negative, of which a
-  constant is a large part; here it counts as much as all components together. Between 10 and 30 of these
-  made little difference; with a hundred, the true map of the true region cost more than C = 0.
-- **Rank.** Only the r columns of C that are not to be zero are kept.
-- **Length.** xi = 1, plain total variation, known to work from an earlier attempt: the paper's narrow xi
-  vanishes wherever v is not near 1/2. It was not tried again.
-- **Weights.** The whole has area 1, and norms of columns are averaged, not summed; so weights have other
-  units than the published ones. mu_1 = mu_3 = 1 and mu_2 = 100 are kept, for a fidelity term that is
-  multiplied by `FIDELITY`; that and mu_5 were chosen on four real pairs, mu_4 was not varied.
-- **Recovery.** Nearest neighbours among all vertices of Y; among those of the region alone they came out the
-  same, or worse where the region is wrong.
-- **Solver.** Limited-memory BFGS by optimistix with a bounded number of steps, v in the metric of vertex
-  areas; all norms are rounded off at zero.
+- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. Here C starts from
+  the functional map of the initial map, as for all methods.
+- **Iterations.** A few steps of spectral ICP follow each minimisation over C. They use the rank-r
+  orthogonality of the refinement at the end of the paper. Without these steps the region is wrong: on three
+  real pairs the intersection with the true region is 39, 21 and 21 % of the union, and 83, 81 and 43 % with
+  them.
+- **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
+  [0, 1]. Starting from 1 or from the last v keeps wrong regions, because the derivative of eta nearly
+  vanishes there.
+- **Descriptors.** F and G are the first principal components of SHOT on both shapes, of mean square 1, and
+  the constant function. The paper uses all 352 numbers of SHOT. These are nonnegative, so a constant is a
+  large part of them; here the constant has as much weight as all components together. Between 10 and 30
+  components made little difference. With a hundred, the true map of the true region had a higher energy than
+  C = 0.
+- **Rank.** Only the r nonzero columns of C are stored.
+- **Length.** xi = 1, plain total variation, which worked in an earlier attempt. The narrow xi of the paper
+  vanishes wherever v is not near 1/2; it was not tried again.
+- **Weights.** Y has area 1, and column norms are averaged instead of summed, so the weights have other units
+  than the published weights. mu_1 = mu_3 = 1 and mu_2 = 100 are as published, with a fidelity term multiplied
+  by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs; mu_4 was not varied.
+- **Recovery.** Nearest neighbours are searched among all vertices of Y. A search among the vertices of the
+  region gave the same maps, or worse maps where the region is wrong.
+- **Solver.** Limited-memory BFGS by optimistix with a bounded number of steps, with v in the metric of the
+  vertex areas. All norms are smoothed at zero.
 
-On 12 pairs of SHREC'16 other than those four the mean geodesic error came to 0.015 on 6 cuts and 0.018 on 6
-holes, from starts with 0.135 and 0.160; that of MWP from the same starts to 0.011 and 0.017.
+On 12 other pairs of SHREC'16 the mean geodesic error is 0.015 on 6 cuts and 0.018 on 6 holes, from initial
+maps with 0.135 and 0.160. MWP from the same initial maps reaches 0.011 and 0.017.
 
-Conventions are those of `jaxsmw.core.functional_map`, pullback.
+`PARTIAL_FUNCTIONAL_MAPS` has the settings in use: 100 eigenvectors, 15 descriptors, 5 iterations. Functional
+maps are in the pullback convention of `jaxsmw.core.functional_map`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,35 +74,37 @@ from jaxsmw.core.products import product
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.bcicp import check_spectrum
+from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.batches import pad_rows, padded_size
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""What the fidelity term counts beside mu_1 to mu_3, its column norms being averaged."""
+"""The weight of the fidelity term beside mu_1 to mu_3; column norms are averaged."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
 """mu_1, mu_2 and mu_3, as published."""
 REGION_WEIGHTS = (10.0, 0.01)
-"""mu_4 and mu_5, of areas and lengths where the whole has area 1."""
+"""mu_4 and mu_5, for areas and lengths on a Y of area 1."""
 
-# How fast the slanted weights fade towards high frequencies (sigma of the paper's W).
-_FADING = 0.03
-# Norms of columns, and of gradients, that are rounded off: a thousandth of what a descriptor has, and of the
-# gradient of a function that changes by 1 over the whole.
-_ROUNDED = 1e-3
-# Steps of L-BFGS in a minimisation over C and over v, most of which are taken.
+# The decay of the slanted weights towards high frequencies (sigma of W in the paper).
+_DECAY = 0.03
+# Norms of columns and of gradients are smoothed below this number: a thousandth of the norm of a descriptor,
+# and of the gradient of a function that changes by 1 over Y.
+_SMOOTHING = 1e-3
+# The largest numbers of L-BFGS steps in a minimisation over C and over v; most of the steps are taken.
 _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
 
 class SurfaceGradient(eqx.Module):
-    """The gradient of functions that are linear on triangles, in a spectrum's unit of length.
+    """The gradient of piecewise linear functions on a mesh, in the unit of length of a spectrum.
 
     **Attributes:**
 
-    - `faces`: corners (f, 3); padded with faces of no area.
-    - `hats`: gradient of each corner's hat function on its triangle (f, 3, 3), zero where it has no area.
-    - `areas`: (f,).
+    - `faces`: the corners of each face (f, 3); padded with faces of area zero.
+    - `hats`: the gradient of each corner's hat function on its face (f, 3, 3), zero on faces of area zero.
+    - `areas`: the area of each face (f,).
     """
 
     faces: Int32[Array, "f 3"]
@@ -103,9 +113,9 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Of a mesh whose spectrum is scaled to any area, perhaps padded.
+        """Returns the gradient on a mesh, in the unit of its spectrum, which may be padded.
 
-        **Raises:** `InputError` if the spectrum has fewer vertices than the mesh.
+        **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
         check_spectrum(mesh, spectrum)
         scale = math.sqrt(float(jnp.sum(spectrum.vertex_areas)) / mesh.area)
@@ -113,7 +123,7 @@ class SurfaceGradient(eqx.Module):
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         doubled = np.linalg.norm(normals, axis=1)
         opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-        # Normal and edge in the unit of the area each: `n x e / (2 area)`, the normal of length 2 area.
+        # The gradient is `n x e / (2 area)` for the unit normal n; the normal here has length 2 area.
         squared = np.where(doubled > 0, doubled, np.inf)[:, None, None] ** 2
         hats = np.cross(normals[:, None], opposite) / squared
         size = padded_size(len(mesh.faces))
@@ -125,19 +135,19 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """The integral of the gradient's length, rounded off at zero (Mumford-Shah term with xi = 1)."""
+        """Returns the integral of the gradient's length, smoothed at zero (Mumford-Shah term, xi = 1)."""
         gradient = jnp.einsum("fc,fcd->fd", function[self.faces], self.hats)
-        return jnp.sum(self.areas * _rounded_norm(gradient, axis=1))
+        return jnp.sum(self.areas * _smoothed_norm(gradient, axis=1))
 
 
 class PartialMap(eqx.Module):
-    """The outcome of `partial_functional_map`.
+    """The result of `partial_functional_map`.
 
     **Attributes:**
 
-    - `pointwise_map`: T: X -> Y (m,); -1 throughout on failure.
-    - `functional_map`: C (r, k_Y), of orthonormal rows, with r the smaller of k_X and k_Y.
-    - `region`: eta(v) (n,), from 0 outside to 1 inside of what X covers; zero where Y is masked.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y; -1 everywhere on failure.
+    - `functional_map`: C (r, k_Y) with orthonormal rows, where r is the smaller of k_X and k_Y.
+    - `region`: eta(v) (n,), 1 inside the region that X covers and 0 outside; zero on masked vertices of Y.
     - `result`: a member of `RESULTS`.
     """
 
@@ -153,105 +163,142 @@ def partial_functional_map(
     gradient_y: SurfaceGradient,
     pointwise_map: Int[Array, " m"],
     *,
-    turns: int = 5,
+    iterations: int = 5,
     icp_steps: int = 5,
 ) -> PartialMap:
-    """Match a part X with a whole Y; see the top of this module.
+    """Matches a partial shape X with a full shape Y; see the docstring of this module.
 
-    Pure, and meant to be compiled. Nothing depends on the signs of eigenvectors or on padding.
+    The function is pure and meant to be compiled. The result does not depend on the signs of eigenvectors or
+    on padding.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: of the part and of the whole in one unit of length, in which the whole has
-      area 1, cut where the first of them ends (`jaxsmw.presets.common_range`), so that k_X is the rank r of
-      the paper (of more than k_Y the first k_Y count); with the same number of descriptors, comparable and
-      of mean square 1.
-    - `gradient_y`: of Y.
-    - `pointwise_map`: the start T: X -> Y, one vertex of Y per vertex of X.
-    - `turns`: how often C and v are minimised over; at least 1.
-    - `icp_steps`: of spectral ICP after each minimisation over C.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and of Y in one unit of length, in which Y has area 1, cut
+      to their common range (`jaxsmw.presets.common_range`). k_X is then the rank r of the paper; if k_X is
+      larger than k_Y, only the first k_Y eigenvectors of X are used. Both spectra need the same number of
+      comparable descriptors, of mean square 1.
+    - `gradient_y`: the gradient on Y.
+    - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
+    - `iterations`: the number of minimisations over C and over v; at least 1.
+    - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
 
-    **Returns:** A `PartialMap`. Nothing is raised for bad numbers: check its `result`.
+    **Returns:** A `PartialMap`. Bad numbers raise no error: check `result`.
 
-    **Raises:** `ValueError` for fewer than one turn, or spectra without the same number of descriptors.
+    **Raises:** `ValueError` for fewer than 1 iteration, or for spectra without the same number of
+    descriptors.
     """
-    if turns < 1:
-        raise ValueError(f"partial functional maps need at least 1 turn, not {turns}")
-    described_x, described_y = (
-        0 if spectrum.descriptors is None else spectrum.descriptors.shape[1]
-        for spectrum in (spectrum_x, spectrum_y)
-    )
-    if not described_x == described_y > 0:
-        raise ValueError(
-            f"both shapes need the same number of descriptors, and some, not {described_x} and {described_y}"
-        )
-    # Rows of C are to be orthonormal. A part with many holes can have more eigenvalues in the common range.
-    k_y = spectrum_y.eigenvalues.shape[0]
-    spectrum_x = spectrum_x.truncate(k_y)
-    k_x = spectrum_x.eigenvalues.shape[0]
-    dual_x, dual_y = (dual_eigenvectors(spectrum, "area") for spectrum in (spectrum_x, spectrum_y))
-    functions_x, functions_y = _functions(spectrum_x), _functions(spectrum_y)
-    coefficients_x = product(dual_x.T, functions_x)
-    weights = slanted_weights(k_x, k_y).astype(coefficients_x.dtype)
-    area_x = jnp.sum(spectrum_x.vertex_areas)
-    # In u = v sqrt(area) all vertices weigh the same, however densely they lie.
-    metric = jnp.sqrt(jnp.where(spectrum_y.mask, spectrum_y.vertex_areas, 1))
+    if iterations < 1:
+        raise ValueError(f"partial functional maps need at least 1 iteration, not {iterations}")
+    energies = _Energies.of(spectrum_x, spectrum_y, gradient_y)
+    spectra = energies.spectrum_x, spectrum_y
 
-    def image(c: Float[Array, "k_x k_y"]) -> Float[Array, " n"]:
-        return jnp.clip(product(spectrum_y.eigenvectors, product(c.T, coefficients_x[:, -1])), 0, 1)
-
-    def inside(membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
-        return product(dual_y.T, eta(membership)[:, None] * functions_y)
-
-    def best_map(c: Float[Array, "k_x k_y"], membership: Float[Array, " n"]) -> Float[Array, "k_x k_y"]:
-        coefficients_y = inside(membership)
-
-        def energy(c: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-            return FIDELITY * fidelity(c, coefficients_x, coefficients_y) + map_energy(c, weights)
-
-        return _minimum(energy, c, _MAP_TOLERANCE, _MAP_STEPS)
-
-    def best_region(c: Float[Array, "k_x k_y"]) -> Float[Array, " n"]:
-        def energy(scaled: Float[Array, " n"]) -> Float[Array, ""]:
-            v = scaled / metric
-            return fidelity(c, coefficients_x, inside(v)) + region_energy(v, area_x, spectrum_y, gradient_y)
-
-        return _minimum(energy, image(c) * metric, _REGION_TOLERANCE, _REGION_STEPS) / metric
-
-    def turn(
-        state: tuple[Float[Array, "k_x k_y"], Float[Array, " n"]], _: None
-    ) -> tuple[tuple[Float[Array, "k_x k_y"], Float[Array, " n"]], None]:
+    def iterate(
+        state: tuple[Float[Array, "r k_y"], Float[Array, " n"]], _: None
+    ) -> tuple[tuple[Float[Array, "r k_y"], Float[Array, " n"]], None]:
         c, membership = state
-        c = _spectral_icp(best_map(c, membership), spectrum_x, spectrum_y, icp_steps)
-        return (c, best_region(c)), None
+        c = _spectral_icp(energies.best_map(c, membership), *spectra, icp_steps)
+        return (c, energies.best_region(c)), None
 
-    start = encode(pointwise_map, spectrum_x, spectrum_y)
-    (functional_map, membership), _ = lax.scan(turn, (start, image(start)), None, length=turns)
+    initial = encode(pointwise_map, *spectra)
+    state, _ = lax.scan(iterate, (initial, energies.covered(initial)), None, length=iterations)
+    functional_map, membership = state
     region = jnp.where(spectrum_y.mask, eta(membership), 0)
-    # An energy that overflows leaves C and v where they were.
-    left = fidelity(functional_map, coefficients_x, inside(membership))
+    # If an energy overflows, the minimisations leave C and v unchanged; only the energy shows the fault.
+    left = fidelity(functional_map, energies.coefficients_x, energies.inside(membership))
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
-    result = diagnose(spectrum_x, spectrum_y, pointwise_map.astype(jnp.int32), result)
-    found = decode(functional_map, spectrum_x, spectrum_y)
+    result = diagnose(*spectra, pointwise_map.astype(jnp.int32), result)
+    found = decode(functional_map, *spectra)
     return PartialMap(jnp.where(result == RESULTS.successful, found, -1), functional_map, region, result)
 
 
+class _Energies(eqx.Module):
+    """The energies of one pair, and their minimisers over C and over v.
+
+    **Attributes:**
+
+    - `spectrum_x`, `spectrum_y`: the spectra, X with at most k_Y eigenvectors.
+    - `gradient_y`: the gradient on Y.
+    - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
+    - `coefficients_x`: A, the coefficients of the descriptors and of the constant function on X (r,
+      functions).
+    - `functions_y`: G, the same functions on Y (n, functions).
+    """
+
+    spectrum_x: Spectrum
+    spectrum_y: Spectrum
+    gradient_y: SurfaceGradient
+    dual_y: Float[Array, "n k_y"]
+    coefficients_x: Float[Array, "r functions"]
+    functions_y: Float[Array, "n functions"]
+
+    @classmethod
+    def of(cls, spectrum_x: Spectrum, spectrum_y: Spectrum, gradient_y: SurfaceGradient) -> _Energies:
+        described_x, described_y = (
+            0 if spectrum.descriptors is None else spectrum.descriptors.shape[1]
+            for spectrum in (spectrum_x, spectrum_y)
+        )
+        if not described_x == described_y > 0:
+            raise ValueError(
+                "partial functional maps need the same number of descriptors on both shapes, at least 1, "
+                f"not {described_x} and {described_y}"
+            )
+        # The rows of C are orthonormal, so their number is at most k_Y. A shape with many holes can have more
+        # eigenvalues in the common range.
+        spectrum_x = spectrum_x.truncate(spectrum_y.eigenvalues.shape[0])
+        dual_x, dual_y = (dual_eigenvectors(spectrum, "area") for spectrum in (spectrum_x, spectrum_y))
+        coefficients_x = product(dual_x.T, _functions(spectrum_x))
+        return cls(spectrum_x, spectrum_y, gradient_y, dual_y, coefficients_x, _functions(spectrum_y))
+
+    def covered(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
+        """Returns the image of the constant function on X, clipped to [0, 1]."""
+        coefficients = product(c.T, self.coefficients_x[:, -1])
+        return jnp.clip(product(self.spectrum_y.eigenvectors, coefficients), 0, 1)
+
+    def inside(self, membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
+        """Returns B(v), the coefficients of the functions on Y, restricted to the region."""
+        return product(self.dual_y.T, eta(membership)[:, None] * self.functions_y)
+
+    def best_map(self, c: Float[Array, "r k_y"], membership: Float[Array, " n"]) -> Float[Array, "r k_y"]:
+        """Minimises over the functional map, starting from `c`."""
+        coefficients_y = self.inside(membership)
+        weights = slanted_weights(*c.shape).astype(self.coefficients_x.dtype)
+
+        def energy(c: Float[Array, "r k_y"]) -> Float[Array, ""]:
+            distance = fidelity(c, self.coefficients_x, coefficients_y)
+            return FIDELITY * distance + map_energy(c, weights)
+
+        return _minimum(energy, c, _MAP_TOLERANCE, _MAP_STEPS)
+
+    def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
+        """Minimises over the membership function, starting from `covered`."""
+        area_x = jnp.sum(self.spectrum_x.vertex_areas)
+        # In u = v sqrt(area) all vertices have equal weight, whatever the density of the mesh.
+        metric = jnp.sqrt(jnp.where(self.spectrum_y.mask, self.spectrum_y.vertex_areas, 1))
+
+        def energy(scaled: Float[Array, " n"]) -> Float[Array, ""]:
+            v = scaled / metric
+            distance = fidelity(c, self.coefficients_x, self.inside(v))
+            return distance + region_energy(v, area_x, self.spectrum_y, self.gradient_y)
+
+        return _minimum(energy, self.covered(c) * metric, _REGION_TOLERANCE, _REGION_STEPS) / metric
+
+
 def eta(membership: Float[Array, " n"]) -> Float[Array, " n"]:
-    """What a value of v means, from 0 outside to 1 inside."""
+    """Returns the membership eta(v), from 0 outside the region to 1 inside."""
     return (jnp.tanh(6 * (membership - 0.5)) + 1) / 2
 
 
 def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
-    """W of the paper, in the pullback: the distance of each entry from the slanted diagonal, fading.
+    """Returns W of the paper for the pullback: the distance of each entry from the slanted diagonal.
 
-    The diagonal goes through the first entry, k_x / k_y of a row per column. Distances are in entries, and
-    multiplied by `exp(-0.03 sqrt(i^2 + j^2))` for row and column counted from 1.
+    The diagonal starts at the first entry and moves k_x / k_y rows per column. Distances are measured in
+    entries and multiplied by `exp(-0.03 sqrt(i^2 + j^2))`, with rows i and columns j counted from 1.
     """
     row, column = jnp.meshgrid(*(jnp.arange(1, k + 1, dtype=float) for k in (k_x, k_y)), indexing="ij")
     slope = k_x / k_y
     distance = jnp.abs((row - 1) - slope * (column - 1)) / math.hypot(1, slope)
-    return jnp.exp(-_FADING * jnp.hypot(row, column)) * distance
+    return jnp.exp(-_DECAY * jnp.hypot(row, column)) * distance
 
 
 def fidelity(
@@ -259,13 +306,13 @@ def fidelity(
     coefficients_x: Float[Array, "k_x functions"],
     coefficients_y: Float[Array, "k_y functions"],
 ) -> Float[Array, ""]:
-    """`||C A - B||_{2,1}`: the mean norm of a column, and the norm of the last, the constant function's."""
-    norms = _rounded_norm(product(functional_map.T, coefficients_x) - coefficients_y, axis=0)
+    """Returns `||C A - B||_{2,1}`: the mean norm of the columns, plus that of the last (the constant)."""
+    norms = _smoothed_norm(product(functional_map.T, coefficients_x) - coefficients_y, axis=0)
     return jnp.mean(norms[:-1]) + norms[-1]
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """The terms of mu_1 to mu_3: C near the slanted diagonal, its rows orthonormal."""
+    """Returns the terms of mu_1 to mu_3, which keep C near the slanted diagonal and its rows orthonormal."""
     slant, orthogonality, length = MAP_WEIGHTS
     gram = product(functional_map, functional_map.T)
     lengths = jnp.diagonal(gram)
@@ -282,28 +329,28 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """The terms of mu_4 and mu_5: the region as large as the part, its boundary short."""
+    """Returns the terms of mu_4 and mu_5, which keep the region as large as X and its boundary short."""
     area, length = REGION_WEIGHTS
     missing = area_x - jnp.sum(spectrum_y.vertex_areas * eta(membership))
     return area * missing**2 + length * gradient_y.total_variation(membership)
 
 
 def _functions(spectrum: Spectrum) -> Float[Array, "n functions"]:
-    """The descriptors, then the constant function."""
+    """Returns the descriptors and, as the last column, the constant function."""
     assert spectrum.descriptors is not None
     constant = spectrum.mask.astype(spectrum.descriptors.dtype)
     return jnp.concatenate([spectrum.descriptors, constant[:, None]], axis=1)
 
 
-def _rounded_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, " c"]:
-    """Euclidean norms, differentiable at zero, where they are zero still."""
-    return jnp.sqrt(jnp.sum(vectors**2, axis=axis) + _ROUNDED**2) - _ROUNDED
+def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, " c"]:
+    """Returns Euclidean norms that are smoothed to be differentiable at zero; zero vectors keep norm zero."""
+    return jnp.sqrt(jnp.sum(vectors**2, axis=axis) + _SMOOTHING**2) - _SMOOTHING
 
 
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """The paper's refinement: nearest neighbours, and the matrix of orthonormal rows nearest to their map."""
+    """Alternates nearest neighbours and the nearest C with orthonormal rows (the refinement of the paper)."""
 
     def step(c: Float[Array, "k_x k_y"], nothing: None) -> tuple[Float[Array, "k_x k_y"], None]:
         matched = encode(decode(c, spectrum_x, spectrum_y), spectrum_x, spectrum_y)
@@ -316,12 +363,44 @@ def _spectral_icp(
 
 def _minimum(
     energy: Callable[[Float[Array, " ..."]], Float[Array, ""]],
-    start: Float[Array, " ..."],
+    initial: Float[Array, " ..."],
     tolerance: float,
     steps: int,
 ) -> Float[Array, " ..."]:
-    """Where a number of steps of L-BFGS leads; that it need not be the minimum is no failure."""
-    import optimistix as optx  # here, as importing it takes long
+    """Returns the result of some L-BFGS steps; stopping before the minimum is not a failure."""
+    import optimistix as optx  # imported here because the import is slow
 
     solver: optx.LBFGS = optx.LBFGS(tolerance, tolerance)
-    return optx.minimise(lambda y, _: energy(y), solver, start, max_steps=steps, throw=False).value
+    return optx.minimise(lambda y, _: energy(y), solver, initial, max_steps=steps, throw=False).value
+
+
+@dataclass(frozen=True)
+class PartialFunctionalMaps(Method):
+    """Matches a partial shape X with a full shape Y by `partial_functional_map`."""
+
+    reference: str
+    number_of_eigenvectors: int = 100
+    number_of_descriptors: int = 15
+    iterations: int = 5
+    partial_only: bool = True
+
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """See `Method`."""
+        assert pair.meshes is not None
+        spectra = pair.seen_in(
+            Stage(
+                number_of_eigenvectors=self.number_of_eigenvectors,
+                number_of_descriptors=self.number_of_descriptors,
+            )
+        )
+        gradient = SurfaceGradient.of(pair.meshes[1], spectra[1])
+        found = compiled(partial_functional_map)(
+            *spectra, gradient, pair.initial_map, iterations=self.iterations
+        )
+        return found.pointwise_map, found.result
+
+
+PARTIAL_FUNCTIONAL_MAPS = PartialFunctionalMaps(
+    "our reconstruction of Rodolà, Cosmo, Bronstein, Torsello, Cremers 2017, partial functional maps: "
+    "k = 100, 5 iterations"
+)

@@ -1,9 +1,13 @@
-"""Other libraries' programs on the same spectra and starts, for comparison: an optional environment.
+"""ZoomOut by other libraries, on the same spectra and initial maps; needs optional packages.
 
     pip install 'jaxsmw[benchmark,peers]'
 
-Their methods are found by name like ours where their packages are installed. They run in the same process,
-on as many cores.
+The methods appear under their names where the packages are installed. They run in the same process and on the
+same number of cores as all other methods. Both are called with the settings of the ZoomOut paper (see
+`zoomout`): k = 20, 25, ..., 120, all vertices in every iteration.
+
+- `PyFM`: pyFM (`pyfmaps` on the package index) by R. Magnet, its function `zoomout_refine` with one job.
+- `Geomfum`: geomfum, its class `ZoomOut`.
 """
 
 from __future__ import annotations
@@ -18,41 +22,37 @@ from jaxtyping import Array, Float64, Int, Int64
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.opponents import (
-    FIRST_EIGENVECTORS,
-    LAST_EIGENVECTORS,
-    ZOOMOUT_STEP,
-    Method,
-    PreparedPair,
-)
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVECTORS, ZOOMOUT_STEP
 
 
 class Peer(Method):
-    """ZoomOut of another library, with the steps of its paper, from k = 20 to 120.
+    """ZoomOut of another library, from k = 20 to 120 in the steps of the paper.
 
-    Its shape 1 is our Y and its shape 2 our X: its functional maps take functions on 1 to functions on 2, its
-    pointwise maps vertices of 2 to vertices of 1.
+    Shape 1 of the other libraries is our Y, and shape 2 is our X. Their functional maps take functions on
+    shape 1 to functions on shape 2, and their pointwise maps take vertices of shape 2 to vertices of shape 1.
     """
 
     number_of_eigenvectors = LAST_EIGENVECTORS
-    whole_only = True
+    full_only = True
     package: str
 
-    def __call__(self, pair: PreparedPair) -> tuple[Int[Array, " m"], RESULTS]:
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """See `Method`."""
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
-        start = np.searchsorted(y.vertices, np.asarray(pair.start)[x.vertices])
-        found = np.zeros(pair.start.shape, np.int32)
-        found[x.vertices] = y.vertices[self.refine(start, x, y)]
+        initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
+        found = np.zeros(pair.initial_map.shape, np.int32)
+        found[x.vertices] = y.vertices[self.refine(initial_map, x, y)]
         return jnp.asarray(found), RESULTS.successful  # type: ignore[return-value]
 
     @abc.abstractmethod
-    def refine(self, start: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """The map of X's used vertices to Y's, both counted from 0."""
+    def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
+        """Returns the refined map between the referenced vertices of X and of Y, both numbered from 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The vertices of a surface, without padding, in the precision that other libraries work in."""
+    """The referenced vertices of a shape, without padding, in the float64 of the other libraries."""
 
     vertices: Int64[np.ndarray, " u"]
     eigenvalues: Float64[np.ndarray, " k"]
@@ -61,26 +61,30 @@ class _Shape:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Shape:
+        """Returns the referenced vertices of a spectrum."""
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
 
 
 class PyFM(Peer):
-    """pyFM (`pyfmaps`), by Magnet."""
+    """The ZoomOut of pyFM."""
 
     reference = "pyFM's zoomout_refine, k = 20, 25, ..., 120, one job"
     package = "pyFM"
 
-    def refine(self, start: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """`pyFM.refine.zoomout_refine`."""
+    def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
+        """Calls `pyFM.refine.zoomout_refine`."""
         from pyFM.refine import zoomout_refine
         from pyFM.spectral import p2p_to_FM
         from scipy.sparse import diags_array
 
         areas = diags_array(x.areas).tocsr()
         first = p2p_to_FM(
-            start, y.eigenvectors[:, :FIRST_EIGENVECTORS], x.eigenvectors[:, :FIRST_EIGENVECTORS], A2=areas
+            initial_map,
+            y.eigenvectors[:, :FIRST_EIGENVECTORS],
+            x.eigenvectors[:, :FIRST_EIGENVECTORS],
+            A2=areas,
         )
         _, found = zoomout_refine(
             first,
@@ -96,19 +100,19 @@ class PyFM(Peer):
 
 
 class Geomfum(Peer):
-    """geomfum."""
+    """The ZoomOut of geomfum."""
 
     reference = "geomfum's ZoomOut, k = 20, 25, ..., 120"
     package = "geomfum"
 
-    def refine(self, start: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """`geomfum.refine.ZoomOut`."""
+    def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
+        """Calls `geomfum.refine.ZoomOut`."""
         from geomfum.basis import EigenBasis
         from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
         from geomfum.refine import ZoomOut
 
         bases = [EigenBasis(shape.eigenvalues, shape.eigenvectors) for shape in (y, x)]
-        first = FmFromP2pConverter()(start, *(basis.truncate(FIRST_EIGENVECTORS) for basis in bases))
+        first = FmFromP2pConverter()(initial_map, *(basis.truncate(FIRST_EIGENVECTORS) for basis in bases))
         refined = ZoomOut(nit=_STEPS, step=ZOOMOUT_STEP)(first, *bases)
         return np.asarray(P2pFromFmConverter()(refined, *bases))
 
@@ -117,6 +121,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Those whose packages are there, by name."""
+    """Returns the methods whose packages are installed, by name."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

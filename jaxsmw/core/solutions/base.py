@@ -1,0 +1,42 @@
+"""The interface of solutions."""
+
+from __future__ import annotations
+
+import abc
+from typing import Generic, TypeVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from jaxsmw.core.functional_map import WaveletProblem
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.soft_maps import PointwiseMap
+
+PreparedT = TypeVar("PreparedT")
+
+
+class Solution(eqx.Module, Generic[PreparedT]):
+    """A way to compute a functional map that preserves wavelets under a given pointwise map.
+
+    The type parameter is the type of the values that `prepare` returns.
+    """
+
+    def prepare(self, problem: WaveletProblem) -> PreparedT:
+        """Returns everything in `solve` that is the same for all pointwise maps; by default None."""
+        return None  # type: ignore[return-value]
+
+    @abc.abstractmethod
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: PreparedT,
+        pointwise_map: PointwiseMap,
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """Returns the functional map that follows from a pointwise map, and how the computation ended.
+
+        **Arguments:**
+
+        - `prepared`: the result of `prepare`.
+        - `previous`: the functional map of the previous iteration, from which iterative solvers start.
+        """

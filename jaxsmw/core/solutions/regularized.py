@@ -1,0 +1,311 @@
+"""The wavelet-preservation energy with further terms, minimised iteratively."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy as jsp
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Bool, Float
+
+from jaxsmw.core.banks import frame_function
+from jaxsmw.core.checks import as_parameter, check_between, check_choice
+from jaxsmw.core.functional_map import Norm, QuadraticEnergy, WaveletProblem
+from jaxsmw.core.products import product
+from jaxsmw.core.results import RESULTS, where
+from jaxsmw.core.soft_maps import PointwiseMap
+from jaxsmw.core.solutions.base import Solution
+from jaxsmw.core.solutions.descriptors import DescriptorPair, ProjectedDescriptors
+
+Weight = Float[Array, ""] | None
+
+_TERMS = (
+    "wavelet_preservation",
+    "laplacian_commutativity",
+    "orthogonality",
+    "descriptor_preservation",
+    "descriptor_commutativity",
+)
+
+
+def _as_weight(value: ArrayLike | None) -> Array | None:
+    return None if value is None else as_parameter(value)
+
+
+class RegularizedLeastSquares(Solution[None]):
+    """The minimiser of the wavelet-preservation energy plus further terms, by an iterative solver.
+
+    The functional map minimises the weighted sum of
+
+    - the wavelet-preservation energy (5);
+    - Laplacian commutativity, `||Lambda_out C - C Lambda_in||²`, with eigenvalues as fractions of the
+      largest;
+    - orthogonality, `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This term is not
+      quadratic;
+    - descriptor preservation, `||C F_in - F_out||²` (Ovsjanikov et al. 2012);
+    - descriptor commutativity, `sum_d ||C D_in - D_out C||²` (Nogneng and Ovsjanikov 2017).
+
+    The terms are scaled so that weights near one are comparable, whatever the height of a bank or the units
+    of descriptors: C = 0, or either side of a difference alone, costs about k_out. To this end the wavelet
+    term is divided by the mean of the frame function, which is one for a Parseval frame. `F_out` and all
+    `D_out` together are scaled to the squared norm k_out.
+
+    The wavelet term and the descriptor term have many thousand columns. They are first reduced to k_in
+    columns, exactly. Then `optimistix.least_squares` takes Gauss–Newton steps, and conjugate gradients solve
+    each step, so that no matrix of size k² x k² is formed. The solver starts from the previous functional map
+    if there is one. The result can be differentiated, implicitly at the minimum.
+
+    **Arguments:**
+
+    - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
+      `descriptor_commutativity`: positive weights. None omits a term.
+    - `descriptors`: the descriptors for the last two terms.
+    - `norm`: the norm of the wavelet term; see `WaveletProblem.energy`.
+    - `tolerance`: the tolerance of the solver, relative to C and to the residuals.
+    - `max_steps`: the largest number of steps. After that the result is `RESULTS.solver_not_converged`.
+
+    **Raises:** `ValueError` if a weight is not positive, or if weights and descriptors do not fit together.
+    """
+
+    wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
+    laplacian_commutativity: Weight = eqx.field(converter=_as_weight, default=1.0)
+    orthogonality: Weight = eqx.field(converter=_as_weight, default=0.1)
+    descriptor_preservation: Weight = eqx.field(converter=_as_weight, default=None)
+    descriptor_commutativity: Weight = eqx.field(converter=_as_weight, default=None)
+    descriptors: DescriptorPair | None = None
+    norm: Norm = eqx.field(static=True, default="area")
+    tolerance: float = eqx.field(static=True, default=1e-3)
+    max_steps: int = eqx.field(static=True, default=256)
+
+    def __check_init__(self) -> None:
+        check_choice("norm", self.norm, get_args(Norm))
+        for term in _TERMS:
+            if getattr(self, term) is not None:
+                check_between(self, term, getattr(self, term))
+        if self.wavelet_preservation is None and self.descriptor_preservation is None:
+            raise ValueError("without wavelet and descriptor preservation nothing ties C to the shapes")
+        weighted = self.descriptor_preservation is not None or self.descriptor_commutativity is not None
+        if weighted != (self.descriptors is not None):
+            raise ValueError("descriptors and a weight for their preservation or commutativity go together")
+        if not self.tolerance > 0 or self.max_steps < 1:
+            raise ValueError(f"tolerance={self.tolerance} and max_steps={self.max_steps} must be positive")
+        if (
+            self.descriptor_commutativity is not None
+            and self.descriptors is not None
+            and self.descriptors.x.operators is None
+        ):
+            raise ValueError("descriptor_commutativity needs DescriptorPair.project(..., operators=True)")
+
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: None,
+        pointwise_map: PointwiseMap,
+        previous: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """Minimises the objective, starting from the previous functional map."""
+        energy = None
+        if self.wavelet_preservation is not None:
+            responses_out, _ = problem.responses
+            height = jnp.mean(frame_function(responses_out))
+            energy = (1 / height) * problem.energy(pointwise_map, norm=self.norm)
+        descriptors = None
+        if self.descriptors is not None:
+            descriptors = problem.out_and_in(self.descriptors.x, self.descriptors.y)
+        spectrum_out, spectrum_in = problem.spectra
+        eigenvalues = spectrum_out.eigenvalues, spectrum_in.eigenvalues
+        return self._minimize(energy, *eigenvalues, descriptors, previous)
+
+    def minimize(
+        self,
+        energy: QuadraticEnergy | None,
+        eigenvalues_out: Float[Array, " k_out"],
+        eigenvalues_in: Float[Array, " k_in"],
+        *,
+        initial: Float[Array, "k_out k_in"] | None = None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """Minimises the objective with the given energy in place of the wavelet-preservation energy.
+
+        **Arguments:**
+
+        - `energy`: any quadratic energy, with the weight `wavelet_preservation`; None if and only if that
+          weight is None.
+        - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to, and of the shape
+          that C maps from. `descriptors.x` belong to the first of these shapes, as in the pullback
+          convention.
+        - `initial`: the functional map from which the solver starts; by default an estimate.
+
+        **Raises:** `ValueError` for an energy without a weight, or a weight without an energy.
+        """
+        descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
+        return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
+
+    def _minimize(
+        self,
+        energy: QuadraticEnergy | None,
+        eigenvalues_out: Float[Array, " k_out"],
+        eigenvalues_in: Float[Array, " k_in"],
+        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
+        initial: Float[Array, "k_out k_in"] | None,
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """Does the work of `solve` and `minimize`. The descriptors are in the order (out, in)."""
+        quadratic = self._quadratic_energy(
+            energy, descriptors, (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
+        )
+        terms = self._terms(quadratic, eigenvalues_out, eigenvalues_in, descriptors)
+        curvature = functools.reduce(operator.add, (t.curvature for t in terms if t.curvature is not None))
+        determined = curvature > quadratic.rounding()
+        finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
+        solvable = finite & jnp.all(determined)
+        # Conjugate gradients take few steps in units in which the quadratic terms have the same curvature in
+        # every entry of C.
+        unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
+        if initial is None:
+            initial = quadratic.cross * unit**2
+        functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
+        if len(terms) == 1:
+            result = where(quadratic.is_regular(), result, RESULTS.singular_system)
+        # A NaN outside of the quadratic terms shows in the residuals, for example of a negative weight.
+        residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
+        finite &= jnp.all(jnp.isfinite(residuals))
+        result = where(solvable, result, RESULTS.undetermined_functional_map)
+        return functional_map, where(finite, result, RESULTS.nonfinite_functional_map)
+
+    def _quadratic_energy(
+        self,
+        energy: QuadraticEnergy | None,
+        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
+        shape: tuple[int, int],
+        dtype: DTypeLike,
+    ) -> QuadraticEnergy:
+        """Returns the weighted sum of the given energy and descriptor preservation."""
+        if (energy is None) != (self.wavelet_preservation is None):
+            raise ValueError("an energy and a weight for it, wavelet_preservation, go together")
+        quadratic = QuadraticEnergy.zero(*shape, dtype)
+        if energy is not None and self.wavelet_preservation is not None:
+            quadratic += self.wavelet_preservation.astype(dtype) * energy
+        if descriptors is not None and self.descriptor_preservation is not None:
+            f_out, f_in = (side.coefficients for side in descriptors)
+            if (f_out.shape[0], f_in.shape[0]) != shape:
+                raise ValueError(
+                    f"the descriptors are in bases of {f_out.shape[0]} and {f_in.shape[0]} eigenvectors, but "
+                    f"the functional map is {shape[0]} x {shape[1]}: project the descriptors on the same "
+                    "spectra, in the same order"
+                )
+            size = jnp.sum(f_out**2)
+            weight = self.descriptor_preservation.astype(dtype) * shape[0] / size
+            quadratic += weight * QuadraticEnergy(product(f_in, f_in.T), product(f_out, f_in.T), size)
+        return quadratic
+
+    def _terms(
+        self,
+        quadratic: QuadraticEnergy,
+        eigenvalues_out: Float[Array, " k_out"],
+        eigenvalues_in: Float[Array, " k_in"],
+        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
+    ) -> list[_Term]:
+        """Returns all terms of the objective: the quadratic energy first, then those with a weight."""
+        dtype = eigenvalues_in.dtype
+        terms = [_energy_term(quadratic)]
+        if self.laplacian_commutativity is not None:
+            weight = self.laplacian_commutativity.astype(dtype)
+            terms.append(_laplacian_term(weight, eigenvalues_out, eigenvalues_in))
+        if self.orthogonality is not None:
+            weight = self.orthogonality.astype(dtype)
+            terms.append(_orthogonality_term(weight, eigenvalues_out.size, eigenvalues_in.size))
+        d_out, d_in = (None, None) if descriptors is None else (side.operators for side in descriptors)
+        if self.descriptor_commutativity is not None and d_out is not None and d_in is not None:
+            terms.append(_operator_term(self.descriptor_commutativity.astype(dtype), d_out, d_in))
+        return terms
+
+    def _gauss_newton(
+        self,
+        terms: Sequence[_Term],
+        unit: Float[Array, "k_out k_in"],
+        initial: Float[Array, "k_out k_in"],
+        solvable: Bool[Array, ""],
+    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        """Minimises the sum of the squared residuals in the given units, and reports convergence.
+
+        A problem that is not solvable ends at once: its residuals are taken to be zero.
+        """
+        import lineax as lx  # imported here because the import takes as long as an eigenbasis
+        import optimistix as optx
+
+        precision = 0.1 * self.tolerance
+        inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(unit.shape)))
+        with jax.default_matmul_precision("highest"):
+            # Full Gauss–Newton steps suffice: on real pairs a trust region never shortened a step. Besides,
+            # the trust regions of optimistix do not accept float32 while jax_enable_x64 is set.
+            solution: optx.Solution = optx.least_squares(
+                lambda scaled, _: [jnp.where(solvable, term.residual(scaled * unit), 0) for term in terms],
+                optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
+                jax.lax.stop_gradient(initial / unit),
+                max_steps=self.max_steps,
+                adjoint=optx.ImplicitAdjoint(lx.GMRES(precision, precision, restart=50)),
+                throw=False,
+            )
+        converged = solution.result == optx.RESULTS.successful
+        return solution.value * unit, where(converged, RESULTS.successful, RESULTS.solver_not_converged)
+
+
+class _Term(NamedTuple):
+    """One term of the objective, the squared norm of a residual.
+
+    **Attributes:**
+
+    - `residual`: the residual as a function of C.
+    - `curvature`: half the second derivative of the term in each entry of C; None if the term is not
+      quadratic.
+    """
+
+    residual: Callable[[Float[Array, "k_out k_in"]], Array]
+    curvature: Float[Array, "k_out k_in"] | None
+
+
+def _energy_term(energy: QuadraticEnergy) -> _Term:
+    """The given energy, up to a constant.
+
+    The Cholesky factor has the same inner products as all the columns in the energy, so the factor can
+    replace the columns. A ridge below rounding lets the factor exist where only the other terms determine C.
+    """
+    (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
+    factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))
+    target = jsp.linalg.solve_triangular(factor, energy.cross.T, lower=True).T
+    curvature = jnp.broadcast_to(jnp.diagonal(energy.gram)[None, :], (k_out, k_in))
+    return _Term(lambda c: product(c, factor) - target, curvature)
+
+
+def _laplacian_term(
+    weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
+) -> _Term:
+    """The weighted term `||Lambda_out C - C Lambda_in||²`, relative to the largest eigenvalue."""
+    largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
+    gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
+    gaps = gaps * jnp.sqrt(weight)
+    return _Term(lambda c: gaps * c, gaps**2)
+
+
+def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
+    """The weighted term `||C^T C - I||²` or `||C C^T - I||²`, whichever is smaller in size."""
+    root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
+    return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
+
+
+def _operator_term(
+    weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
+) -> _Term:
+    """The weighted term `sum_d ||C D_in - D_out C||²`, with all D_out scaled to the squared norm k_out."""
+    scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
+    diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
+    squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
+    return _Term(
+        lambda c: scale * (product(c[None], d_in) - product(d_out, c[None])),
+        scale**2 * (squares - 2 * product(diagonal_out.T, diagonal_in)),
+    )

@@ -1,0 +1,267 @@
+"""The tasks of a benchmark: precompute one shape, or match and evaluate one pair."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.evaluation.ground_truth import GroundTruth
+from jaxsmw.evaluation.journal import Row
+from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
+from jaxsmw.evaluation.preparation import prepare_pair
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.initial_maps import INITIAL_MAPS
+from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.provenance import machine
+from jaxsmw.runtime.threads import one_blas_thread
+
+CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
+"""The thresholds of stored correspondence quality curves, in square roots of the target's area."""
+
+FIGURES = (
+    "mean",
+    "median",
+    *(f"within_{threshold}" for threshold in THRESHOLDS),
+    "area_under_curve",
+    "unreachable",
+    "coverage",
+)
+"""The figures of each map besides its curve; lengths in square roots of the target's area."""
+
+
+def read_curve(text: str) -> list[float]:
+    """Reads a stored curve: the share of points with an error of at most each threshold of `CURVE`.
+
+    **Raises:** `ValueError` if the text is not a curve.
+    """
+    shares = [float(share) for share in text.split()]
+    if len(shares) != len(CURVE):
+        raise ValueError(f"{len(shares)} shares instead of {len(CURVE)}")
+    return shares
+
+
+RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
+    "source": str,
+    "target": str,
+    "method": str,
+    "machine": str,
+    "result": str,
+    "seconds": float,
+    "truth": str,
+    **dict.fromkeys(FIGURES, float),
+    "curve": read_curve,
+}
+"""The columns of `results.csv`, one row per pair and method, each with the function that reads its text.
+
+`seconds` is the time from the initial map to the result, without compilation, and `truth` the ground truth
+that was used, `direct` or `mirrored`.
+"""
+
+SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
+    "shape": str,
+    "digest": str,
+    "vertices": int,
+    "seconds_spectrum": float,
+    "seconds_descriptors": float,
+}
+"""The columns of `shapes.csv`, one row per shape; `digest` is a hash of the mesh file."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings that results depend on, besides data and code.
+
+    **Attributes:**
+
+    - `init`: the initial map of all methods: a descriptor (see `jaxsmw.match`), or a directory with maps
+      `X_Y.map`.
+    - `mirrored`: whether to use the mirrored ground truth where a map is closer to the mirrored ground truth;
+      for methods and initial maps that cannot distinguish left from right.
+    - `evaluated_points`: the number of evaluated rows of each ground truth, the same rows for all methods;
+      all rows if None.
+    - `seed`: the seed of the draw of these rows.
+
+    **Raises:** `InputError` if `init` is neither a descriptor nor a directory.
+    """
+
+    init: str = "shot"
+    mirrored: bool = False
+    evaluated_points: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+        if not self.is_descriptor and not os.path.isdir(self.init):
+            raise InputError(
+                f"{self.init!r} is not an initial map: choose from {', '.join(INITIAL_MAPS)}, or give a "
+                "directory with maps X_Y.map."
+            )
+
+    @property
+    def is_descriptor(self) -> bool:
+        """Whether the initial maps are computed from a descriptor."""
+        return self.init in INITIAL_MAPS
+
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Checks that every pair has an initial map.
+
+        **Raises:** `InputError` if a file with an initial map is missing.
+        """
+        if not self.is_descriptor:
+            PublishedMaps(Path(self.init)).check(pairs)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A pair, and the methods that still have to be measured on that pair, by name."""
+
+    pair: DataPair
+    methods: dict[str, Method]
+
+
+def file_digest(file: Path) -> str:
+    """Returns a short hash of the contents of a file.
+
+    **Raises:** `InputError` if the file cannot be read.
+    """
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise InputError(
+            f"{file}: cannot be read ({error.strerror}): check the path and its permissions."
+        ) from error
+
+
+def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
+    """Precomputes and caches the spectrum and the descriptors of a shape, and measures the time.
+
+    **Returns:** One row with `SHAPE_COLUMNS`.
+    """
+    name, file = shape
+    with recomputing():
+        seconds, mesh = {}, read_mesh(file)
+        for what, compute in (
+            ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors)),
+            ("descriptors", lambda: shot_descriptors(mesh)),
+        ):
+            began = time.perf_counter()
+            compute()
+            seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}"
+    return [{"shape": name, "digest": file_digest(file), "vertices": len(mesh.vertices), **seconds}]
+
+
+def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
+    """Matches a pair with every method, and evaluates the maps.
+
+    **Returns:** One row with `RESULT_COLUMNS` for each method.
+    """
+    data = task.pair
+    mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
+    truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
+    if settings.mirrored:
+        truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+    methods = task.methods.values()
+    pair = prepare_pair(
+        data,
+        mesh_x,
+        mesh_y,
+        settings.init,
+        number_of_eigenvectors,
+        number_of_descriptors=max(method.number_of_descriptors for method in methods),
+        both_directions=any(method.both_directions for method in methods),
+    )
+    rows = []
+    for name, method in task.methods.items():
+        pointwise_map, result, seconds = _timed(name, method, pair)
+        ending = "successful" if result == RESULTS.successful else sentence(result)
+        figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+        identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
+        rows.append(identity | {"result": ending, "seconds": f"{seconds:.5f}"} | figures)
+    return rows
+
+
+def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
+    """Runs a method; returns map, result and seconds without compilation (NaN for published maps)."""
+    for _ in range(2):
+        with _CompilationClock() as compilation, one_blas_thread():
+            began = time.perf_counter()
+            pointwise_map, result = jax.block_until_ready(method(pair))
+            seconds = time.perf_counter() - began - compilation.seconds
+        warm = name in _warm and not compilation.seconds
+        _warm.add(name)
+        # A first run also imports modules, for example. That is negligible in a long run.
+        if warm or seconds > _LONG:
+            break
+    return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
+
+
+# A run of more than so many seconds is not repeated.
+_LONG = 60
+# The names of the methods that have run in this process.
+_warm: set[str] = set()
+
+
+class _CompilationClock:
+    """Adds up the seconds that XLA spends compiling in this process during its `with` block."""
+
+    def __enter__(self) -> _CompilationClock:
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        jax.monitoring.unregister_event_duration_listener(self._listen)
+
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            self.seconds += duration_secs
+
+
+def _evaluate(
+    mesh_y: Mesh,
+    pointwise_map: Int[np.ndarray, " m"],
+    truths: Mapping[str, GroundTruth],
+    settings: Settings,
+) -> Row:
+    """Returns the figures of a map by the ground truth closest to the map; all NaN if the map failed."""
+    if (pointwise_map < 0).any():
+        return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+    errors = {
+        name: geodesic_error(
+            mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed
+        )
+        for name, truth in truths.items()
+    }
+    nearest = min(errors, key=lambda name: errors[name].mean)
+    error = errors[nearest]
+    figures = (
+        error.mean,
+        error.median,
+        *error.within.values(),
+        error.area_under_curve(),
+        error.unreachable,
+        coverage(mesh_y, pointwise_map),
+    )
+    curve = error.correspondence_quality_curve(CURVE)
+    return {
+        "truth": nearest,
+        **{name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)},
+        "curve": " ".join(f"{share:.5f}" for share in curve),
+    }

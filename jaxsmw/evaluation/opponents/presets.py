@@ -1,0 +1,74 @@
+"""This library's own methods: MWP at one number of eigenvectors, and the presets of `jaxsmw.PRESETS`.
+
+MWP is written from Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
+manifold wavelets preservation*, CVPR 2021, Algorithm 1. `MWP` has the settings of the paper: 100
+eigenvectors, a Meyer frame of 6 filters, 3 iterations. `MWP_SAMPLED` iterates on 500 samples of each shape,
+like the fast variant of the authors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Array, Int
+
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.results import RESULTS
+from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.preparation import fewest_vertices
+from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.stage import Stage
+
+
+@dataclass(frozen=True)
+class Refined(Method):
+    """Refines the initial map with `jaxsmw.refine`, at one number of eigenvectors."""
+
+    reference: str
+    refiner: Refiner = field(default_factory=WaveletPreservation)
+    number_of_eigenvectors: int = 100
+    iterations: int = 3
+    number_of_samples: int | None = None
+
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """See `Method`."""
+        stage = Stage(
+            self.refiner,
+            number_of_eigenvectors=self.number_of_eigenvectors,
+            iterations=self.iterations,
+            number_of_samples=self.number_of_samples,
+        )
+        found = stage.run(*pair.seen_in(stage), pair.initial_map, pair.samples, partial=pair.partial)
+        return found.pointwise_map, found.result
+
+
+@dataclass(frozen=True)
+class Chosen(Method):
+    """Refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does."""
+
+    reference: str
+    preset: PresetName
+
+    @property
+    def number_of_eigenvectors(self) -> int:  # type: ignore[override]
+        """The largest number of eigenvectors of any stage."""
+        return PRESETS[self.preset].number_of_eigenvectors
+
+    @property
+    def number_of_descriptors(self) -> int:  # type: ignore[override]
+        """The largest number of descriptors of any stage."""
+        return PRESETS[self.preset].number_of_descriptors
+
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """See `Method`."""
+        assert pair.prepared is not None
+        preset = PRESETS[self.preset].fitted(fewest_vertices(pair.prepared.pair))
+        outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
+        return outcome.pointwise_map, outcome.refinements[-1].result
+
+
+MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")
+MWP_SAMPLED = Refined("Hu, Li, Liu, Liu 2021: as mwp, but on 500 samples", number_of_samples=500)
+ACCURATE = Chosen("this library's preset accurate, which continues from the result of mwp", "accurate")

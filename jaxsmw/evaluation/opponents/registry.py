@@ -1,0 +1,75 @@
+"""The methods by the names that the command line and the results use."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.evaluation.opponents.base import Method
+from jaxsmw.evaluation.opponents.bcicp import BCICP
+from jaxsmw.evaluation.opponents.cpd import CPD
+from jaxsmw.evaluation.opponents.initial_map import UNREFINED
+from jaxsmw.evaluation.opponents.partial_functional_maps import PARTIAL_FUNCTIONAL_MAPS
+from jaxsmw.evaluation.opponents.peers import installed_peers
+from jaxsmw.evaluation.opponents.presets import ACCURATE, MWP, MWP_SAMPLED
+from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
+from jaxsmw.evaluation.opponents.spectral_icp import NO_FILTER, SPECTRAL_ICP
+from jaxsmw.evaluation.opponents.zoomout import ZOOMOUT, ZOOMOUT_SAMPLED
+
+METHODS: dict[str, Method] = {
+    "start": UNREFINED,
+    "mwp": MWP,
+    "accurate": ACCURATE,
+    "mwp-sampled": MWP_SAMPLED,
+    "no-filter": NO_FILTER,
+    "icp": SPECTRAL_ICP,
+    "cpd": CPD,
+    "bcicp": BCICP,
+    "pfm": PARTIAL_FUNCTIONAL_MAPS,
+    "zoomout": ZOOMOUT,
+    "zoomout-sampled": ZOOMOUT_SAMPLED,
+}
+"""The methods that need no other library, by name, in the order of the tables."""
+
+MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
+
+
+def known_methods() -> dict[str, Method]:
+    """Returns `METHODS` and the methods of other libraries that are installed, by name."""
+    return METHODS | installed_peers()
+
+
+def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
+    """Returns the known methods that are defined on all of the pairs, by name."""
+    return {name: method for name, method in known_methods().items() if method.suits(pairs)}
+
+
+def find_methods(names: Iterable[str]) -> dict[str, Method]:
+    """Looks up methods by name; a name may also be a directory with maps that were computed elsewhere.
+
+    **Returns:** The methods, each under its own name or under the name of its directory.
+
+    **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would get
+    the same name.
+    """
+    known, found = known_methods(), {}
+    for name in dict.fromkeys(names):
+        if name in known:
+            found[name] = known[name]
+            continue
+        # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+        if not os.path.isdir(name):
+            raise InputError(
+                f"{name!r} is not a method: choose from {', '.join(known)}, or give a directory with maps "
+                "X_Y.map."
+            )
+        directory = Path(name).resolve()
+        if directory.name in {**known, **found}:
+            raise InputError(
+                f"{directory}: another method is called {directory.name} already: rename the directory."
+            )
+        found[directory.name] = PublishedMaps(directory)
+    return found

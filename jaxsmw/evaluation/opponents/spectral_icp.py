@@ -1,0 +1,25 @@
+"""Spectral ICP, and nearest neighbours without any constraint on the functional map.
+
+M. Ovsjanikov, M. Ben-Chen, J. Solomon, A. Butscher, L. Guibas, *Functional maps: a flexible representation of
+maps between shapes*, ACM Transactions on Graphics 31(4), 2012: post-processing by iterative refinement. Each
+iteration replaces the functional map of the pointwise map by the nearest orthogonal matrix, then searches
+nearest neighbours. Both methods run in the loop of `jaxsmw.refine` with 100 eigenvectors, the number that MWP
+uses.
+
+- `SPECTRAL_ICP`: 10 iterations.
+- `NO_FILTER`: MWP without its filters, so the functional map is used as encoded; 3 iterations, as for MWP.
+"""
+
+from __future__ import annotations
+
+from jaxsmw.core.banks import Identity
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.solutions import Filtering, NearestOrthogonal
+from jaxsmw.evaluation.opponents.presets import Refined
+
+NO_FILTER = Refined("MWP without filters: k = 100, 3 iterations", WaveletPreservation(Identity()))
+SPECTRAL_ICP = Refined(
+    "Ovsjanikov et al. 2012, spectral ICP: k = 100, 10 iterations",
+    WaveletPreservation(Identity(), NearestOrthogonal(Filtering())),
+    iterations=10,
+)

@@ -1,0 +1,80 @@
+"""ZoomOut: iterative spectral upsampling.
+
+S. Melzi, J. Ren, E. Rodolà, A. Sharma, P. Wonka, M. Ovsjanikov, *ZoomOut: spectral upsampling for efficient
+shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration encodes the pointwise map as a
+functional map of size k, searches nearest neighbours, and enlarges k.
+
+- `ZOOMOUT`: k = 20, 25, ..., 120, all vertices in every iteration.
+- `ZOOMOUT_SAMPLED`: the same on 1000 samples of each shape (section 4.3 of the paper).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Array, Int
+
+from jaxsmw.core.banks import Identity
+from jaxsmw.core.functional_map import encode
+from jaxsmw.core.pointwise_map import decode
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.solutions import Filtering
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, Method, MethodInput
+from jaxsmw.runtime.compilation import compiled
+
+FIRST_EIGENVECTORS, ZOOMOUT_STEP, LAST_EIGENVECTORS = 20, 5, 120
+"""The first k, the step between two k, and the last k."""
+
+_UNFILTERED = WaveletPreservation(Identity())
+_UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_inverse="least_squares"))
+
+
+@dataclass(frozen=True)
+class ZoomOut(Method):
+    """ZoomOut (Melzi et al. 2019): encodes and decodes the map with more eigenvectors in each iteration.
+
+    With samples (section 4.3) both halves of an iteration use the samples only. The last search is among all
+    vertices.
+    """
+
+    reference: str
+    first: int = FIRST_EIGENVECTORS
+    step: int = ZOOMOUT_STEP
+    number_of_eigenvectors: int = LAST_EIGENVECTORS
+    number_of_samples: int | None = None
+
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """See `Method`."""
+        pointwise_map, refiner = pair.initial_map, _UNFILTERED
+        samples_x, samples_y = pair.sampled(self.number_of_samples)
+        if samples_x is not None:
+            refiner, first = _UNFILTERED_ON_SAMPLES, pair.truncated(self.first)
+            functional_map = compiled(encode)(pair.initial_map, *first)
+            pointwise_map = compiled(decode)(functional_map, *_at(first, samples_x, samples_y))
+        for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
+            spectra = _at(pair.truncated(k), samples_x, samples_y)
+            refined = compiled(refine)(*spectra, pointwise_map, refiner=refiner, iterations=1)
+            pointwise_map = refined.pointwise_map
+        if samples_x is not None:
+            pointwise_map = compiled(decode)(refined.functional_map, *pair.truncated(k))
+        return pointwise_map, refined.result
+
+
+def _at(
+    spectra: tuple[Spectrum, Spectrum],
+    samples_x: Int[Array, " s_x"] | None,
+    samples_y: Int[Array, " s_y"] | None,
+) -> tuple[Spectrum, Spectrum]:
+    """Restricts both spectra to the samples; without samples, returns both as they are."""
+    if samples_x is None or samples_y is None:
+        return spectra
+    return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
+
+
+ZOOMOUT = ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120")
+ZOOMOUT_SAMPLED = ZoomOut(
+    "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
+)

@@ -1,0 +1,76 @@
+"""Prepares a pair for the compared methods, by the pipeline of `jaxsmw.match`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int64
+
+from jaxsmw.core.functional_map import encode
+from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.search import nearest_neighbor
+from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, MethodInput
+from jaxsmw.evaluation.opponents.published_maps import published_file, read_published_map
+from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.initial_maps import INITIAL_MAPS, initial_map
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare
+
+
+def prepare_pair(
+    data: DataPair,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    init: str,
+    number_of_eigenvectors: int,
+    *,
+    number_of_descriptors: int = 0,
+    both_directions: bool = False,
+) -> MethodInput:
+    """Computes everything that the methods share.
+
+    **Arguments:**
+
+    - `data`: the names of the two shapes, and whether X is a partial shape.
+    - `mesh_x`, `mesh_y`: X and Y.
+    - `init`: a descriptor (see `jaxsmw.match`), or a directory with initial maps `X_Y.map`.
+    - `number_of_eigenvectors`: k of both spectra.
+    - `number_of_descriptors`: the number of principal components of SHOT; without descriptors if 0.
+    - `both_directions`: whether to compute the initial map Y -> X, too.
+    """
+    pair = Pair(mesh_x, mesh_y, data.partial)
+    prepared = prepare(
+        pair,
+        number_of_eigenvectors=number_of_eigenvectors,
+        number_of_descriptors=number_of_descriptors,
+        number_of_samples=min(MOST_SAMPLES, fewest_vertices(pair)),
+        init=_init(init, data.names, pair),
+    )
+    reverse = _reverse_initial_map(data, prepared, init) if both_directions else None
+    return MethodInput.of(prepared, data.names, reverse)
+
+
+def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:
+    """Returns the name of a descriptor as it is, and the map of a directory."""
+    return init if init in INITIAL_MAPS else read_published_map(Path(init), names, pair.meshes)
+
+
+def _reverse_initial_map(data: DataPair, prepared: PreparedPair, init: str) -> Int64[np.ndarray, " n"]:
+    """Returns the initial map Y -> X, of the same kind as the initial map X -> Y.
+
+    If the directory has no map Y -> X, the functional map of the initial map X -> Y gives the map Y -> X.
+    """
+    names, reversed_ = (data.target, data.source), prepared.pair.reversed()
+    if init in INITIAL_MAPS or published_file(Path(init), names).is_file():
+        first = _init(init, names, reversed_)
+        return initial_map(reversed_, prepared.spectrum_y, prepared.spectrum_x, init=first)
+    spectra = prepared.spectrum_x, prepared.spectrum_y
+    spectrum_x, spectrum_y = (spectrum.truncate(FIRST_EIGENVECTORS) for spectrum in spectra)
+    functional_map = encode(jnp.asarray(prepared.initial_map), spectrum_x, spectrum_y)
+    embeddings = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
+    reverse = nearest_neighbor(*embeddings[::-1], database_mask=spectrum_x.mask)
+    return np.asarray(reverse).astype(np.int64)

@@ -1,0 +1,40 @@
+"""The initial map `functional`: the functional map that preserves SHOT and commutes with the Laplacian."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsmw.core.pointwise_map import spectral_embeddings
+from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
+from jaxsmw.descriptors import SampledPair, paired_shot
+
+# The weight of commutativity with the Laplacian beside preservation of SHOT. On eight real pairs the mean
+# error of the initial map was 0.055 for 10, 0.052 for 100, 0.076 for 1, and 0.313 without commutativity.
+_COMMUTATIVITY = 10.0
+
+
+def functional_features(
+    sampled: SampledPair,
+) -> tuple[Float[np.ndarray, "m k_x"], Float[np.ndarray, "n k_x"]]:
+    """The spectral embeddings of the functional map (section 3.2 of the MWP paper).
+
+    **Raises:** `ArithmeticError` if the functional map cannot be computed.
+    """
+    spectrum_x, spectrum_y = sampled.x.spectrum, sampled.y.spectrum
+    dtype = spectrum_x.eigenvectors.dtype
+    shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in paired_shot(sampled))
+    solution = RegularizedLeastSquares(
+        wavelet_preservation=None,
+        orthogonality=None,
+        descriptor_preservation=jnp.asarray(1.0, dtype),
+        laplacian_commutativity=jnp.asarray(_COMMUTATIVITY, dtype),
+        descriptors=DescriptorPair.project(shot_x, shot_y, spectrum_x, spectrum_y),
+    )
+    functional_map, result = solution.minimize(None, spectrum_x.eigenvalues, spectrum_y.eigenvalues)
+    if result != RESULTS.successful:
+        raise ArithmeticError(f"{sampled.pair.name}: {sentence(result)}")
+    embedded_x, embedded_y = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
+    return np.asarray(embedded_x), np.asarray(embedded_y)

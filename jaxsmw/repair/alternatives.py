@@ -1,0 +1,171 @@
+"""Alternative initial maps, for pairs on which SHOT alone exchanges limbs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import islice
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int, Int64
+
+from jaxsmw.core.functional_map import encode, multiscale_kernel
+from jaxsmw.core.pointwise_map import chosen_patches, decode
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
+from jaxsmw.geometry.mesh import extend_to_unused
+from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
+from jaxsmw.geometry.shot import SHOT_RADIUS
+from jaxsmw.initial_maps.landmarks import distance_features
+from jaxsmw.initial_maps.nearest import nearest_among_compared, nearest_map, to_all_vertices
+from jaxsmw.pair import Pair
+from jaxsmw.repair.extremities import extremities, plausible_pairings
+from jaxsmw.repair.outcome import Outcome, score
+from jaxsmw.repair.scores import distinct, distortion, same_map
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.runtime.batches import pad_rows, padded_size
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.threads import side_by_side
+from jaxsmw.stage import Stage
+
+_Shot = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
+
+
+def alternative_initial_maps(
+    pair: Pair,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    settings: RepairSettings = RepairSettings(),  # noqa: B008 (immutable)
+) -> Iterator[Int64[np.ndarray, " m"]]:
+    """Initial maps (m,), computed one by one: where one exchanges limbs, another often does not.
+
+    The first maps come from functional maps. Nearest neighbours of SHOT from X to Y and from Y to X each give
+    a functional map. Their weighted mean is filtered as in the paper and converted to a pointwise map.
+    `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+
+    Two full shapes with descriptors (`describe`) have further maps, from pairings of their extremities.
+    Distances between extremities choose the pairings. Each pairing gives a map by nearest neighbours in SHOT
+    and in distances to the extremities, which a coarse regression refines. The maps with the best scores that
+    differ from each other are returned.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: see `paired_spectra`.
+    - `settings`: the numbers.
+    """
+    sampled = sample_pair(pair, spectrum_x, spectrum_y)
+    shot: dict[float, _Shot] = {}
+    for multiples, weight in settings.alternatives:
+        radii = [multiple * SHOT_RADIUS for multiple in multiples]
+        for radius in radii:
+            if radius not in shot:
+                shot[radius] = paired_shot(sampled, radius)
+        features_x, features_y = (
+            np.hstack(of_shape) for of_shape in zip(*(shot[radius] for radius in radii), strict=True)
+        )
+        k = settings.alternative_eigenvectors
+        truncated = spectrum_x.truncate(k), spectrum_y.truncate(k)
+        yield extend_to_unused(
+            pair.mesh_x, _in_both_directions(sampled, features_x, features_y, weight, *truncated)
+        )
+    if not pair.partial and spectrum_x.descriptors is not None:
+        yield from _by_extremities(sampled, shot[SHOT_RADIUS], spectrum_x, settings)
+
+
+def _in_both_directions(
+    sampled: SampledPair,
+    features_x: Float[np.ndarray, "a d"],
+    features_y: Float[np.ndarray, "b d"],
+    weight: float,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+) -> Int64[np.ndarray, " m"]:
+    """The map of the mean of the functional maps of the nearest neighbours in both directions."""
+    reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
+    forward = nearest_map(sampled, features_x, features_y)
+    backward = nearest_map(reversed_, features_y, features_x)
+    on_device = jax.device_put((forward, backward, spectrum_x.eigenvalues.dtype.type(weight)))
+    found = compiled(_decode_mean)(on_device, spectrum_x, spectrum_y)
+    return np.asarray(found).astype(np.int64)
+
+
+def _decode_mean(
+    maps_and_weight: tuple[Int[Array, " m"], Int[Array, " n"], Float[Array, ""]],
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+) -> Int[Array, " m"]:
+    forward, backward, reverse_weight = maps_and_weight
+    responses = WaveletPreservation().problem(spectrum_x, spectrum_y).responses
+    of_forward = encode(forward, spectrum_x, spectrum_y)
+    of_backward = encode(backward, spectrum_y, spectrum_x).T
+    mean = (1 - reverse_weight) * of_forward + reverse_weight * of_backward
+    patches = chosen_patches("auto", spectrum_x, spectrum_y)
+    return decode(mean * multiscale_kernel(*responses), spectrum_x, spectrum_y, patches=patches)
+
+
+def _by_extremities(
+    sampled: SampledPair, shot: _Shot, spectrum_x: Spectrum, settings: RepairSettings
+) -> Iterator[Int64[np.ndarray, " m"]]:
+    """Maps by pairings of extremities; `spectrum_x`, of all of X, serves for the scores."""
+    pair = sampled.pair
+    refinement = _CoarseRefinement(sampled, settings)
+    ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
+    distances = [
+        distance_features(side, of_side.vertices, unit)
+        for side, of_side, unit in zip(sampled.sides, ends, pair.units_of_length, strict=True)
+    ]
+    outcomes = []
+    for pairing in plausible_pairings(*ends, settings.extremity_pairings):
+        features_x, features_y = (
+            np.hstack([described, to_ends[:, chosen]])
+            for described, to_ends, chosen in zip(shot, distances, pairing.T, strict=True)
+        )
+        outcome = refinement(features_x, features_y)
+        if outcome.successful:
+            found = np.asarray(outcome.pointwise_map)[: len(sampled.x.spectrum.mask)].astype(np.int64)
+            everywhere = to_all_vertices(sampled, found)
+            measured = distortion(pair, everywhere, spectrum_x, settings.scores)
+            outcome = outcome._replace(distortion=measured)
+            outcomes.append((score(outcome, settings.uncertainty_weight), everywhere))
+    outcomes.sort(key=lambda outcome: outcome[0])
+    same = partial(same_map, pair, settings=settings.scores)
+    for everywhere in islice(distinct((found for _, found in outcomes), same), settings.extremity_maps):
+        yield extend_to_unused(pair.mesh_x, everywhere)
+
+
+class _CoarseRefinement:
+    """Nearest neighbours of features, refined by a coarse regression: enough to find the place of limbs.
+
+    The regression starts with few eigenvectors, so the nearest neighbours of evenly spread vertices suffice.
+    """
+
+    def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
+        fewest = min(int(mesh.used_vertices.sum()) for mesh in sampled.pair.meshes)
+        self.stage = Stage(
+            FeatureRegression(levels=settings.extremity_levels),
+            number_of_descriptors=settings.extremity_descriptors,
+            number_of_samples=settings.extremity_samples,
+        ).fitted(fewest)
+        count = self.stage.number_of_samples or fewest
+        queries = spread_samples(sampled.x.mesh, count)
+        self.sampled = sampled
+        self.rows = sampled.x.rows(queries.vertices)
+        samples = sampled.x.samples
+        self.nearest_query = queries.nearest if samples is None else queries.nearest[samples.vertices]
+        self.spectrum_x, self.spectrum_y = (
+            spectrum.pad(padded_size(len(spectrum.mask)))
+            for spectrum in self.stage.view(sampled.x.spectrum, sampled.y.spectrum)
+        )
+        self.samples = tuple(
+            jax.device_put(side.rows(farthest_point_samples(side.mesh, count))) for side in sampled.sides
+        )
+
+    def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
+        """The outcome of the regression, not yet judged; unsuccessful if numbers went wrong."""
+        nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
+        padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
+        first = jax.device_put(padded.astype(np.int32))
+        return Outcome([self.stage.run(self.spectrum_x, self.spectrum_y, first, self.samples)], first)

@@ -1,0 +1,206 @@
+"""Refinement in stages, with the repair of maps that look wrong."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import jax
+import numpy as np
+from jaxtyping import Array, Int, Int64
+
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.preparation import PreparedPair
+from jaxsmw.repair.alternatives import alternative_initial_maps
+from jaxsmw.repair.outcome import Judge, Outcome
+from jaxsmw.repair.scores import distinct
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.stage import Stage
+
+logger = logging.getLogger("jaxsmw")
+
+
+def refine_in_stages(
+    prepared: PreparedPair,
+    stages: Sequence[Stage],
+    repair: RepairSettings | None = None,
+    *,
+    alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
+    history: bool = False,
+) -> Outcome:
+    """Refines the initial map of a pair by one stage after the other, and repairs a map that looks wrong.
+
+    Symmetric limbs that the initial map exchanges stay exchanged: each limb fits the place of the other,
+    except for its left and right and for its connection to the body. With `repair`, the outcome is checked
+    for both (`jaxsmw.repair.scores`), and returned if it looks right. Otherwise repair proceeds as follows.
+
+    1. Rounds: the repaired stage and all later stages run again. They start from a functional map without
+       the faults of the round before: without reversed orientation and without discontinuous parts, in turn.
+    2. Fallback: the repaired stage runs from the best outcome with `fallback_levels`. The fallback is taken
+       if it looks right, or else if it has the better score.
+    3. Alternatives: if the outcome still looks wrong, alternative initial maps go up to the repaired stage
+       and through rough rounds of it. The best of these run through all stages and are repaired. The outcome
+       with the best score that looks right is returned. If no outcome looks right, the map to which at
+       least `agreeing` initial maps lead is returned, or else the outcome with the best score.
+
+    **Arguments:**
+
+    - `prepared`: the pair with its initial map.
+    - `stages`: the stages, in order.
+    - `repair`: the settings of the repair; None for no repair.
+    - `alternatives`: alternative initial maps, computed one by one and only if needed. By default
+      `jaxsmw.repair.alternatives`, if the initial map is `"shot"`.
+    - `history`: see `jaxsmw.refine`.
+
+    **Returns:** An `Outcome`. The refinement stops at the first stage that fails.
+    """
+    views = [prepared.view(stage) for stage in stages]
+    runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
+    first = prepared.padded_map(prepared.initial_map)
+    if repair is None:
+        return runner.run(0, Outcome([], first))
+    finest = max((of_x for of_x, _ in views), key=lambda of_x: of_x.eigenvalues.shape[0])
+    repairer = _Repairer(runner, Judge(prepared.pair, finest, repair), repair)
+    best = repairer.finished(repairer.begun(first))
+    if best.successful and best.suspicious:
+        best = repairer.repaired(best)
+    if not (best.successful and best.suspicious):
+        return best
+    logger.info(
+        "limbs may be swapped (distortion %.3f; right maps have up to %.2f)",
+        best.distortion,
+        repair.suspicious,
+    )
+    if alternatives is None:
+        alternatives = _usual_alternatives(prepared, repair)
+    return repairer.best_of_alternatives(best, map(prepared.padded_map, alternatives))
+
+
+def _usual_alternatives(
+    prepared: PreparedPair, settings: RepairSettings
+) -> Iterable[Int64[np.ndarray, " m"]]:
+    if not isinstance(prepared.init, str) or prepared.init != "shot":
+        return ()
+    return alternative_initial_maps(prepared.pair, prepared.spectrum_x, prepared.spectrum_y, settings)
+
+
+_View = tuple[Spectrum, Spectrum]
+
+
+@dataclass(frozen=True)
+class _Runner:
+    """Runs stages on one pair."""
+
+    prepared: PreparedPair
+    steps: list[tuple[_View, Stage]]
+    history: bool
+
+    def run(self, first: int, before: Outcome, last: int | None = None) -> Outcome:
+        """The outcome of the stages from position `first` up to, but without, `last`."""
+        for view, stage in self.steps[first:last]:
+            if not before.successful:
+                break
+            before = self.run_one(view, stage, before)
+        return before
+
+    def run_one(self, view: _View, stage: Stage, before: Outcome) -> Outcome:
+        """The outcome of one more stage."""
+        found = stage.run(
+            *view,
+            before.pointwise_map,
+            self.prepared.samples,
+            partial=self.prepared.pair.partial,
+            history=self.history,
+        )
+        return before._replace(refinements=[*before.refinements, found])
+
+
+@dataclass(frozen=True)
+class _Repairer:
+    """Repairs outcomes by repeating the stage at position `settings.stage` and all later stages."""
+
+    runner: _Runner
+    judge: Judge
+    settings: RepairSettings
+
+    def begun(self, first: Int[Array, " m"]) -> Outcome:
+        """The outcome up to the repaired stage, not yet judged."""
+        return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
+
+    def finished(self, outcome: Outcome) -> Outcome:
+        """The judged outcome of all later stages."""
+        return self.judge.judged(self.runner.run(self.settings.stage + 1, outcome))
+
+    def repaired(self, outcome: Outcome) -> Outcome:
+        """A finished outcome after rounds of repair and the fallback."""
+        outcome = self._without_faults(outcome, self.settings.rounds, finish=True)
+        (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
+        fallback = stage.with_levels(
+            tuple(min(level, stage.number_of_eigenvectors) for level in self.settings.fallback_levels)
+        )
+        last = self.finished(self._repeated(outcome, spectrum_x, fallback))
+        # The fallback knows least of the faults that misled earlier rounds. It is preferred if it looks right
+        # and its score is hardly worse: upside-down maps have a much worse score.
+        score = self.judge.score
+        preferred = (
+            self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
+        )
+        best = last if preferred else min(outcome, last, key=score)
+        return best._replace(suspicious=not self.judge.looks_right(best))
+
+    def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
+        """The best outcome among a suspicious one and those of alternative initial maps."""
+        rough = self._rough_outcomes(alternatives)
+        # All alternatives are tried once the first map is in doubt, because a later one may be better.
+        finished, tried = [best], [best, *rough]
+        for outcome in islice(distinct(rough, self.judge.same), self.settings.finalists):
+            finished.append(self.repaired(self.finished(outcome)))
+        best = min(finished, key=lambda outcome: (outcome.suspicious, self.judge.score(outcome)))
+        if best.suspicious:
+            # With topological noise, right maps look discontinuous too. Most wrong maps are wrong in their
+            # own way, so agreement speaks for a map.
+            group = self.judge.largest_group(tried)
+            if len(group) >= self.settings.agreeing:
+                known = [outcome for outcome in finished if self.judge.same(outcome, group[0])]
+                best = min(known, key=self.judge.score) if known else self.repaired(self.finished(group[0]))
+        if rough:
+            left = "; limbs may still be swapped" if best.suspicious else ""
+            logger.info(
+                "the best of %d initial maps has distortion %.2f%s", len(tried), best.distortion, left
+            )
+        return best
+
+    def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
+        """The outcomes of alternative initial maps up to the repaired stage, best score first."""
+        rough: list[Outcome] = []
+        for number, first in enumerate(alternatives, 2):
+            logger.info("initial map %d ...", number)
+            rough.append(
+                self._without_faults(self.judge.judged(self.begun(first)), self.settings.rough_rounds)
+            )
+        return sorted((outcome for outcome in rough if outcome.successful), key=self.judge.score)
+
+    def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
+        """The best outcome of some rounds, each started without the faults of the round before."""
+        (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
+        areas = np.asarray(spectrum_x.vertex_areas)
+        best = last = outcome
+        for done in range(rounds):
+            if not (last.successful and best.suspicious and (faults := self.judge.faults(last))):
+                break
+            fault = faults[done % len(faults)]
+            sound = np.where(pad_rows(fault, len(areas)), 0, areas)
+            last = self._repeated(last, replace(spectrum_x, vertex_areas=jax.device_put(sound)), stage)
+            last = self.finished(last) if finish else self.judge.judged(last)
+            best = min(best, last, key=self.judge.score)
+        return best
+
+    def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
+        """The outcome up to the repaired stage, repeated as `stage` from the last map; not yet judged."""
+        (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
+        found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))
+        before = outcome.refinements[: self.settings.stage]
+        return outcome._replace(refinements=[*before, *found.refinements])

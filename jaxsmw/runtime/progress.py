@@ -1,0 +1,19 @@
+"""Progress messages with times."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+logger = logging.getLogger("jaxsmw")
+
+
+@contextmanager
+def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Logs the name of a step, and adds the wall time of the block under this name."""
+    logger.info("%s ...", name)
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start

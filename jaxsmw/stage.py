@@ -1,0 +1,227 @@
+"""One stage of refinement: a refiner and its sizes, run as one compiled program."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
+from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Refiner, Samples
+from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.pair import common_range
+from jaxsmw.runtime.compilation import compile_ahead, compiled
+
+
+@dataclass(frozen=True, init=False)
+class Stage:
+    """A refiner, and the sizes at which `jaxsmw.refine` runs it.
+
+    **Attributes:**
+
+    - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
+    - `number_of_eigenvectors`: k of both shapes. The levels of a refiner determine the number; without levels
+      the default is 100.
+    - `iterations`: at least 1. A refiner with levels does one iteration per level; without levels the default
+      is 3.
+    - `number_of_descriptors`: the number of principal components of SHOT that the refiner gets.
+    - `number_of_samples`: iterate on this number of samples of each shape, and search all vertices in the
+      last step; None iterates on all vertices.
+    - `stop_when_unchanged`: see `jaxsmw.refine`.
+
+    **Raises:** `InputError` for settings that cannot work.
+    """
+
+    refiner: Refiner
+    number_of_eigenvectors: int
+    iterations: int
+    number_of_descriptors: int
+    number_of_samples: int | None
+    stop_when_unchanged: bool
+
+    def __init__(
+        self,
+        refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
+        *,
+        number_of_eigenvectors: int | None = None,
+        iterations: int | None = None,
+        number_of_descriptors: int = 0,
+        number_of_samples: int | None = None,
+        stop_when_unchanged: bool = False,
+    ) -> None:
+        if not isinstance(refiner, Refiner):
+            raise InputError(
+                f"refiner is {refiner!r}; give a Refiner such as WaveletPreservation(bank=Meyer(8))."
+            )
+        largest, count = max(refiner.levels, default=None), len(refiner.levels) or None
+        sizes = {
+            "number_of_eigenvectors": _derived(
+                "number_of_eigenvectors", number_of_eigenvectors, largest, NUMBER_OF_EIGENVECTORS
+            ),
+            "iterations": _derived("iterations", iterations, count, ITERATIONS),
+            "number_of_descriptors": number_of_descriptors,
+        }
+        if number_of_samples is not None:
+            sizes["number_of_samples"] = number_of_samples
+        checked = {name: _whole_number(name, value) for name, value in sizes.items()}
+        others = {"refiner": refiner, "number_of_samples": None, "stop_when_unchanged": stop_when_unchanged}
+        for name, value in (others | checked).items():
+            object.__setattr__(self, name, value)
+        self._check_sizes()
+
+    def _check_sizes(self) -> None:
+        if self.number_of_eigenvectors < 1:
+            raise InputError(f"{self.number_of_eigenvectors} eigenvectors were requested; give at least 1.")
+        if self.iterations < 1:
+            raise InputError(f"{self.iterations} iterations were requested; give at least 1.")
+        if not 0 <= self.number_of_descriptors <= SHOT_DIMENSION:
+            raise InputError(
+                f"{self.number_of_descriptors} descriptors were requested; SHOT has {SHOT_DIMENSION}."
+            )
+        if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
+            raise InputError(
+                f"{self.number_of_samples} samples cannot tell {self.number_of_eigenvectors} eigenvectors "
+                "apart; use more samples (five per eigenvector is usual) or fewer eigenvectors."
+            )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments of `jaxsmw.refine` that are not arrays."""
+        return {
+            "refiner": self.refiner,
+            "iterations": self.iterations,
+            "stop_when_unchanged": self.stop_when_unchanged,
+        }
+
+    def with_levels(self, levels: tuple[int, ...]) -> Stage:
+        """The same stage with other levels, and the sizes that follow from these.
+
+        **Raises:** `InputError` if the refiner has no levels.
+        """
+        if not isinstance(self.refiner, CoarseToFine):
+            raise InputError(
+                f"{type(self.refiner).__name__} has no levels; use FeatureRegression or Registration."
+            )
+        refiner = replace(self.refiner, levels=levels)
+        derived: dict[str, Any] = {"number_of_eigenvectors": None, "iterations": None}
+        return replace(self, refiner=refiner, **derived)
+
+    def without_descriptors(self) -> Stage:
+        """The same stage with eigenvectors alone."""
+        return replace(self, number_of_descriptors=0)
+
+    def fitted(self, number_of_vertices: int) -> Stage:
+        """The stage for a small mesh: at most half as many eigenvectors as vertices, and fewer samples."""
+        most = max(1, number_of_vertices // 2)
+        samples = self.number_of_samples
+        if samples is not None and samples >= number_of_vertices:
+            samples = None
+        if self.number_of_eigenvectors <= most:
+            return replace(self, number_of_samples=samples)
+        if self.refiner.levels:
+            stage = self.with_levels(tuple(min(level, most) for level in self.refiner.levels))
+            return replace(stage, number_of_samples=samples)
+        return replace(self, number_of_eigenvectors=most, number_of_samples=samples)
+
+    def view(
+        self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
+    ) -> tuple[Spectrum, Spectrum]:
+        """Both spectra with the eigenvectors and descriptors of this stage.
+
+        The spectra of a partial pair are cut to their `common_range`.
+        """
+        spectra, seen = (spectrum_x, spectrum_y), []
+        for spectrum in spectra:
+            descriptors = None
+            if self.number_of_descriptors and spectrum.descriptors is not None:
+                descriptors = spectrum.descriptors[:, : self.number_of_descriptors]
+            seen.append(spectrum.truncate(self.number_of_eigenvectors).with_descriptors(descriptors))
+        fewer = [now.eigenvalues.shape != s.eigenvalues.shape for now, s in zip(seen, spectra, strict=True)]
+        return common_range(*seen) if partial and any(fewer) else (seen[0], seen[1])
+
+    def run(
+        self,
+        spectrum_x: Spectrum,
+        spectrum_y: Spectrum,
+        pointwise_map: Int[Array, " m"],
+        samples: Samples | None = None,
+        *,
+        partial: bool = False,
+        history: bool = False,
+    ) -> Refinement:
+        """Refines a pointwise map (m,).
+
+        **Arguments:**
+
+        - `spectrum_x`, `spectrum_y`: the `view` of this stage.
+        - `pointwise_map`: the map from which the stage starts, (m,).
+        - `samples`: vertices of X and Y in farthest-point order, at least `number_of_samples` of each.
+        - `partial`, `history`: see `jaxsmw.refine`.
+        """
+        arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
+        settings = {**options, **self.settings, "partial": partial, "history": history}
+        return compiled(refine)(*arrays, **settings)
+
+    def compile_ahead(self, number_x: int, number_y: int, *, history: bool = False) -> Future[object]:
+        """Compiles in the background the program that `run` needs for two full shapes.
+
+        **Arguments:**
+
+        - `number_x`, `number_y`: the numbers of vertices, padding included.
+        - `history`: see `jaxsmw.refine`.
+        """
+
+        def arguments() -> tuple[tuple, dict[str, Any]]:
+            x, y = (self._outline(number) for number in (number_x, number_y))
+            samples = None
+            if self.number_of_samples is not None:
+                samples = (jnp.zeros(self.number_of_samples, int),) * 2
+            return self._arguments(*self.view(x, y), jnp.zeros(number_x, jnp.int32), samples)
+
+        return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
+
+    def _outline(self, number_of_vertices: int) -> Spectrum:
+        """A spectrum of the right sizes; only its shapes are used."""
+        n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
+        descriptors = jnp.zeros((n, d)) if d else None
+        places = {"positions": jnp.zeros((n, 3)), "normals": jnp.zeros((n, 3))}
+        return Spectrum(
+            jnp.zeros(k), jnp.zeros((n, k)), jnp.zeros(n), jnp.zeros(n, bool), descriptors, **places
+        )
+
+    def _arguments(
+        self,
+        spectrum_x: Spectrum,
+        spectrum_y: Spectrum,
+        pointwise_map: Int[Array, " m"],
+        samples: Samples | None,
+    ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Any]]:
+        """The arrays for `jaxsmw.refine`, by position and by name, for `run` and `compile_ahead` alike."""
+        chosen = None
+        if self.number_of_samples is not None and samples is not None:
+            chosen = samples[0][: self.number_of_samples], samples[1][: self.number_of_samples]
+        return (spectrum_x, spectrum_y, pointwise_map), {"samples": chosen}
+
+
+def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
+    """A size that the refiner's levels determine, or else the given size, or else the default."""
+    if derived is None:
+        return default if given is None else given
+    if given is not None and given != derived:
+        raise InputError(f"{name} is {given!r}, but the refiner's levels mean {derived}: leave {name} out.")
+    return derived
+
+
+def _whole_number(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} is {value!r}; give a whole number.")
+    return int(value)

@@ -1,0 +1,172 @@
+"""Stages one after the other, and the repair of maps that look wrong."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from synthetic import body_with_arms
+
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.matching import match
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import PreparedPair
+from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.repair.outcome import Judge
+from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.scores import distortion
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.report.summary import summarize
+from jaxsmw.runtime import batches
+from jaxsmw.stage import Stage
+
+LEVELS = (20, 20, 40, 40)
+STAGE = Stage(FeatureRegression(LEVELS))
+REPAIR = RepairSettings(stage=0, fallback_levels=LEVELS)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A mesh and its spectrum."""
+    mesh = body_with_arms()
+    return mesh, compute_spectrum(mesh, 40)
+
+
+@pytest.fixture(scope="module")
+def mirrored(body):
+    """The map of the body to its mirror image."""
+    mesh, _ = body
+    return KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])[1]
+
+
+@pytest.fixture(scope="module")
+def swapped(body, mirrored):
+    """The map of the body to itself that exchanges the arms."""
+    mesh, _ = body
+    return np.where(np.abs(mesh.vertices[:, 0]) > 1, mirrored, np.arange(len(mesh.vertices)))
+
+
+@pytest.fixture(scope="module")
+def identity(body):
+    return np.arange(len(body[0].vertices))
+
+
+def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), **options):
+    """The share of the area with a wrong match, and the outcome."""
+    mesh, spectrum = body
+    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, initial_map, initial_map)
+    found = refine_in_stages(prepared, stages, repair, **options)
+    assert found.successful
+    n = len(mesh.vertices)
+    wrong = np.asarray(found.pointwise_map)[:n] != np.arange(n)
+    return mesh.vertex_areas[wrong].sum() / mesh.area, found
+
+
+def test_swapped_limbs_are_repaired(body, swapped):
+    assert outcome(body, swapped, None)[0] > 0.1
+    assert outcome(body, swapped)[0] < 0.02
+
+
+def test_padding_changes_nothing(body, swapped, monkeypatch):
+    _, found = outcome(body, swapped)
+    n = len(swapped)
+    padded_size = batches.padded_size
+    monkeypatch.setattr("jaxsmw.preparation.padded_size", lambda size: padded_size(size) + 20)
+    _, more = outcome(body, swapped)
+    assert more.pointwise_map.shape[0] == found.pointwise_map.shape[0] + 20
+    np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map[:n])
+
+
+def test_an_alternative_initial_map_helps_where_rounds_do_not(body, swapped, mirrored, identity):
+    """With a single round, nothing tells the arms apart: whatever the round keeps is mirrored."""
+    mesh, spectrum = body
+    repair = replace(REPAIR, rounds=1)
+    assert distortion(Pair(mesh, mesh), mirrored, spectrum) > 1.3
+    wrong, found = outcome(body, mirrored, repair, alternatives=[swapped, identity])
+    n = len(mirrored)
+    assert wrong < 0.02 and not np.array_equal(found.initial_map[:n], mirrored) and not found.suspicious
+    wrong, alone = outcome(body, mirrored, repair)
+    assert wrong > 0.5 and alone.suspicious and alone.distortion > 1.3
+
+
+def test_a_map_that_looks_right_precedes_a_map_with_a_better_score(body, mirrored, identity, monkeypatch):
+    monkeypatch.setattr(Judge, "score", lambda self, outcome: -outcome.distortion)
+    wrong, found = outcome(body, mirrored, alternatives=[identity])
+    assert wrong < 0.02 and not found.suspicious
+
+
+def test_the_map_on_which_three_initial_maps_agree_is_taken_if_none_looks_right(body, mirrored, identity):
+    alternatives = [mirrored, identity, mirrored]
+    wrong, found = outcome(body, mirrored, alternatives=alternatives)
+    assert wrong < 0.02 and not found.suspicious  # the identity looks right, so agreement does not count
+    strict = replace(REPAIR, suspicious=0.5, doubtful=0.5)
+    wrong, found = outcome(body, mirrored, strict, alternatives=alternatives)
+    assert wrong > 0.5 and found.suspicious
+    wrong, found = outcome(body, mirrored, strict, alternatives=alternatives[:2])
+    assert wrong < 0.02 and found.suspicious  # two initial maps are not enough
+    wrong, found = outcome(body, mirrored, replace(strict, agreeing=2), alternatives=alternatives[:2])
+    assert wrong > 0.5 and found.suspicious
+
+
+def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):
+    def none():
+        raise AssertionError("an alternative initial map was computed")
+        yield
+
+    wrong, found = outcome(body, identity, alternatives=none())
+    assert wrong < 0.02
+    np.testing.assert_array_equal(found.initial_map[: len(identity)], identity)
+    outcome(body, swapped, None, alternatives=none())
+
+
+def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
+    mesh, _ = body
+    preset = Preset((STAGE,), REPAIR)
+    with pytest.warns(
+        UserWarning, match=r"limbs may be swapped or mirrored.* mirrors 100% of the source and cuts off 0%"
+    ):
+        found = match(mesh, mesh, preset=preset, init=mirrored)
+    assert found.suspicious and found.distortion > 1.3
+    facts = summarize(found, {}, found.expected_error())
+    assert f"{found.distortion:.2f}; above 1.12 limbs may be swapped" in facts.values()
+    right = match(mesh, mesh, preset=preset, init=identity)
+    assert right.distortion < 1.1 and not right.suspicious
+
+
+def test_every_number_of_repair_is_in_the_settings():
+    """No constant of the repair lives anywhere else."""
+    settings = RepairSettings()
+    assert settings == PRESETS["accurate"].repair
+    for field in fields(settings):
+        assert f"`{field.name}`" in RepairSettings.__doc__
+
+
+@pytest.mark.parametrize(
+    ("make", "fault"),
+    [
+        (lambda: Preset(()), "at least one stage"),
+        (lambda: Preset((STAGE,), RepairSettings()), "repair repeats stage 1, but the stages are 0 to 0"),
+        (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
+        (lambda: Stage(FeatureRegression(LEVELS), number_of_eigenvectors=60), "mean 40: leave .* out"),
+        (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "mean 4: leave iterations out"),
+        (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),
+    ],
+)
+def test_presets_that_cannot_work_are_refused(make, fault):
+    with pytest.raises(InputError, match=fault):
+        make()
+
+
+def test_sizes_follow_from_levels():
+    assert (STAGE.number_of_eigenvectors, STAGE.iterations) == (40, 4)
+    assert (Stage().number_of_eigenvectors, Stage().iterations) == (100, 3)
+    other = STAGE.with_levels((5, 50))
+    assert (other.number_of_eigenvectors, other.iterations) == (50, 2)
+    assert replace(STAGE, number_of_samples=300).number_of_samples == 300
+    small = STAGE.fitted(60)
+    assert small.refiner.levels == (20, 20, 30, 30) and small.number_of_eigenvectors == 30
+    with pytest.raises(TypeError, match="positional"):
+        Stage(FeatureRegression(LEVELS), 40)
