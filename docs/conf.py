@@ -47,8 +47,11 @@ nb_execution_timeout = 180
 
 # Every name of this library in docstrings and pages must exist.
 nitpicky = True
-# Type variables, such as StateT, have no entry in the reference.
-nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*"), ("py:class", r"jaxsmw\.[\w.]*[a-z]T")]
+# Type variables have no entry in the reference.
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!jaxsmw\b).*"),
+    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.Side)"),
+]
 default_role = "code"
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"

@@ -163,7 +163,7 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """One right-handed frame per center, with rows x, y, z: x along the largest scatter, z the least."""
+    """One right-handed frame per center: rows x, y, z; x along the largest scatter, z along the least."""
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
         for column in range(row, 3):
