@@ -310,8 +310,8 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "fault"),
     [
-        ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "eigenvectors were asked for"),
-        ({"preset": replace(STAGE, number_of_samples=10**6)}, "samples were asked for"),
+        ({"preset": replace(STAGE, number_of_eigenvectors=10**6)}, "cannot compute 1000000 eigenvectors"),
+        ({"preset": replace(STAGE, number_of_samples=10**6)}, "cannot choose 1000000 samples"),
         ({"preset": ()}, "give one of fast, paper, accurate, or stages"),
         ({"init": "shoot"}, "choose shot"),
         ({"init": [0, 1]}, "has 2 entries"),
