@@ -54,7 +54,7 @@ def assert_sphere(mesh):
     assert len(np.unique(directed, axis=0)) == len(directed) == 2 * len(edges)
     assert np.all(igl.is_vertex_manifold(mesh.faces))
     assert igl.facet_components(mesh.faces)[0] == 1
-    assert mesh.used_vertices.all()
+    assert mesh.referenced_vertices.all()
     assert len(mesh.vertices) - len(edges) + len(mesh.faces) == 2
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     assert np.einsum("fx,fx->", a, np.cross(b, c)) > 0

@@ -235,7 +235,7 @@ def test_moving_scaling_and_renumbering(method, scale):
 
 def test_three_and_more_sheets_at_an_edge():
     mesh, page, place = book(pages=4)
-    used = mesh.used_vertices
+    used = mesh.referenced_vertices
     assert len(mesh.nonmanifold_edges) == 6
     distances = geodesic_distances(mesh, np.flatnonzero(used))[:, used]
     page, place = page[used], place[used]

@@ -76,7 +76,7 @@ def as_spectrum(
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
     """The `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type, with positions and normals."""
-    used = mesh.used_vertices
+    used = mesh.referenced_vertices
     # Relative to the centroid, single precision suffices wherever the mesh lies.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     positions = np.where(used[:, None], centered / np.sqrt(mesh.area), 0)
@@ -95,7 +95,7 @@ def eigenpairs(
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
     """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors and vertex areas, for total area 1."""
     check_kind("mesh", mesh, Mesh)
-    used = np.flatnonzero(mesh.used_vertices)
+    used = np.flatnonzero(mesh.referenced_vertices)
     if not isinstance(number_of_eigenvectors, int | np.integer):
         raise InputError(
             f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}: give an integer."
@@ -139,7 +139,7 @@ def eigenpairs(
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
     """Resolve `"auto"` for meshes that will be compared: all get the solver of the largest mesh."""
-    most = max(int(mesh.used_vertices.sum()) for mesh in meshes)
+    most = max(int(mesh.referenced_vertices.sum()) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 

@@ -102,14 +102,14 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
     **Returns:** sRGB colours (n, 3) in [0, 1].
     """
-    used = mesh.vertices[mesh.used_vertices]
+    used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
     # Coordinates that differ by rounding errors only get the same rank, or a flat mesh would show the noise.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
         values = np.round(mesh.vertices[:, axis] / grid)
-        sorted_values = np.sort(values[mesh.used_vertices])
+        sorted_values = np.sort(values[mesh.referenced_vertices])
         below = np.searchsorted(sorted_values, values, "left") + np.searchsorted(
             sorted_values, values, "right"
         )

@@ -302,7 +302,7 @@ def draw_functions(
     standing = [stand(mesh, up) for mesh in meshes]
     angle = choose_azimuth(standing) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
-    reach = [np.abs(mesh.vertices[mesh.used_vertices] @ axes.T).max(axis=0) for mesh in standing]
+    reach = [np.abs(mesh.vertices[mesh.referenced_vertices] @ axes.T).max(axis=0) for mesh in standing]
     scale = np.min(np.divide((280, 420), 2 * np.max(reach, axis=0)))
     cell_width = int(np.ceil(2 * scale * max(x for x, _ in reach)))
     heights = [int(np.ceil(2 * scale * y)) for _, y in reach]
@@ -531,7 +531,9 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
     """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
-    reach = [np.abs(panel.mesh.vertices[panel.mesh.used_vertices] @ axes.T).max(axis=0) for panel in panels]
+    reach = [
+        np.abs(panel.mesh.vertices[panel.mesh.referenced_vertices] @ axes.T).max(axis=0) for panel in panels
+    ]
     scale = np.min(np.divide(_BODY_SIZE, 2 * np.max(reach, axis=0)))
     captioned = bool(panels[0].role)
     gap, header, narrowest = (40, 135, _LONGEST_NAME * 12) if captioned else (40, 0, 0)

@@ -165,7 +165,9 @@ def write_page(
 
 def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
     """The data of two standing meshes, and of the camera."""
-    reach = np.max([np.ptp(mesh.vertices[mesh.used_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0)
+    reach = np.max(
+        [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
+    )
     return {
         "x": encode_mesh(shown_x),
         "y": encode_mesh(shown_y),

@@ -70,7 +70,7 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     elif up not in _STAND:
         raise InputError(f"up={up!r} is not an axis; choose one of {', '.join(get_args(Axis))}.")
     vertices = mesh.vertices @ np.array(_STAND[up], dtype=float).T / np.sqrt(mesh.area)
-    used = vertices[mesh.used_vertices]
+    used = vertices[mesh.referenced_vertices]
     faces, _ = igl.bfs_orient(mesh.faces)
     return replace(
         mesh,
@@ -127,13 +127,13 @@ def guess_up(mesh: Mesh) -> Axis:
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
     """A coarse copy of the mesh: the mean of the vertices in each cell of a grid, and edges between them."""
-    used = mesh.vertices[mesh.used_vertices]
+    used = mesh.vertices[mesh.referenced_vertices]
     keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     cells = cells.ravel()
     points = np.stack([np.bincount(cells, coordinate) / counts for coordinate in used.T], axis=1)
     number = np.zeros(len(mesh.vertices), dtype=np.int64)
-    number[mesh.used_vertices] = cells
+    number[mesh.referenced_vertices] = cells
     edges = np.unique(np.sort(number[mesh.edges], axis=1), axis=0)
     return points, edges[edges[:, 0] != edges[:, 1]]
 

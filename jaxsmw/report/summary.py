@@ -262,7 +262,7 @@ def write_comparison(
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
     """The spectra that a page of these meshes shows; None, with a warning, if they cannot be computed."""
-    fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
+    fewest = min(int(mesh.referenced_vertices.sum()) for mesh in (mesh_x, mesh_y))
     number = min(eigenvectors_on_page(mesh_x, mesh_y), fewest // 2)
     if not number:
         return None

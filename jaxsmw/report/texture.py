@@ -51,7 +51,7 @@ def write_textured_pair(
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """Coordinates along the two longest principal axes; those of the surface are from 0 to at most 1."""
-    used = mesh.vertices[mesh.used_vertices]
+    used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
     # The signs of singular vectors are arbitrary; make the largest coordinate of each axis positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
