@@ -274,6 +274,18 @@ def search_in_patches(
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
 
 
+def nearest_vertices(
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    database_mask: Bool[Array, " n"],
+    patches: tuple[Patches, Patches] | None,
+) -> Int32[Array, " m"]:
+    """Returns the database row nearest to each query, by patches of both point sets if there are any."""
+    if patches is None:
+        return nearest_neighbor(queries, database, database_mask=database_mask)
+    return nearest_neighbor_in_patches(queries, database, *patches)
+
+
 class _Boxes(NamedTuple):
     """The location of each patch: within `radius` of a box along orthonormal `axes` through its `center`.
 
