@@ -4,9 +4,15 @@ The public names stand in `__init__.pyi`; they are loaded when first used, so th
 wait for JAX.
 """
 
-from importlib import metadata
-
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__version__ = metadata.version("jaxsmw")
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        # Imported late: this module takes as long to load as all the rest of `jaxsmw --help`.
+        from importlib import metadata
+
+        return metadata.version("jaxsmw")
+    return _load(name)

@@ -1,5 +1,5 @@
 """`python -m jaxsmw`."""
 
-from jaxsmw.cli.main import main
+from jaxsmw.cli import main
 
 main()

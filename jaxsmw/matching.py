@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
@@ -22,9 +23,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
-from jaxsmw.geometry.eigenbasis import Eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused
 from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import Eigensolver, as_spectrum, choose_eigensolver, eigenpairs
-from jaxsmw.geometry.laplacian import Laplacian
+from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
 from jaxsmw.runtime.threads import side_by_side
 

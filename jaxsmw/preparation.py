@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Array, Int, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.eigenbasis import Eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.laplacian import Laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.initial_maps import InitialMap, initial_map

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
+from jaxsmw.choices import PresetName
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.errors import InputError
@@ -68,7 +69,6 @@ class Preset:
         return max(stage.number_of_samples or 0 for stage in self.stages)
 
 
-PresetName = Literal["fast", "paper", "accurate"]
 PRESETS: dict[PresetName, Preset] = {
     "fast": Preset((Stage(number_of_samples=500),)),
     "paper": Preset((Stage(),)),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Refiner, Samples
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
@@ -19,9 +20,6 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 from jaxsmw.pair import common_range
 from jaxsmw.runtime.compilation import compile_ahead, compiled
-
-# The paper's setting.
-_EIGENVECTORS, _ITERATIONS = 100, 3
 
 
 @dataclass(frozen=True, init=False)
@@ -67,9 +65,9 @@ class Stage:
         largest, count = max(refiner.levels, default=None), len(refiner.levels) or None
         sizes = {
             "number_of_eigenvectors": _derived(
-                "number_of_eigenvectors", number_of_eigenvectors, largest, _EIGENVECTORS
+                "number_of_eigenvectors", number_of_eigenvectors, largest, NUMBER_OF_EIGENVECTORS
             ),
-            "iterations": _derived("iterations", iterations, count, _ITERATIONS),
+            "iterations": _derived("iterations", iterations, count, ITERATIONS),
             "number_of_descriptors": number_of_descriptors,
         }
         if number_of_samples is not None:

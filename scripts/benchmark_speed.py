@@ -53,13 +53,13 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from jaxsmw.core.pointwise_map import Search
+from jaxsmw.choices import Eigensolver, Search
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
-from jaxsmw.geometry.eigenbasis import Eigensolver, compute_spectrum, eigenpairs
+from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh

@@ -21,13 +21,11 @@ import argparse
 import warnings
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxsmw.repair.faults import flaw, stretch
 from jaxtyping import Float64
 from scipy.stats import spearmanr
 from tqdm import tqdm
@@ -35,14 +33,15 @@ from tqdm import tqdm
 from jaxsmw import InputError, geodesic_error, match, read_mesh
 from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_data_set
 from jaxsmw.matching import Correspondence
-from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.repair.scores import dirichlet_energy_ratio, distortion
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
 # The stages of the preset after the first, without repair.
-WITHOUT_REPAIR = tuple(replace(stage, mending=None) for stage in PRESETS["accurate"][1:])
+WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 
 class Measured(NamedTuple):
@@ -60,7 +59,7 @@ class Measured(NamedTuple):
 
 
 def measure(
-    pair: DataPair, seed: int, preset: Preset = "accurate", number_of_samples: int | None = 1000
+    pair: DataPair, seed: int, preset: PresetName = "accurate", number_of_samples: int | None = 1000
 ) -> Measured:
     """Matches a pair, and compares the scores of the result with the ground truth."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
@@ -83,12 +82,14 @@ def measure(
 
 def scores_of(found: Correspondence) -> dict[str, float]:
     """Returns the scores of a map by name; lower is better."""
-    meshes, pointwise_map = (found.mesh_x, found.mesh_y), found.pointwise_map
-    regression = match(*meshes, init=pointwise_map, preset=WITHOUT_REPAIR[0]).refinement.state
+    known = found.pair, found.pointwise_map, found.spectrum_x
+    regression = match(*found.pair.meshes, init=found.pointwise_map, preset=WITHOUT_REPAIR[0])
+    uncertainty = regression.refinement.state.uncertainty
+    assert uncertainty is not None
     return {
-        "Dirichlet energy ratio": stretch(*meshes, pointwise_map, found.spectrum_x),
-        "uncertainty of the regression": float(regression.uncertainty),
-        "distortion": flaw(*meshes, pointwise_map, found.spectrum_x),
+        "Dirichlet energy ratio": dirichlet_energy_ratio(*known),
+        "uncertainty of the regression": float(uncertainty),
+        "distortion": distortion(*known),
     }
 
 

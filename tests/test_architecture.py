@@ -10,6 +10,7 @@ LIBRARY = Path(jaxsmw.__file__).parent
 # From the ground floor up: a room imports from itself and from rooms before it.
 ROOMS = (
     "errors",
+    "choices",
     "core",
     "runtime",
     "geometry",

@@ -13,6 +13,7 @@ from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from itertools import permutations
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +25,15 @@ from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError
-from jaxsmw.cli.main import main
+from jaxsmw.choices import MethodName, PeerName
+from jaxsmw.cli.run import run_command
 from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation import measurement
 from jaxsmw.evaluation.benchmark import Results, run_benchmark
 from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
 from jaxsmw.evaluation.measurement import CURVE, FIGURES, Settings
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
 from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
@@ -76,8 +79,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     assert lines[: len(kept)] == kept  # a second measurement would have other times
     assert len(lines) == len(set(lines)) == 1 + 6 * 2
     assert second.stdout.startswith("| method | mean error |")
-    with pytest.raises(SystemExit, match="0"):
-        main(call[3:])
+    assert run_command(call[3:]) == 0
     assert capsys.readouterr().out == second.stdout and results.read_text().splitlines() == lines
 
     table = pyarrow.parquet.read_table(output / "results.parquet").to_pylist()
@@ -89,8 +91,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     for name in ("summary.md", "table.tex", "curves.png", "shapes.csv", "provenance.json"):
         assert (output / name).stat().st_size > 100
 
-    with pytest.raises(SystemExit, match="2"):
-        main([*call[3:], "--seed", "1"])
+    assert run_command([*call[3:], "--seed", "1"]) == 2
     assert "seed in settings was 0 and not 1" in capsys.readouterr().err
 
 
@@ -186,6 +187,8 @@ def test_help_names_every_method():
         [sys.executable, "-m", "jaxsmw", "benchmark", "--help"], capture_output=True, text=True
     )
     assert set(METHODS) <= set(re.findall(r"[\w-]+", re.sub(r"-\s+", "-", outcome.stdout)))
+    assert get_args(MethodName) == tuple(METHODS)
+    assert set(installed_peers()) <= set(get_args(PeerName))
 
 
 TOO_LONG = "x" * 300
@@ -199,8 +202,7 @@ def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
         (["benchmark", str(scape), "--pairs", TOO_LONG], "cannot be read as text"),
     ]
     for call, message in calls:
-        with pytest.raises(SystemExit, match="2"):
-            main(call)
+        assert run_command(call) == 2
         errors = capsys.readouterr().err
         assert message in errors and TOO_LONG in errors and "Traceback" not in errors
 
@@ -393,12 +395,10 @@ def test_removed_and_empty_files_and_unfinished_headers_are_measured_again(
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
     call = ["benchmark", str(scape), "--methods", "start", "--pairs", "1", "--output", str(tmp_path)]
-    with pytest.raises(SystemExit, match="0"):
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 0
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
     capsys.readouterr()
-    with pytest.raises(SystemExit, match="2"):
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 2
     (message,) = [line for line in capsys.readouterr().err.splitlines() if "results.csv" in line]
     assert "is not a table of results" in message and "remove it to measure its rows again" in message
 
@@ -433,10 +433,8 @@ def test_tables_show_the_measured_pairs(scape, tmp_path, monkeypatch, capsys):
     (data / "mesh002.off").write_text("OFF\n1")
     monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
     call = ["benchmark", str(data), "--methods", "start", "--output", str(output)]
-    with pytest.raises(SystemExit) as ended:
-        main([*call, "--evaluation-samples", "50"])
+    assert run_command([*call, "--evaluation-samples", "50"]) == 2
     printed = capsys.readouterr()
-    assert ended.value.code == 2
     assert "| start |" in printed.out and "| start |" in (output / "summary.md").read_text()
     assert "2 of 6 pairs" in (output / "summary.md").read_text()
     assert "5 shapes or pairs could not be measured" in (output / "summary.md").read_text()

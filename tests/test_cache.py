@@ -1,4 +1,4 @@
-"""The disk cache: what counts as the same input, damage, unwritable places, size, many processes."""
+"""The disk cache: equal inputs, damaged entries, unwritable directories, the size limit, many processes."""
 
 import concurrent.futures
 import errno
@@ -23,7 +23,7 @@ RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none":
 
 
 class Computation:
-    """Counts how often it had to be done."""
+    """A computation that counts its runs."""
 
     def __init__(self, result=RESULT):
         self.result, self.runs = result, 0
@@ -62,7 +62,7 @@ def test_equal_inputs_are_equal_however_they_lie_in_memory(directory):
     assert compute.runs == 1
 
 
-def test_everything_about_the_inputs_counts(directory):
+def test_every_property_of_the_inputs_is_part_of_the_key(directory):
     inputs = [
         [INPUT],
         [INPUT + 1e-15],
@@ -110,7 +110,7 @@ def test_by_default_in_the_users_cache_directory(tmp_path, monkeypatch):
     assert len(list((tmp_path / "jaxsmw").glob("test-*.npz"))) == 1
 
 
-def test_no_single_wrong_byte_is_believed(directory):
+def test_every_wrong_byte_is_detected(directory):
     cached("test", [INPUT], Computation())
     (entry,) = directory.iterdir()
     good = entry.read_bytes()
@@ -120,7 +120,7 @@ def test_no_single_wrong_byte_is_believed(directory):
 
 
 class Bomb:
-    """Unpickled, it leaves a trace."""
+    """Unpickling this object creates a file."""
 
     def __init__(self, trace):
         self.trace = trace
@@ -149,7 +149,7 @@ def test_damaged_and_foreign_entries_are_computed_again_and_replaced(directory, 
     assert not trace.exists()
 
 
-def test_a_place_that_cannot_be_written_costs_one_warning(tmp_path, monkeypatch):
+def test_an_unwritable_directory_causes_one_warning(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path / "file"))
     with warnings.catch_warnings(record=True) as caught:
@@ -176,7 +176,7 @@ def test_a_directory_in_place_of_an_entry(directory):
     (entry,) = directory.iterdir()
     entry.unlink()
     entry.mkdir()
-    with pytest.warns(RuntimeWarning, match="cannot be kept"):
+    with pytest.warns(RuntimeWarning, match="cannot be cached"):
         assert_same(cached("test", [INPUT], Computation()))
 
 
@@ -197,7 +197,7 @@ def test_the_least_recently_used_go_first_and_nothing_else_goes(directory, monke
         for file in directory.glob("test-*"):
             if file.stat().st_mtime > now + 1000:
                 os.utime(file, (now + number, now + number))
-    assert entry(0) == 0  # used: now 1 is the oldest
+    assert entry(0) == 0  # entry 0 was used, so now entry 1 is the oldest
     assert entry(3) == 1
     assert not (directory / f".{'0' * 32}.npz").exists() and (directory / "thesis.npz").exists()
     assert [entry(number) for number in (0, 2, 3, 1)] == [0, 0, 0, 1]
@@ -211,7 +211,7 @@ def test_the_limit_must_be_a_number(directory, monkeypatch, limit):
 
 
 def _work(seed):
-    """Read and write a few entries in random order, as others do, in a cache that is always too small."""
+    """Read and write a few entries in random order, in a cache that is always too small."""
     generator = np.random.default_rng(seed)
     for number in generator.integers(0, 4, 60).tolist():
         result = cached("test", [number], lambda number=number: {"values": np.full(3000, float(number))})
@@ -227,8 +227,8 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
     assert all(entry.name.startswith("test-") for entry in directory.iterdir())
 
 
-def test_commands_keep_compiled_programs(tmp_path):
-    """Of a processor's own, found again by the next process, and none where no cache is wanted."""
+def test_commands_cache_compiled_programs(tmp_path):
+    """The next process finds the programs in a directory for its processor; a disabled cache stays empty."""
     mesh = tmp_path / "mesh.off"
     write_mesh(mesh, make_mesh(*sphere_mesh(2)))
     command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), "--eigenvectors", "20"]
@@ -248,7 +248,7 @@ def test_commands_keep_compiled_programs(tmp_path):
     assert len(compiled(str(cache))) > 5
 
 
-def test_settings_of_the_user_stay(monkeypatch, tmp_path):
+def test_the_users_settings_are_respected(monkeypatch, tmp_path):
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
     before = dict(os.environ)

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from jaxsmw import creature_pair, match
+from jaxsmw.presets import choose_preset
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -31,7 +32,7 @@ def test_tables_summarise_the_measurements():
 
 
 def test_stages_after_the_first_do_not_repair():
-    assert all(stage.mending is None for stage in WITHOUT_REPAIR)
+    assert choose_preset(WITHOUT_REPAIR).repair is None
 
 
 def test_a_mirrored_map_has_a_worse_distortion():

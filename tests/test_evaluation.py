@@ -12,13 +12,11 @@ from jaxsmw import InputError, make_mesh, read_mesh
 from jaxsmw.evaluation.ground_truth import (
     GroundTruth,
     read_ground_truth,
-    read_landmarks,
-    read_pointwise_map,
     write_ground_truth,
-    write_pointwise_map,
 )
 from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.io.map_files import read_landmarks, read_pointwise_map, write_pointwise_map
 
 # 4 and 9 vertices; 2 and 8 faces.
 X = make_mesh(*grid_mesh(2, 2), name="mesh_x")
@@ -150,7 +148,12 @@ class TestReading:
         path = write("landmarks.txt", "0 8\n3 0\n")
         assert read_landmarks(path, X, Y).tolist() == [[0, 8], [3, 0]]
         assert read_landmarks(write("l.txt", "4 1"), X, Y, index_base=1).tolist() == [[3, 0]]
-        for content, message in (("0\n", "has 1 number where 2"), ("4 0\n", "4 is not one .* of mesh_x")):
+        for content, message in (
+            ("0\n", "has 1 number where 2"),
+            ("4 0\n", "4 is not one .* of mesh_x"),
+            ("0 8\n3,0\n", "line 2: '3,0' is not a number: separate numbers by spaces, not by ','"),
+            ("1_0 8\n", "line 1: '1_0' is not a number: correct the line"),
+        ):
             with pytest.raises(InputError, match=message):
                 read_landmarks(write("l.txt", content), X, Y)
 
@@ -210,7 +213,8 @@ class TestBadFiles:
             ("1\n2\n0x3\n4\n", "line 3: '0x3' is not a number"),
             ("1\n2\n1_0\n4\n", "line 3: '1_0' is not a number"),
             ("1\n2\n٣\n4\n", "line 3: '.u0663' is not a number"),
-            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number"),
+            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number: separate numbers by spaces, not by ','"),
+            ("1;2\n2\n3\n4\n", "line 1: '1;2' is not a number: separate numbers by spaces, not by ';'"),
             ("vertex\n1\n2\n3\n4", "line 1: 'vertex' is not a number"),
         ],
     )
@@ -266,9 +270,9 @@ class TestBadFiles:
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
     def test_files_that_cannot_be_read_or_written(self, tmp_path):
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="missing: does not exist"):
             read_pointwise_map(tmp_path / "missing", X, Y)
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="is not a regular file"):
             read_ground_truth(tmp_path, X, Y)
         with pytest.raises(InputError, match="cannot be written"):
             write_pointwise_map(tmp_path / "missing" / "a.map", [0])

@@ -1,11 +1,11 @@
-"""What goes to other libraries does there what it does here, and what comes from them is checked.
+"""Exchange with other libraries and with MATLAB: results agree on both sides, and bad input is refused.
 
-Where a package is not installed a stand-in with its attributes is read instead; `pip install '.[peers]' pyvista`
-brings all of them.
+Stand-ins replace packages that are not installed; `pip install '.[peers]' pyvista` installs all packages.
 """
 
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,15 +20,16 @@ import trimesh
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
-from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh, make_spectrum
-from jaxsmw.evaluation.ground_truth import read_landmarks
+from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
+from jaxsmw.io import make_spectrum
+from jaxsmw.io.map_files import read_landmarks
 
 K = 12
 
 
 @pytest.fixture(scope="module")
 def bodies() -> tuple[Mesh, Mesh]:
-    """Two of different sizes and numbers of vertices, neither of area 1."""
+    """Two surfaces of different areas and numbers of vertices."""
     x, (vertices, faces) = bumpy_mesh(3), sphere_mesh(2)
     return make_mesh(3 * x.vertices, x.faces, name="x"), make_mesh(vertices * [5, 7, 6], faces, name="y")
 
@@ -93,18 +94,18 @@ LIBRARIES: list[Callable[[Mesh], object]] = [
 
 
 @pytest.mark.parametrize("convert", LIBRARIES)
-def test_meshes_of_other_libraries_come_as_they_are(bodies, convert):
+def test_meshes_of_other_libraries_are_read_unchanged(bodies, convert):
     for body in bodies:
         mesh = make_mesh(convert(body))
         np.testing.assert_allclose(mesh.vertices, body.vertices, rtol=1e-15)
         np.testing.assert_array_equal(mesh.faces, body.faces)
 
 
-def test_a_mesh_is_a_mesh(bodies):
+def test_make_mesh_accepts_a_mesh(bodies):
     np.testing.assert_array_equal(make_mesh(bodies[0]).faces, bodies[0].faces)
 
 
-def test_match_takes_them(bodies, spectra, pointwise_map):
+def test_match_accepts_meshes_of_other_libraries(bodies, spectra, pointwise_map):
     stage = jaxsmw.Stage(jaxsmw.WaveletPreservation(), number_of_eigenvectors=K, iterations=1)
     x, y = bodies
     ours = jaxsmw.match(x, y, preset=stage, init=pointwise_map)
@@ -113,30 +114,30 @@ def test_match_takes_them(bodies, spectra, pointwise_map):
     assert theirs.mesh_x.name == "source mesh" and theirs.mesh_y.name == "target mesh"
 
 
-NO_MESHES = {
-    "a number": (3, "int is no triangle mesh"),
-    "vertices alone": (np.zeros((4, 3)), "ndarray is no triangle mesh"),
-    "a point cloud": (SimpleNamespace(vertices=np.zeros((4, 3)), faces=None), "no faces beside vertices"),
+NOT_MESHES = {
+    "a number": (3, "int is not a triangle mesh"),
+    "vertices alone": (np.zeros((4, 3)), "ndarray is not a triangle mesh"),
+    "a point cloud": (SimpleNamespace(vertices=np.zeros((4, 3)), faces=None), "lacks vertices or faces"),
     "polygons": (
-        SimpleNamespace(points=np.eye(4, 3), faces=np.array([4, 0, 1, 2, 3])), "not all its faces are triangles"),
+        SimpleNamespace(points=np.eye(4, 3), faces=np.array([4, 0, 1, 2, 3])), "not all faces are triangles"),
     "triangles and a polygon": (
         SimpleNamespace(points=np.eye(5, 3), faces=np.array([3, 0, 1, 2, 7, 0, 1, 2, 3, 4, 0, 1])),
-        "not all its faces are triangles"),
-    "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is no triangle mesh"),
-    "a path": ("body.off", "is the name of a file: read it with jaxsmw.read_mesh first"),
+        "not all faces are triangles"),
+    "three arrays": ((np.eye(3), np.eye(3), np.eye(3)), "tuple is not a triangle mesh"),
+    "a path": ("body.off", "is a file name: read the file with jaxsmw.read_mesh first"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("given", "fault"), NO_MESHES.values(), ids=NO_MESHES)
-def test_what_is_no_mesh_is_told(given, fault):
+@pytest.mark.parametrize(("given", "fault"), NOT_MESHES.values(), ids=NOT_MESHES)
+def test_objects_that_are_not_meshes_are_refused(given, fault):
     with pytest.raises(InputError, match=fault) as caught:
         make_mesh(given, name="my body")
     assert str(caught.value).startswith("my body: ")
 
 
-def test_the_package_imports_none_of_them():
+def test_the_package_does_not_import_other_libraries():
     code = (
-        "import jaxsmw, jaxsmw.io.exchange, jaxsmw.matching, sys;"
+        "import jaxsmw, jaxsmw.io.spectra, jaxsmw.matching, sys;"
         "print([name for name in ('pyFM', 'geomfum', 'trimesh', 'pyvista', 'torch', 'potpourri3d') "
         "if name in sys.modules])"
     )
@@ -163,7 +164,7 @@ def test_an_eigenbasis_in_any_unit_is_scaled_to_area_1(spectra, unit, form):
 def test_vertices_without_area_are_masked(spectra):
     padded = spectra[0].pad(spectra[0].mask.shape[0] + 3)
     vectors = np.asarray(padded.eigenvectors).copy()
-    vectors[-1] = 7  # what an eigensolver leaves there means nothing
+    vectors[-1] = 7  # an eigensolver may leave any value there
     found = make_spectrum(padded.eigenvalues, vectors, padded.vertex_areas)
     same_spectrum(found, padded, tolerance=1e-12)
 
@@ -196,7 +197,7 @@ def test_spectrum_of_geomfum(bodies, spectra, use_k):
         same_spectrum(make_spectrum(theirs), ours.truncate(use_k))
 
 
-def test_spectrum_of_what_looks_like_geomfum(spectra):
+def test_spectrum_of_a_stand_in_for_geomfum(spectra):
     ours = spectra[0].scale(9.0)
     shape = SimpleNamespace(
         basis=SimpleNamespace(vals=np.asarray(ours.eigenvalues), vecs=np.asarray(ours.eigenvectors)),
@@ -234,16 +235,19 @@ VALUES, (VECTORS, AREAS) = (
 BAD_SPECTRA = {
     "nothing": ((3,), "int has no eigenbasis"),
     "eigenvalues alone": ((VALUES,), "ndarray has no eigenbasis"),
-    "no areas": ((VALUES, VECTORS), "vertex areas are no numeric array"),
+    "no areas": ((VALUES, VECTORS), "vertex areas are not an array of real numbers"),
     "transposed": ((VALUES, VECTORS.T, AREAS), "do not fit each other"),
     "too many eigenvalues": ((np.arange(4.0), VECTORS, AREAS), "do not fit each other"),
     "too few areas": ((VALUES, VECTORS, AREAS[:-1]), "do not fit each other"),
+    "a sparse mass matrix of another size": ((VALUES, VECTORS, sp.eye_array(7)), "do not fit each other"),
+    "a sparse mass matrix that would fill the memory": (
+        (VALUES, VECTORS, sp.csc_array(([1.0], [0], [0, 1]), shape=(2**40, 1))), "do not fit each other"),
     "a matrix of eigenvalues": ((np.diag(VALUES), VECTORS, AREAS), "do not fit each other"),
-    "complex": ((VALUES * 1j, VECTORS, AREAS), "eigenvalues are no numeric array"),
-    "words": ((["a", "b", "c"], VECTORS, AREAS), "eigenvalues are no numeric array"),
+    "complex": ((VALUES * 1j, VECTORS, AREAS), "eigenvalues are not an array of real numbers"),
+    "words": ((["a", "b", "c"], VECTORS, AREAS), "eigenvalues are not an array of real numbers"),
     "not finite": ((VALUES, VECTORS * np.nan, AREAS), "eigenvectors are not all finite"),
-    "negative areas": ((VALUES, VECTORS, -AREAS), "must not be negative"),
-    "no area": ((VALUES, VECTORS, 0 * AREAS), "not all zero"),
+    "negative areas": ((VALUES, VECTORS, -AREAS), "vertex areas are negative"),
+    "no area": ((VALUES, VECTORS, 0 * AREAS), "or all zero"),
     "negative semi-definite": ((-VALUES[::-1], VECTORS, AREAS), "change its sign"),
     "descending": ((VALUES[::-1], VECTORS, AREAS), "do not ascend"),
     "areas of another unit": ((VALUES, VECTORS, 100 * AREAS), "not orthonormal"),
@@ -262,8 +266,8 @@ def test_bad_spectra_end_in_one_sentence(arrays, fault):
 # ---------------------------------------------------------------------------------- functional maps
 
 
-def test_maps_of_pyfm_are_ours(spectra, pointwise_map):
-    """Its shape 1 is our Y, its shape 2 our X: `FM_12` is C, `p2p_21` is T."""
+def test_maps_of_pyfm_equal_ours(spectra, pointwise_map):
+    """Shape 1 of pyFM is our Y, and shape 2 is our X: `FM_12` is C, `p2p_21` is T."""
     convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
     x, y = spectra
     basis_1, basis_2 = np.asarray(y.eigenvectors), np.asarray(x.eigenvectors)
@@ -282,7 +286,7 @@ def test_maps_of_pyfm_are_ours(spectra, pointwise_map):
     )
 
 
-def test_zoomout_of_pyfm_on_our_basis(spectra, pointwise_map):
+def test_zoomout_of_pyfm_in_our_basis(spectra, pointwise_map):
     refine = pytest.importorskip("pyFM.refine", reason="pip install pyfmaps")
     x, y = spectra
     first = encode(jnp.asarray(pointwise_map), x.truncate(4), y.truncate(4))
@@ -302,8 +306,8 @@ def test_zoomout_of_pyfm_on_our_basis(spectra, pointwise_map):
     np.testing.assert_array_equal(points, decode(ours, x, y))
 
 
-def test_maps_between_pyfm_meshes_in_their_own_unit(bodies, pointwise_map):
-    """`make_spectrum` says how such a map becomes one between spectra of area 1."""
+def test_maps_between_pyfm_meshes_in_any_unit(bodies, pointwise_map):
+    """A factor, given by `make_spectrum`, converts such a map into a map between spectra of area 1."""
     functional = pytest.importorskip("pyFM.functional", reason="pip install pyfmaps")
     convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
     x, y = (as_pyfm(body).process(K) for body in bodies)
@@ -311,15 +315,15 @@ def test_maps_between_pyfm_meshes_in_their_own_unit(bodies, pointwise_map):
     ours = encode(jnp.asarray(pointwise_map), make_spectrum(x), make_spectrum(y))
     np.testing.assert_allclose(theirs * np.sqrt(y.area / x.area), ours, atol=1e-10)
     assert abs(y.area / x.area - 1) > 1
-    # Of meshes of area 1 they are the same, and so is what their object makes of ours.
+    # Between meshes of area 1, the maps are equal, and so are the pointwise maps of both libraries.
     x, y = x.area_normalize(), y.area_normalize()
     model = functional.FunctionalMapping(y, x)
     model.FM_12 = np.asarray(ours)
     np.testing.assert_array_equal(model.get_p2p(), decode(ours, make_spectrum(x), make_spectrum(y)))
 
 
-def test_maps_of_geomfum_are_ours(spectra, pointwise_map):
-    """Its shape a is our Y, its shape b our X."""
+def test_maps_of_geomfum_equal_ours(spectra, pointwise_map):
+    """Shape a of geomfum is our Y, and shape b is our X."""
     convert = pytest.importorskip("geomfum.convert", reason="pip install geomfum")
     basis = pytest.importorskip("geomfum.basis", reason="pip install geomfum")
     x, y = spectra
@@ -336,7 +340,7 @@ def test_maps_of_geomfum_are_ours(spectra, pointwise_map):
 # --------------------------------------------------------------------------------------- .npy files
 
 
-def test_maps_as_arrays(tmp_path, bodies):
+def test_maps_in_npy_files(tmp_path, bodies):
     x, y = bodies
     pointwise_map = np.random.default_rng(0).integers(0, len(y.vertices), len(x.vertices))
     path = tmp_path / "map.npy"
@@ -359,10 +363,10 @@ def test_maps_as_arrays(tmp_path, bodies):
         (np.zeros(0, int), "holds int64 of shape .0,.: give"),
         (np.zeros((1, 0), int), "holds int64 of shape .1, 0.: give"),
         (np.array(["a", "b"]), "holds <U1 of shape"),
-        (np.array([None, 1]), "is no array that NumPy saved"),
+        (np.array([None, 1]), "is not an array that NumPy saved"),
         (np.zeros(3, complex), "holds complex128 of shape"),
         (np.zeros(3), "has 3 rows, but one is needed"),
-        (None, "is no array that NumPy saved"),
+        (None, "is not an array that NumPy saved"),
     ],
 )
 def test_hostile_arrays(tmp_path, bodies, contents, fault):
@@ -383,10 +387,10 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
     started = b"\x93NUMPY\x01\x00"
     for data in (archive, *(started + len(h).to_bytes(2, "little") + h for h in (huge, b"(" * 3000, b""))):
         path.write_bytes(data)
-        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is no array that NumPy saved"):
+        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is not an array that NumPy saved"):
             jaxsmw.read_pointwise_map(path, *bodies)
     path.unlink()
-    with pytest.raises(jaxsmw.InputError, match=r"map\.npy: cannot be read .No such file"):
+    with pytest.raises(jaxsmw.InputError, match=r"map\.npy: does not exist: check the path"):
         jaxsmw.read_pointwise_map(path, *bodies)
 
 
@@ -397,13 +401,13 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
 def test_spectra_survive_files(bodies, spectra, tmp_path, suffix):
     for body, spectrum in zip(bodies, spectra, strict=True):
         path = tmp_path / f"body{suffix}"
-        jaxsmw.write_spectrum(path, spectrum.scale(4.0), body)
-        same_spectrum(jaxsmw.read_spectrum(path), spectrum, tolerance=1e-12)
+        jaxsmw.io.write_spectrum(path, spectrum.scale(4.0), body)
+        same_spectrum(jaxsmw.io.read_spectrum(path), spectrum, tolerance=1e-12)
 
 
 def test_a_shape_for_matlab(bodies, spectra, tmp_path):
     body, spectrum = bodies[0], spectra[0]
-    jaxsmw.write_spectrum(tmp_path / "x.mat", spectrum, body)
+    jaxsmw.io.write_spectrum(tmp_path / "x.mat", spectrum, body)
     shape = scipy.io.loadmat(tmp_path / "x.mat", squeeze_me=False)["S"][0, 0]
     n = len(body.vertices)
     assert shape["evals"].shape == (K, 1) and shape["evecs"].shape == (n, K) and shape["A"].shape == (n, n)
@@ -412,7 +416,7 @@ def test_a_shape_for_matlab(bodies, spectra, tmp_path):
     surface = shape["surface"][0, 0]
     assert surface["X"].shape == (n, 1) and surface["TRIV"].dtype == np.float64
     np.testing.assert_array_equal(surface["TRIV"], body.faces + 1)
-    # All of one surface: that of the spectrum.
+    # All fields describe the surface of the spectrum.
     mesh = jaxsmw.read_mesh(tmp_path / "x.mat")
     np.testing.assert_allclose(mesh.area, shape["area"].item(), rtol=1e-12)
     np.testing.assert_allclose(mesh.vertex_areas, shape["A"].diagonal(), rtol=1e-9)
@@ -438,16 +442,16 @@ def test_shapes_of_other_matlab_code(spectra, tmp_path, form, nested):
         **field,
     }
     path = mat_file(tmp_path / "s.mat", **({"shape": fields, "about": "a body"} if nested else fields))
-    same_spectrum(jaxsmw.read_spectrum(path), spectra[0], tolerance=1e-12)
+    same_spectrum(jaxsmw.io.read_spectrum(path), spectra[0], tolerance=1e-12)
 
 
-def test_matlab_code_composes_what_we_write(bodies, spectra, pointwise_map, tmp_path):
+def test_matlab_code_can_use_our_files(bodies, spectra, pointwise_map, tmp_path):
     """C21 = S1.evecs' * S1.A * S2.evecs(T12, :), and T12 = knnsearch(S2.evecs * C21', S1.evecs)."""
     x, y = spectra
     ours = encode(jnp.asarray(pointwise_map), x, y)
-    jaxsmw.write_spectrum(tmp_path / "1.mat", x, bodies[0])
-    jaxsmw.write_spectrum(tmp_path / "2.mat", y)
-    jaxsmw.write_functional_map(tmp_path / "c.mat", ours)
+    jaxsmw.io.write_spectrum(tmp_path / "1.mat", x, bodies[0])
+    jaxsmw.io.write_spectrum(tmp_path / "2.mat", y)
+    jaxsmw.io.write_functional_map(tmp_path / "c.mat", ours)
     jaxsmw.write_pointwise_map(tmp_path / "t.mat", pointwise_map)
     s_1, s_2 = (scipy.io.loadmat(tmp_path / f"{i}.mat")["S"][0, 0] for i in (1, 2))
     t_12, c_21 = scipy.io.loadmat(tmp_path / "t.mat")["T12"], scipy.io.loadmat(tmp_path / "c.mat")["C21"]
@@ -456,7 +460,7 @@ def test_matlab_code_composes_what_we_write(bodies, spectra, pointwise_map, tmp_
     np.testing.assert_allclose(c_21, composed, atol=1e-12)
     distances = np.linalg.norm((s_2["evecs"] @ c_21.T)[None] - s_1["evecs"][:, None], axis=2)
     np.testing.assert_array_equal(distances.argmin(axis=1), decode(ours, x, y))
-    np.testing.assert_array_equal(jaxsmw.read_functional_map(tmp_path / "c.mat", x, y), np.asarray(ours))
+    np.testing.assert_array_equal(jaxsmw.io.read_functional_map(tmp_path / "c.mat", x, y), np.asarray(ours))
     np.testing.assert_array_equal(jaxsmw.read_pointwise_map(tmp_path / "t.mat", *bodies), pointwise_map)
 
 
@@ -479,8 +483,6 @@ def test_pointwise_maps_of_other_matlab_code(bodies, pointwise_map, tmp_path, sh
 
 
 def test_pairs_of_vertices_in_mat_files(bodies, pointwise_map, tmp_path):
-    from jaxsmw.evaluation.ground_truth import read_landmarks
-
     x, y = bodies
     pairs = np.stack([np.arange(9), pointwise_map[:9]], axis=1)
     path = mat_file(tmp_path / "pairs.mat", pairs=pairs + 1)
@@ -520,8 +522,8 @@ def test_damaged_mat_files_end_in_one_sentence(bodies, spectra, tmp_path, kind, 
 
 READERS = {
     "mesh": lambda path, *_: jaxsmw.read_mesh(path),
-    "spectrum": lambda path, *_: jaxsmw.read_spectrum(path),
-    "functional map": lambda path, _, spectra: jaxsmw.read_functional_map(path, *spectra),
+    "spectrum": lambda path, *_: jaxsmw.io.read_spectrum(path),
+    "functional map": lambda path, _, spectra: jaxsmw.io.read_functional_map(path, *spectra),
     "pointwise map": lambda path, bodies, _: jaxsmw.read_pointwise_map(path, *bodies),
 }
 M, N = 642, 162
@@ -538,18 +540,24 @@ BAD_VARIABLES = {
     "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but one is needed for each of the 642"),
     "map of fractions": ("pointwise map", {"T12": np.full(M, 1.5)}, "row 1: 1.5 is not one of"),
     "map of NaN": ("pointwise map", {"T12": np.full(M, np.nan)}, "row 1: nan is not one of"),
-    "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "holds 'T12', and no list of numbers"),
-    "two maps": ("pointwise map", {"a": np.ones(M), "b": np.ones(M)}, "more than one list of numbers, a, b: call .* T12"),
+    "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "holds 'T12', but no list of numbers"),
+    "two maps": ("pointwise map", {"a": np.ones(M), "b": np.ones(M)}, "more than one list of numbers, a, b: save the right one as T12"),
     "no variable": ("pointwise map", {}, "is empty"),
     "words": ("pointwise map", {"T12": "one two"}, "no list of numbers"),
     "complex": ("functional map", {"C21": np.eye(3) * 1j}, "no matrix"),
+    "complex eigenvectors": ("spectrum", {**BASIS, "A": np.ones(8), "evecs": np.eye(8, 3) * (1 + 1j)}, "eigenvectors are not an array of real numbers"),
+    "complex areas": ("spectrum", {**BASIS, "A": sp.diags_array(np.full(8, 1 + 1j)).tocsc()}, "vertex areas are not an array of real numbers"),
+    "complex coordinates": ("mesh", {"surface": {**SURFACE, "Y": SURFACE["Y"] + 1j}}, "surface.Y is not an array of real numbers"),
+    "complex positions": ("mesh", {"VERT": np.eye(4, 3) + 1j, "TRIV": SURFACE["TRIV"]}, "VERT is not an array of real numbers"),
+    "complex faces": ("mesh", {"surface": {**SURFACE, "TRIV": SURFACE["TRIV"] + 1j}}, "surface.TRIV is not an array of real numbers"),
+    "words for coordinates": ("mesh", {"surface": {**SURFACE, "X": "abcd"}}, "surface.X is not an array of real numbers"),
     "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): compute more eigenvectors"),
     "infinite": ("functional map", {"C21": np.full((3, 3), np.inf)}, "not finite"),
-    "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "call the one that is meant C21"),
+    "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "save the right one as C21"),
     "no basis": ("spectrum", {"S": {"evals": np.arange(3.0)}}, "no evals and evecs"),
     "two bases": ("spectrum", {"S1": BASIS, "S2": BASIS}, "holds 2 eigenbases, S1, S2"),
-    "no areas": ("spectrum", BASIS, "no areas beside its evecs"),
-    "one area": ("spectrum", {**BASIS, "area": 3.0}, "no areas beside its evecs"),
+    "no areas": ("spectrum", BASIS, "has evecs but no areas"),
+    "one area": ("spectrum", {**BASIS, "area": 3.0}, "has evecs but no areas"),
     "areas of another shape": ("spectrum", {**BASIS, "A": np.ones(7)}, "do not fit each other"),
     "another mass matrix": ("spectrum", {**BASIS, "A": np.full(8, 2.0)}, "not orthonormal"),
     "no faces": ("mesh", {"surface": {"X": np.ones(4)}}, "no struct 'surface' with X, Y, Z"),
@@ -570,24 +578,33 @@ def test_bad_variables_end_in_one_sentence(bodies, spectra, tmp_path, reader, va
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_missing_files_are_told(bodies, spectra, tmp_path, reader):
+def test_missing_files_are_refused(bodies, spectra, tmp_path, reader):
     with pytest.raises(InputError, match=r"nowhere\.mat: "):
         READERS[reader](tmp_path / "nowhere.mat", bodies, spectra)
 
 
-def test_what_cannot_be_written_is_told(bodies, spectra, tmp_path):
+def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for number in range(3):
+            archive.writestr(f"{number}.npy", bytes(400_000_000))
+    assert (tmp_path / "bomb.npz").stat().st_size < 10_000_000
+    with pytest.raises(InputError, match=r"bomb\.npz: would take more than 1 GiB of memory"):
+        jaxsmw.io.read_spectrum(tmp_path / "bomb.npz")
+
+
+def test_what_cannot_be_written_or_read_is_refused(bodies, spectra, tmp_path):
     x, _ = spectra
     (tmp_path / "damaged.npz").write_bytes(b"no archive")
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
-        "written as .npz or .mat": lambda: jaxsmw.write_spectrum(tmp_path / "x.txt", x),
-        "has 642 vertices and y 162": lambda: jaxsmw.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
-        "written as .mat": lambda: jaxsmw.write_functional_map(tmp_path / "c.txt", np.eye(3)),
-        "not all finite": lambda: jaxsmw.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
-        "read from .npz and .mat": lambda: jaxsmw.read_spectrum(tmp_path / "x.txt"),
-        "does not exist": lambda: jaxsmw.read_spectrum(tmp_path / "x.npz"),
-        "damaged or lacks": lambda: jaxsmw.read_spectrum(tmp_path / "damaged.npz"),
-        "lacks one of": lambda: jaxsmw.read_spectrum(tmp_path / "fields.npz"),
+        "written as .npz or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
+        "has 642 vertices and y 162": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
+        "written as .mat": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.txt", np.eye(3)),
+        "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
+        "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),
+        "does not exist": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.npz"),
+        "damaged or lacks": lambda: jaxsmw.io.read_spectrum(tmp_path / "damaged.npz"),
+        "lacks one of": lambda: jaxsmw.io.read_spectrum(tmp_path / "fields.npz"),
         "not a pointwise map": lambda: jaxsmw.write_pointwise_map(tmp_path / "t.mat", [0.5]),
     }.items():
         with pytest.raises(InputError, match=fault):

@@ -95,7 +95,7 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
 def test_both_shapes_have_the_same_eigensolver(pair, monkeypatch):
     """Also where one is larger than what is approximated, and the other is not."""
     mesh_x = pair[0]
-    monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
+    monkeypatch.setattr(eigenbasis, "APPROXIMATE_FROM", 2000)
     smaller = bumpy_mesh(3)
     spectrum_x, spectrum_y = paired_spectra(Pair(mesh_x, smaller), 10)
     for mesh, spectrum in ((mesh_x, spectrum_x), (smaller, spectrum_y)):

@@ -1,11 +1,10 @@
-"""Meshes: checking and cleaning, properties, every file format in and out, and files that lie."""
+"""Meshes: checks and cleaning, properties, every file format in both directions, and hostile files."""
 
 import dataclasses
 import errno
 import itertools
 import os
 import struct
-import threading
 import tracemalloc
 from collections import Counter
 from pathlib import Path
@@ -22,7 +21,6 @@ from hypothesis.extra import numpy as hnp
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, diagnose, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 OCTAHEDRON = make_mesh(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
@@ -51,7 +49,7 @@ def same_mesh(a: Mesh, b: Mesh) -> bool:
 
 @pytest.fixture
 def saved(tmp_path):
-    """Write a file and give its path."""
+    """Write a file and return its path."""
 
     def save(name: str, content: str | bytes) -> Path:
         path = tmp_path / name
@@ -68,7 +66,7 @@ def saved(tmp_path):
     "vertex_type", [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.int64]
 )
 @pytest.mark.parametrize("face_type", [np.int8, np.uint8, np.int32, np.uint64, np.float32])
-def test_any_numeric_type_is_taken(vertex_type, face_type):
+def test_all_numeric_types_are_accepted(vertex_type, face_type):
     mesh = make_mesh(np.array(SQUARE, vertex_type), np.array(SQUARE_FACES, face_type))
     assert mesh.vertices.dtype == np.float64 and mesh.vertices.tolist() == SQUARE
     assert mesh.faces.dtype == np.int64 and mesh.faces.tolist() == SQUARE_FACES
@@ -82,6 +80,10 @@ def test_arrays_are_copied_and_stored_row_by_row():
     assert mesh.vertices.tolist() == SQUARE and mesh.faces.tolist() == SQUARE_FACES
     assert mesh.vertices.flags.c_contiguous and mesh.faces.flags.c_contiguous
 
+
+# A sheet with more edges than the square.
+BUMPS = bumpy_grid(4).vertices.tolist()
+BUMP_FACES = (bumpy_grid(4).faces + 4).tolist()
 
 BAD_ARRAYS = {
     "no vertices": ([], SQUARE_FACES, "no vertices"),
@@ -114,6 +116,22 @@ BAD_ARRAYS = {
     "too large": (np.array(SQUARE) * 1e200, SQUARE_FACES, "another unit"),
     "beyond the largest float apart": ((np.array(SQUARE) * 2.0 - 1) * 1.7e308, SQUARE_FACES, "another unit"),
     "too small": (np.array(SQUARE) * 1e-200, SQUARE_FACES, "another unit"),
+    "a corner far away": (
+        [*SQUARE[:3], [0, -1e30, 0], *BUMPS],
+        [*SQUARE_FACES, *BUMP_FACES],
+        "vertex 3 (counted from 0) lies 9e+29 median edge lengths from the origin",
+    ),
+    "an unreferenced vertex far away": (
+        [*SQUARE, [0, 0, 1e13]],
+        SQUARE_FACES,
+        "vertex 4 (counted from 0) lies 1e+13 median edge lengths from the origin",
+    ),
+    "a corner far from all others": (
+        [*SQUARE[:3], [0, -1e7, 0], *BUMPS],
+        [*SQUARE_FACES, *BUMP_FACES],
+        "vertex 3 (counted from 0) lies 9e+06 median edge lengths from the middle",
+    ),
+    "far from the origin": (np.array(SQUARE) + 1e13, SQUARE_FACES, "move the mesh to the origin"),
 }
 
 
@@ -127,6 +145,14 @@ def test_bad_arrays_end_in_one_sentence(vertices, faces, fault, weld):
     assert "\n" not in message and message.endswith(".")
 
 
+@pytest.mark.parametrize("scale", [1e-20, 1, 1e20])
+def test_distant_vertices_are_accepted_within_the_limits(scale):
+    """Far from the origin, with a distant unreferenced vertex, and with a distant corner, in any unit."""
+    for vertices in (np.array(SQUARE) + 1e11, [*SQUARE, [1e11, 0, 0]], [*SQUARE[:3], [0, 1e5, 0]]):
+        mesh = make_mesh(np.array(vertices) * scale, SQUARE_FACES)
+        np.testing.assert_array_equal(mesh.vertices, np.array(vertices) * scale)
+
+
 def test_cleaning_drops_faces_and_keeps_vertices():
     faces = [[0, 1, 2], [2, 1, 0], [1, 1, 3], [0, 2, 3], [3, 0, 2], [0, 1, 2]]
     mesh = make_mesh([*SQUARE, [9, 9, 9]], faces, notes=["From afar."])
@@ -136,12 +162,12 @@ def test_cleaning_drops_faces_and_keeps_vertices():
         "From afar.",
         "1 face with a repeated vertex dropped.",
         "3 faces with the vertices of an earlier face dropped.",
-        "1 vertex of 5 in no face.",
+        "1 unreferenced vertex (in no face) of 5.",
     )
 
 
 def unwelded(mesh: Mesh) -> Mesh:
-    """The same surface with three vertices for each face."""
+    """The same surface with three separate vertices for each face."""
     return make_mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
 
 
@@ -155,19 +181,19 @@ def test_welding_closes_a_seam_without_renumbering():
     assert np.array_equal(welded.vertices[welded.faces], seam.vertices[seam.faces])
     found = diagnose(welded)
     assert (found.components, found.boundary_edges, found.unused_vertices) == (1, 0, 18)
-    # The lowest-numbered of the twins is the one that stays in use.
+    # Faces use the lowest-numbered of the vertices at the same position.
     for i in np.flatnonzero(welded.used_vertices):
         assert i == (seam.vertices == seam.vertices[i]).all(axis=1).argmax()
     assert any("Welding changed" in note for note in welded.notes)
     assert not any("--weld" in note for note in welded.notes)
 
 
-def test_welding_takes_only_equal_positions_and_both_zeros_are_equal():
+def test_welding_joins_only_equal_positions_and_both_zeros_are_equal():
     vertices = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [1 + 1e-15, 0, 0], [0, -1, 0]]
     assert make_mesh(vertices, [[0, 1, 2], [3, 5, 4]], weld=True).faces.tolist() == [[0, 1, 2], [0, 5, 4]]
 
 
-def test_no_seam_is_reported_where_twins_are_not_both_on_a_boundary():
+def test_no_seam_is_reported_away_from_boundaries():
     vertices = np.concatenate([OCTAHEDRON.vertices, OCTAHEDRON.vertices])
     mesh = make_mesh(vertices, np.concatenate([OCTAHEDRON.faces, OCTAHEDRON.faces + 6]))
     assert mesh.notes == ()
@@ -215,12 +241,12 @@ def test_octahedron_in_closed_form():
 
 
 def test_normals_are_zero_where_they_cancel():
-    # Both sides of a triangle, the other side in two pieces so that rounding leaves a little.
+    # Both sides of a triangle; the other side consists of two triangles, so that rounding leaves a residue.
     corners = np.array(
         [[0.1, 0.2, 0.3], [1, 0, 0.5], [0, 1, 0.7], [1, 0, 0.5], [0, 1, 0.7], [0.3, 0.7, 0.64]]
     )
     mesh = make_mesh(corners, [[0, 1, 2], [0, 5, 3], [0, 4, 5]])
-    assert mesh._area_vectors.sum(axis=0).any(), "else this tests nothing"
+    assert mesh._area_vectors.sum(axis=0).any(), "otherwise the test is trivial"
     assert (mesh.vertex_normals[0] == 0).all()
     assert np.allclose(np.linalg.norm(mesh.vertex_normals[1:], axis=1), 1)
 
@@ -263,7 +289,7 @@ DIAGNOSES = {
 
 
 @pytest.mark.parametrize(("faces", "expected"), DIAGNOSES.values(), ids=DIAGNOSES)
-def test_what_is_unusual_is_counted(faces, expected):
+def test_peculiarities_are_counted(faces, expected):
     found = dataclasses.asdict(diagnose(make_mesh(POINTS, faces)))
     usual = dict(
         vertices=12, faces=len(faces), components=1, boundary_edges=0, boundary_loops=1, nonmanifold_edges=0,
@@ -273,15 +299,15 @@ def test_what_is_unusual_is_counted(faces, expected):
     assert found == usual | expected
 
 
-def test_sentences_name_each_finding_once():
+def test_each_finding_has_one_sentence():
     vertices = np.concatenate([POINTS, [POINTS[0] * 0.5 + POINTS[1] * 0.5]])
     faces = [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 7], [5, 6, 8], [5, 9, 10], [0, 1, 12]]
     sentences = diagnose(make_mesh(vertices, faces)).sentences()
     for sentence, part in zip(
         sentences,
-        ["13 vertices, 7 faces, 2 connected components, open.", "1 vertex in no face",
+        ["13 vertices, 7 faces, 2 connected components, open.", "1 unreferenced vertex (in no face): never",
          "15 boundary edges in 2 loops", "1 non-manifold edge (", "1 non-manifold vertex:",
-         "1 edge between faces of opposite orientation", "1 face without area"],
+         "1 edge between faces of opposite orientation", "1 degenerate triangle without area"],
         strict=True,
     ):  # fmt: skip
         assert sentence.startswith(part) and sentence.endswith(".") and "\n" not in sentence
@@ -297,7 +323,7 @@ def test_degenerate_faces_are_relative_and_at_any_scale():
 
 @given(seed=st.integers(0, 2**32 - 1), log_scale=st.floats(-20, 20))
 @settings(max_examples=30, deadline=None)
-def test_renumbering_moving_and_scaling(seed, log_scale):
+def test_properties_are_invariant_to_renumbering_motion_and_scale(seed, log_scale):
     random = np.random.default_rng(seed)
     mesh = make_mesh(
         random.normal(size=(30, 3)), np.stack([random.choice(30, 3, replace=False) for _ in range(40)])
@@ -418,7 +444,7 @@ SQUARE_FILES = {
 
 
 @pytest.mark.parametrize("name", SQUARE_FILES)
-def test_every_way_to_write_a_square(saved, name):
+def test_all_files_of_a_square_give_the_same_mesh(saved, name):
     mesh = read_mesh(saved(name.replace("\\", ""), SQUARE_FILES[name]))
     assert mesh.vertices.tolist() == SQUARE and mesh.faces.tolist() == SQUARE_FACES
     assert (mesh.notes != ()) == ("quad" in name)
@@ -485,6 +511,19 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
     assert mesh.vertices.tolist() == [[1, 1, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0]]
     assert mesh.faces.tolist() == [[0, 1, 2], [2, 3, 0]]
     assert len(mesh.notes) == 1 and "4 vertices, numbered by first appearance" in mesh.notes[0]
+
+
+def test_welding_says_when_it_changes_nothing(saved):
+    """For example in STL files, whose corners the reader merges."""
+    path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
+    plain, welded = read_mesh(path), read_mesh(path, weld=True)
+    assert same_mesh(plain, welded) and diagnose(plain).components == 1
+    assert welded.notes == (
+        *plain.notes,
+        "Welding changed nothing: no two vertices of faces have the same position.",
+    )
+    twins = make_mesh([*SQUARE, SQUARE[0]], SQUARE_FACES, weld=True)
+    assert twins.faces.tolist() == SQUARE_FACES and "Welding changed nothing" in twins.notes[0]
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl"])
@@ -565,6 +604,10 @@ HOSTILE = {
     "inf.off": ("OFF\n3 1 0\n0 0 0\n1 0 -inf\n0 1 0\n3 0 1 2\n", "finite"),
     "overflow.off": ("OFF\n3 1 0\n0 0 0\n1e999 0 0\n0 1 0\n3 0 1 2\n", "finite"),
     "word.off": ("OFF\n3 1 0\n0 0 0\n1 zero 0\n0 1 0\n3 0 1 2\n", "'1 zero 0'"),
+    "underscore.off": ("OFF\n3 1 0\n0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0 0 0' stands where 3 numbers"),
+    "underscore in a face.off": (f"OFF\n3 1 0\n{T}3 0 1 0_2\n", "'3 0 1 0_2' stands where 4 numbers"),
+    "underscore in a count.off": (f"OFF\n3_0 1 0\n{T}3 0 1 2\n", "numbers of vertices"),
+    "hexadecimal.off": ("OFF\n3 1 0\n0 0 0\n0x1 0 0\n0 1 0\n3 0 1 2\n", "'0x1 0 0'"),
     "comma.off": ("OFF\n3 1 0\n0,0 0,0 0,0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0,0 0,0 0,0'"),
     "junk line.off": (b"OFF\n3 1 0\n0 0 0\n\xff\x00\x85\n0 1 0\n3 0 1 2\n", "3 numbers"),
     "two coordinates.off": ("OFF\n3 1 0\n0 0\n1 0\n0 1\n3 0 1 2\n", "'0 0'"),
@@ -586,6 +629,8 @@ HOSTILE = {
     "no faces.obj": (V, "no faces"),
     "bare v.obj": (V + "v\nf 1 2 3\n", "3 numbers"),
     "bare v at the end.obj": (V + "f 1 2 3\nv", "3 numbers"),
+    "underscore.obj": ("v 0 0 1_0\n" + V + "f 1 2 3\n", "'0 0 1_0'"),
+    "underscore in a face.obj": (V + "f 1 2 0_3\n", "3 1 2 0_3"),
     "bare f.obj": (V + "f\n", "0 corners"),
     "word.obj": ("v 0 0 x\n" + V + "f 1 2 3\n", "'0 0 x'"),
     "nan.obj": ("v 0 0 nan\n" + V + "f 1 2 3\n", "finite"),
@@ -601,6 +646,8 @@ HOSTILE = {
     "no format.ply": (("ply\n" + PLY_HEAD[21:] + PLY_FACE + T + "3 0 1 2\n"), "none of the formats"),
     "unknown format.ply": (PLY_HEAD.replace("ascii", "xml") + PLY_FACE, "none of the formats"),
     "two formats.ply": (PLY_HEAD + "format ascii 1.0\n" + PLY_FACE + T + "3 0 1 2\n", "none of the formats"),
+    "version that does not exist.ply": (PLY_HEAD.replace("1.0", "9.9") + PLY_FACE + T + "3 0 1 2\n", "in version 1.0"),
+    "no version.ply": (PLY_HEAD.replace(" 1.0", "") + PLY_FACE + T + "3 0 1 2\n", "in version 1.0"),
     "format without name.ply": (PLY_HEAD.replace(" ascii 1.0", "") + PLY_FACE, "none of the formats"),
     "property first.ply": ("ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property float x"),
     "unknown type.ply": (PLY_HEAD + "property quad w\n" + PLY_FACE, "property quad w"),
@@ -623,7 +670,11 @@ HOSTILE = {
         PLY_HEAD + "element face 1\nproperty int vertex_indices\nend_header\n" + T + "1\n", "1 corner,"
     ),
     "no faces.ply": (PLY_HEAD + PLY_FACE.replace("face 1", "face 0") + T, "no faces"),
-    "word.ply": (PLY_HEAD + PLY_FACE + "0 0 zero\n1 0 0\n0 1 0\n3 0 1 2\n", "word"),
+    "word.ply": (PLY_HEAD + PLY_FACE + "0 0 zero\n1 0 0\n0 1 0\n3 0 1 2\n", "'zero' stands where a number"),
+    "underscore.ply": (PLY_HEAD + PLY_FACE + "0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0' stands where a number"),
+    "underscore in a face.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 0_2\n", "'0_2' stands where a number"),
+    "null character.ply": (PLY_HEAD + PLY_FACE + "0 0 0\0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0\\x00' stands where a number"),
+    "strange digit.ply": (PLY_HEAD + PLY_FACE + "0 0 \xb2\n1 0 0\n0 1 0\n3 0 1 2\n", "stands where a number"),
     "truncated.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3", "truncated"),
     "truncated in texture.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\nf 1/1 3/", "truncated"),
     "truncated text.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1", "'face'"),
@@ -671,6 +722,7 @@ HOSTILE = {
     "truncated text.stl": (text_stl(TRIANGLE)[:90], "truncated"),
     "without end.stl": (text_stl(TRIANGLE).replace("endsolid", ""), "truncated"),
     "four corners.stl": (text_stl(TRIANGLE).replace("outer loop", "outer loop vertex 1 1 1"), "4 corners"),
+    "underscore.stl": (text_stl(TRIANGLE).replace("vertex 1", "vertex 1_0"), "'1_0 0 0'"),
     "word.stl": (text_stl(TRIANGLE).replace("vertex 1", "vertex one"), "'one 0 0'"),
     "two coordinates.stl": (text_stl(TRIANGLE).replace("vertex 0 1 0", "vertex 0 1"), "'0 1 endloop'"),
     "empty solid.stl": ("solid facetless\nendsolid\n", "no vertices"),
@@ -681,7 +733,7 @@ HOSTILE = {
 def test_hostile_files_end_in_one_sentence(saved, name):
     content, fault = HOSTILE[name]
     path = saved(name, content)
-    if fault is None:  # strange, and yet all there
+    if fault is None:  # the file is strange but complete
         assert read_mesh(path).faces.tolist() == [[0, 1, 2]]
         return
     tracemalloc.start()
@@ -698,7 +750,7 @@ def test_hostile_files_end_in_one_sentence(saved, name):
     assert peak < 4e6
 
 
-def test_paths_that_are_no_files(tmp_path):
+def test_paths_that_are_not_files(tmp_path):
     for path, fault in [
         (tmp_path / "missing.off", "does not exist"),
         (tmp_path / "no" / "such" / "directory.off", "does not exist"),
@@ -716,7 +768,7 @@ def test_paths_that_are_no_files(tmp_path):
         assert str(caught.value).startswith(f"{path}: ") and fault in str(caught.value)
 
 
-def test_a_pipe_is_not_waited_for(tmp_path):
+def test_a_pipe_is_refused_without_waiting(tmp_path):
     path = tmp_path / "pipe.off"
     os.mkfifo(path)
     with pytest.raises(InputError, match="not a regular file"):
@@ -737,7 +789,7 @@ def test_no_permission(saved, monkeypatch):
 def test_a_terabyte_is_not_read(tmp_path):
     path = tmp_path / "sparse.off"
     with path.open("wb") as file:
-        file.truncate(2**40)  # takes no space on the disk
+        file.truncate(2**40)  # a sparse file takes no space on the disk
     with pytest.raises(InputError, match=r"sparse\.off: is larger than 1 GiB"):
         read_mesh(path)
 
@@ -752,7 +804,7 @@ def scratch(tmp_path_factory) -> Path:
 
 
 def read_or_refuse(path: Path) -> None:
-    """Either a sound mesh or one sentence, whatever is in the file."""
+    """Read a file; the result must be a sound mesh or an error of one sentence."""
     try:
         mesh = read_mesh(path)
     except InputError as error:
@@ -768,7 +820,7 @@ def read_or_refuse(path: Path) -> None:
 
 @given(junk=st.binary(max_size=300), start=st.sampled_from(STARTS), suffix=st.sampled_from(SUFFIXES))
 @settings(max_examples=400, deadline=None)
-def test_junk_is_refused_politely(scratch, junk, start, suffix):
+def test_junk_is_refused_in_one_sentence(scratch, junk, start, suffix):
     path = scratch / f"junk{suffix}"
     path.write_bytes(start + junk)
     read_or_refuse(path)
@@ -813,8 +865,8 @@ COORDINATES = st.one_of(
 
 @given(vertices=hnp.arrays(np.float64, st.tuples(st.integers(3, 8), st.just(3)), elements=COORDINATES))
 @settings(max_examples=100, deadline=None)
-def test_what_is_written_is_read_bit_for_bit(scratch, vertices):
-    vertices = np.concatenate([vertices, SQUARE])
+def test_written_meshes_are_read_back_bit_for_bit(scratch, vertices):
+    vertices = np.concatenate([vertices, np.array(SQUARE) * 1e45])
     faces = np.array(SQUARE_FACES) + len(vertices) - 4
     faces = np.concatenate([faces, [[0, 1, 2]]])
     for suffix in (".off", ".ply"):
@@ -825,7 +877,7 @@ def test_what_is_written_is_read_bit_for_bit(scratch, vertices):
 
 
 @pytest.mark.parametrize("suffix", [".off", ".ply", ".OFF"])
-def test_other_programs_read_what_is_written(tmp_path, suffix):
+def test_another_program_reads_written_meshes(tmp_path, suffix):
     mesh = bumpy_grid(5)
     colors = np.random.default_rng(0).integers(0, 256, (25, 3), dtype=np.uint8)
     path = tmp_path / f"m{suffix}"
@@ -883,89 +935,11 @@ def test_bad_targets_write_nothing(tmp_path, name):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-# ------------------------------------------------------------------------------------- atomic_write
-
-
-def test_the_file_appears_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "result.npz"
-    with atomic_write(str(path)) as temporary:
-        assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary.read_bytes() == b""
-        temporary.write_bytes(b"one")
-        assert not path.exists()
-    assert path.read_bytes() == b"one"
-
-    def fail() -> None:
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(b"half of")
-            raise KeyError("in the middle")
-
-    with pytest.raises(KeyError):
-        fail()
-    assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
-
-
-def test_trouble_of_the_system_is_one_sentence(tmp_path):
-    def fill() -> None:
-        with atomic_write(tmp_path / "a.txt"):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(InputError, match=r"a\.txt: cannot be written \(No space left on device\)"):
-        fill()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["x" * 300, "missing/a.txt", "/dev/null", ".", "/"])
-def test_places_that_cannot_be_written(tmp_path, name):
-    with pytest.raises(InputError, match=r"cannot be written"), atomic_write(tmp_path / name) as temporary:
-        temporary.write_text("x")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_write_protection_is_respected(tmp_path, monkeypatch):
-    path = tmp_path / "kept.txt"
-    path.write_text("old")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind the superuser
-    with pytest.raises(InputError, match="write-protected"), atomic_write(path) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "old"
-
-
-def test_permissions_are_those_of_any_new_file(tmp_path):
-    (tmp_path / "plain").touch()
-    with atomic_write(tmp_path / "atomic"):
-        pass
-    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_links_are_followed(tmp_path):
-    (tmp_path / "store").mkdir()
-    (tmp_path / "link.txt").symlink_to(tmp_path / "store" / "real.txt")
-    with atomic_write(tmp_path / "link.txt") as temporary:
-        temporary.write_text("x")
-    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "store" / "real.txt").read_text() == "x"
-
-
-def test_many_writers_of_one_file_leave_one_whole_file(tmp_path):
-    path = tmp_path / "shared.txt"
-
-    def write(letter: str) -> None:
-        with atomic_write(path) as temporary:
-            temporary.write_text(letter * 100_000)
-
-    threads = [threading.Thread(target=write, args=(letter,)) for letter in "abcdefgh"]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert path.stat().st_size == 100_000 and len(set(path.read_text())) == 1
-    assert list(tmp_path.iterdir()) == [path]
-
-
 # -------------------------------------------------------------------------------------- real shapes
 
 
 def read_plainly(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The data sets' files, all of one kind, without any of the code under test."""
+    """Read an OFF file of the data sets without the code under test."""
     words = path.read_text().split()
     n, f = int(words[1]), int(words[2])
     numbers = np.array(words[4:], float)
@@ -1011,28 +985,3 @@ def test_real_shape_round_trip(shared, tmp_path):
     for name in ("w.off", "w.ply"):
         write_mesh(tmp_path / name, mesh)
         assert same_mesh(read_mesh(tmp_path / name), mesh)
-
-
-def test_check_writable_tells_before_the_work_what_atomic_write_would_tell_after(tmp_path):
-    check_writable(tmp_path / "new.txt")
-    (tmp_path / "old.txt").write_text("x")
-    check_writable(tmp_path / "old.txt")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["old.txt"]
-    # Nobody can create files in /proc, whatever permissions say.
-    for path in (
-        tmp_path,
-        tmp_path / "no" / "such.txt",
-        *([Path("/proc/x")] if Path("/proc").exists() else []),
-    ):
-        with pytest.raises(InputError, match="cannot be written"):
-            check_writable(path)
-
-
-def test_check_directory_tells_before_the_work_and_leaves_nothing(tmp_path):
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "kept").mkdir()
-    check_directory(tmp_path / "new" / "one")
-    check_directory(tmp_path / "kept")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "kept"]
-    with pytest.raises(InputError, match="cannot be made a directory"):
-        check_directory(tmp_path / "file" / "one")

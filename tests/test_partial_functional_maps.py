@@ -26,7 +26,7 @@ from jaxsmw.evaluation.opponents.partial_functional_maps import (
 from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import paired_spectra
+from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 
 K, D = 40, 8
@@ -44,8 +44,8 @@ class Case:
         number = np.full(len(self.full.vertices), -1)
         number[self.truth] = np.arange(len(self.truth))
         self.partial: Mesh = make_mesh(self.full.vertices[self.truth], number[kept])
-        spectra = paired_spectra(self.partial, self.full, K, partial=True)
-        self.x, self.y = describe(self.partial, self.full, *spectra, D, partial=True)
+        pair = Pair(self.partial, self.full, True)
+        self.x, self.y = describe(pair, *paired_spectra(pair, K), D)
         self.covered = np.isin(np.arange(len(self.full.vertices)), self.truth)
         wrong = generator.random(len(self.truth)) < 0.3
         self.initial_map = np.where(

@@ -1,4 +1,4 @@
-"""SHOT: what it must and must not depend on, and how well it matches."""
+"""SHOT: its invariances, and its accuracy as a descriptor."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def descriptors(bumpy):
 
 
 def agree(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal but for the odd vertex where rounding decides a majority of neighbours that is a tie."""
+    """Whether descriptors are equal, except at rare vertices where rounding breaks a tie of the majority."""
     return np.mean(np.abs(a - b).max(axis=1) < 1e-6) > 0.99
 
 
@@ -54,17 +54,17 @@ def test_renumbering_vertices_renumbers_descriptors(bumpy, descriptors):
     assert agree(shot_descriptors(renumbered), descriptors[order])
 
 
-def test_inside_out_is_the_same(bumpy, descriptors):
+def test_an_inside_out_mesh_has_the_same_descriptors(bumpy, descriptors):
     assert agree(shot_descriptors(make_mesh(bumpy.vertices, bumpy.faces[:, ::-1])), descriptors)
 
 
-def test_tells_a_mirror_image_apart(bumpy, descriptors):
+def test_distinguishes_a_mirror_image(bumpy, descriptors):
     mirrored = make_mesh(bumpy.vertices * [-1, 1, 1], bumpy.faces[:, ::-1])
     distance = np.linalg.norm(shot_descriptors(mirrored) - descriptors, axis=1)
     assert np.median(distance) > 0.1
 
 
-def test_tells_vertices_apart_under_noise(bumpy, descriptors):
+def test_distinguishes_vertices_despite_noise(bumpy, descriptors):
     generator = np.random.default_rng(0)
     spacing = np.sqrt(bumpy.area / len(bumpy.vertices))
     noisy = make_mesh(
@@ -75,33 +75,33 @@ def test_tells_vertices_apart_under_noise(bumpy, descriptors):
     assert np.mean(distance < 2 * spacing) > 0.5
 
 
-def test_blocks_do_not_matter(bumpy, descriptors, monkeypatch):
+def test_the_size_of_blocks_has_no_effect(bumpy, descriptors, monkeypatch):
     monkeypatch.setattr(shot, "_PAIRS_PER_BLOCK", 5000)
     np.testing.assert_allclose(shot_descriptors(bumpy), descriptors, atol=1e-9)
 
 
-def test_flat_square_has_the_closed_form():
-    """On a plane all normals agree with z or with -z: one bin of the cosine, nothing else."""
+def test_a_flat_square_has_a_closed_form():
+    """On a plane, all normals equal z or -z, so only one bin of the cosine is not empty."""
     descriptors = shot_descriptors(make_mesh(*grid_mesh(40, 40)), radius=0.2)
     bins = descriptors.reshape(-1, 32, 11).sum(axis=1)
     extreme = np.maximum(bins[:, 0], bins[:, 10])
     np.testing.assert_allclose(extreme, bins.sum(axis=1))
 
 
-def test_radius_matters(bumpy, descriptors):
+def test_the_radius_has_an_effect(bumpy, descriptors):
     assert np.abs(shot_descriptors(bumpy, radius=0.09) - descriptors).max() > 0.1
 
 
-def test_unused_and_coincident_vertices(bumpy, descriptors):
+def test_unreferenced_and_coincident_vertices(bumpy, descriptors):
     vertices = np.concatenate([bumpy.vertices, bumpy.vertices[:1]])
-    with_unused = shot_descriptors(make_mesh(vertices, bumpy.faces))
-    assert (with_unused[-1] == 0).all()
-    assert agree(with_unused[:-1], descriptors)
+    with_unreferenced = shot_descriptors(make_mesh(vertices, bumpy.faces))
+    assert (with_unreferenced[-1] == 0).all()
+    assert agree(with_unreferenced[:-1], descriptors)
     faces = np.concatenate([bumpy.faces, [[len(vertices) - 1, *bumpy.faces[0, 1:]]]])
     assert np.isfinite(shot_descriptors(make_mesh(vertices, faces))).all()
 
 
-def test_too_coarse():
+def test_too_coarse_meshes_are_refused():
     coarse = make_mesh(*sphere_mesh(1))
     with pytest.raises(InputError, match="--init wks"):
         shot_descriptors(coarse)
@@ -113,7 +113,7 @@ def test_too_coarse():
     assert np.isfinite(shot_descriptors(flag)).all()
 
 
-def test_few_lonely_vertices_are_said_aloud():
+def test_some_vertices_without_neighbors_cause_a_warning():
     vertices, faces = sphere_mesh(3)
     lonely = np.arange(30).reshape(10, 3)
     far = np.repeat(np.arange(10.0)[:, None] * 5 + 20, 3, axis=0) + np.tile(np.eye(3), (10, 1))
@@ -129,8 +129,8 @@ def test_radius_must_be_positive(bumpy, radius):
         shot_descriptors(bumpy, radius=radius)
 
 
-def test_samples_describe_like_a_mesh_of_them(bumpy):
-    """On a finer mesh of the same surface, samples give nearly what all vertices of the coarser one do."""
+def test_samples_act_like_the_vertices_of_a_coarser_mesh(bumpy):
+    """Samples of a fine mesh have nearly the descriptors of a coarse mesh whose vertices they are."""
     coarse, fine = bumpy, bumpy_mesh(5)
     n = len(coarse.vertices)
     np.testing.assert_allclose(fine.vertices[:n], coarse.vertices, atol=1e-12)
@@ -144,7 +144,7 @@ def test_samples_describe_like_a_mesh_of_them(bumpy):
     assert difference < 0.2 * usual
 
 
-def test_samples_of_all_vertices_change_nothing(bumpy, descriptors):
+def test_all_vertices_as_samples_change_nothing(bumpy, descriptors):
     everything = np.arange(len(bumpy.vertices))
     same = shot_descriptors(bumpy, samples=Samples(everything, everything))
     np.testing.assert_allclose(same, descriptors, atol=1e-9)

@@ -317,7 +317,7 @@ def test_all_solutions_in_a_batch_of_refinements_and_on_samples():
     x, y = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *spectra) for spectra in zip(*pairs, strict=True))
     for solution in (LeastSquares(), LeastSquares("frobenius"), RegularizedLeastSquares(**PRECISE)):
         options = {"refiner": WaveletPreservation(solution=solution), "iterations": 2}
-        options |= {"samples_x": samples_x, "samples_y": samples_y}
+        options |= {"samples": (samples_x, samples_y)}
         batch = jax.vmap(lambda x, y, t, options=options: refine(x, y, t, **options))(x, y, maps)
         for i, pair in enumerate(pairs):
             alone = refine(*pair, maps[i], **options)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 from jaxtyping import Array, Float, Int, Int32
 
+from jaxsmw.choices import Search
 from jaxsmw.core.functional_map import Convention, out_and_in
 from jaxsmw.core.products import product
 from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
-
-Search = Literal["auto", "exhaustive", "patches"]
-"""How nearest neighbours are found. All settings find the same; `"auto"` chooses the faster search."""
 
 
 def spectral_embeddings(

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
+from jaxsmw.choices import ITERATIONS
 from jaxsmw.core.checks import all_finite, check_kind, counts_iterations
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -83,7 +84,7 @@ def refine(
     pointwise_map: Int[Array, " m"],
     *,
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = 3,
+    iterations: int = ITERATIONS,
     samples: Samples | None = None,
     partial: bool = False,
     stop_when_unchanged: bool = False,

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.ground_truth import GroundTruth, IndexBase, read_ground_truth
+from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import MESH_SUFFIXES
 

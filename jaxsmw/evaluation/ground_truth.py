@@ -1,35 +1,26 @@
-"""Ground truth in every form in which it circulates, pointwise maps and landmarks in files.
+"""Ground truth in every form in which it circulates.
 
-Text, one row per line, or a matrix in MATLAB's `.mat` format, one row each. What their indices count from a
-file does not say, so each form has the base with which it circulates; in `.mat` files that is always 1.
+Files are read as `jaxsmw.io.map_files` reads them. Each form has the index base with which it circulates.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, count_of
-from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
-
-IndexBase = Literal[0, 1]
-
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 # How far weights in a file, printed with few digits, may lie below 0 and their sum from 1.
 _WEIGHT_TOLERANCE = 1e-4
@@ -125,30 +116,27 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         raise InputError(f"ground truth: {len(files)} files were given: give one file, or the two of a pair.")
 
     if len(files) == 2:
-        tables = [_Table(file, columns=1) for file in files]
+        tables = [Table(file, columns=1) for file in files]
         if tables[0].rows != tables[1].rows:
             raise InputError(
                 f"{files[1]}: has {tables[1].rows} lines where {files[0]} has {tables[0].rows}, "
                 "but line i of both must be the same point: give two files of one data set."
             )
-        return GroundTruth(
-            *(
-                table.vertices(0, mesh, table.base(index_base, usual=1 if table.path.suffix == ".vts" else 0))
-                for table, mesh in zip(tables, (mesh_x, mesh_y), strict=True)
-            )
-        )
+        bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
+        sides = zip(tables, (mesh_x, mesh_y), bases, strict=True)
+        return GroundTruth(*(table.vertices(0, mesh, base) for table, mesh, base in sides))
 
     (file,) = files
     if file.suffix == ".vts":
         raise InputError(f"{file}: is one half of a pair: give the source's .vts file and the target's.")
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
-        table = _Table(file, columns=4)
+        table = Table(file, columns=4)
         table.require_rows(mesh_x)
-        base = table.base(index_base, usual=1)
-        return GroundTruth.of_all_vertices(SurfacePoints(table.faces(0, mesh_y, base), table.weights(1)))
-    table = _Table(file)
+        base = table.index_base(index_base, default=1)
+        return GroundTruth.of_all_vertices(SurfacePoints(_faces(table, 0, mesh_y, base), _weights(table, 1)))
+    table = Table(file)
     if table.columns == 2:
-        base = table.base(index_base, usual=1)
+        base = table.index_base(index_base, default=1)
         return GroundTruth(table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base))
     if table.columns != 1:
         raise InputError(
@@ -156,7 +144,7 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
             "with two (source and target vertex), or a .baryc_gt file with four (face and weights)."
         )
     table.require_rows(mesh_x)
-    return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.base(index_base)))
+    return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.index_base(index_base)))
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
@@ -184,224 +172,32 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
             file.write(f"{face + 1} {' '.join(map(repr, weights))}\n")
 
 
-def read_pointwise_map(
-    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
-) -> Int64[np.ndarray, " m"]:
-    """Read a pointwise map T: X -> Y, one target vertex per line, or from a `.mat` or `.npy` file.
-
-    **Arguments:**
-
-    - `path`: the file. One with the suffix `.mat` holds a single list of numbers, or among others one called
-        `T12` (X is 1, Y is 2).
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y.
-    - `index_base`: what the indices in the file count from. By default 1 in `.mat` files, as MATLAB counts,
-        and 0 in all others, though many published maps count from 1.
-
-    **Returns:** The target vertex of each source vertex (m,), 0-based.
-
-    **Raises:** `InputError` that names the file, the line and the fault.
-    """
-    table = _Table(Path(path), columns=1)
-    table.require_rows(mesh_x)
-    return table.vertices(0, mesh_y, table.base(index_base))
-
-
-def read_landmarks(
-    path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
-) -> Int64[np.ndarray, "l 2"]:
-    """Read landmarks, two columns: a vertex of X and the vertex of Y that is the same point.
-
-    **Arguments:** As in `read_pointwise_map`; a `.mat` file holds a single matrix of two columns.
-
-    **Returns:** Pairs of vertices (l, 2), 0-based.
-
-    **Raises:** `InputError` that names the file, the line and the fault.
-    """
-    table = _Table(Path(path), columns=2)
-    base = table.base(index_base)
-    return np.stack([table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base)], axis=1)
-
-
-def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) -> None:
-    """Write a pointwise map T: X -> Y; never half of it.
-
-    One 0-based target vertex per line; or, where the name ends in `.mat`, the column `T12` in MATLAB's
-    format, which counts from 1 as MATLAB does; or, where it ends in `.npy`, an array for `numpy.load`.
-
-    **Arguments:**
-
-    - `path`: the file to create or to replace.
-    - `pointwise_map`: the target vertex of each source vertex (m,), 0-based.
-
-    **Raises:** `InputError` if these are not vertices, the name is that of another kind of file, or it cannot
-    be written.
-    """
-    check_map_name(path)
-    targets = np.asarray(pointwise_map)
-    if targets.ndim != 1 or targets.dtype.kind not in "iu" or (targets < 0).any():
+def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
+    """A column as 0-based faces of a mesh. The file also counts the faces that cleaning dropped."""
+    count = len(mesh.faces) + len(mesh.dropped_faces)
+    given = table.indices(column, count, f"faces of {mesh.name}", base)
+    faces = np.searchsorted(mesh.face_numbers, given)
+    dropped = np.isin(given, mesh.dropped_faces)
+    if dropped.any():
+        row = int(dropped.argmax())
         raise InputError(
-            f"{path}: what should be written is not a pointwise map: one vertex index, at least 0, is needed "
-            "for each source vertex."
+            f"{table.place(row)}: face {table.word(row, column)} was dropped from {mesh.name}, for it "
+            "repeats a vertex or another face: name a face that was kept."
         )
-    if is_mat_file(path):
-        write_variables(path, {POINTWISE_MAP: targets.astype(np.float64) + 1})
-        return
-    with atomic_write(path) as temporary:
-        if _is_npy_file(path):
-            np.save(temporary, targets.astype(np.int64))
-        else:
-            temporary.write_text("".join(f"{target}\n" for target in targets.tolist()), encoding="ascii")
+    return faces
 
 
-def check_map_name(path: str | os.PathLike[str]) -> None:
-    """**Raises:** `InputError` if the name is that of a file in which others expect something else."""
-    suffix = Path(path).suffix.lower()
-    if suffix in (".npz", ".baryc_gt", ".vts", ".json"):
+def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
+    """Three columns as barycentric weights."""
+    weights = table.values[:, column : column + 3]
+    good = (weights >= -_WEIGHT_TOLERANCE).all(axis=1)
+    good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE
+    if not good.all():
+        row = int(good.argmin())
+        written = " ".join(table.word(row, at) for at in range(column, table.columns))
         raise InputError(
-            f"{path}: a map is written as text, .npy or .mat, not as {suffix}: choose another name."
+            f"{table.place(row)}: {written[:80]} are no barycentric weights, "
+            "which are at least 0 and sum to 1: correct the line."
         )
-
-
-def _is_npy_file(path: str | os.PathLike[str]) -> bool:
-    return Path(path).suffix.lower() == ".npy"
-
-
-class _Table:
-    """The numbers in a file, as many in each line of text or row of a matrix."""
-
-    def __init__(self, path: Path, *, columns: int | None = None) -> None:
-        self.path = path
-        self.is_mat, self.is_text = is_mat_file(path), False
-        if self.is_mat:
-            self.values = read_matrix(path, POINTWISE_MAP, columns=columns)
-        elif _is_npy_file(path):
-            self.values = self._read_array(columns)
-        else:
-            self.is_text = True
-            self._words = self._read_text(columns)
-            self.values = np.array(self._words, dtype=np.float64)
-        self.rows, self.columns = self.values.shape
-
-    def _bytes(self) -> bytes:
-        try:
-            return self.path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be read ({error.strerror}): check the path and its permissions."
-            ) from error
-
-    def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
-        """An array of NumPy's; of one column a list or a row will do, too."""
-        data = io.BytesIO(self._bytes())
-        try:
-            array = np.lib.format.read_array(data, allow_pickle=False)
-        except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
-            raise InputError(f"{self.path}: is no array that NumPy saved: give one, or text.") from error
-        is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
-        table = array.reshape(-1, 1) if is_list else array
-        fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size
-        if not fits or table.dtype.kind not in "iuf":
-            wanted = "a list of numbers" if columns == 1 else f"numbers in {columns or 'some'} columns"
-            raise InputError(
-                f"{self.path}: holds {array.dtype} of shape {array.shape}: give the file with {wanted}."
-            )
-        return table.astype(np.float64)
-
-    def _read_text(self, columns: int | None) -> list[list[str]]:
-        """The numbers as they are written."""
-        path = self.path
-        try:
-            text = self._bytes().decode("utf-8-sig")
-        except UnicodeDecodeError:
-            text = "\0"
-        if "\0" in text:
-            raise InputError(f"{path}: is not a text file: give a file of numbers, one row per line.")
-        lines = re.split("\r\n|\r|\n", text.rstrip())
-        rows = [line.split() for line in lines]
-        if not rows[0]:
-            what = "is empty" if len(lines) == 1 else "begins with an empty line"
-            raise InputError(f"{path}: {what}: give a file of numbers, one row per line.")
-        columns = columns or len(rows[0])
-        for row, words in enumerate(rows):
-            for word in words:
-                if not _NUMBER.fullmatch(word):
-                    raise InputError(f"{self._at(row)}: {word[:40]!a} is not a number: correct the line.")
-            if len(words) != columns:
-                raise InputError(
-                    f"{self._at(row)}: has {count_of(len(words), 'number')} where {columns} should be: "
-                    "correct the line, or give the file that belongs here."
-                )
-        return rows
-
-    def base(self, asked: IndexBase | None, *, usual: IndexBase = 0) -> IndexBase:
-        """What indices count from: as asked, else as usual for the form, and as in MATLAB in its files."""
-        if asked is not None:
-            return asked
-        return 1 if self.is_mat else usual
-
-    def _at(self, row: int) -> str:
-        return f"{self.path}, {'line' if self.is_text else 'row'} {row + 1}"
-
-    def _word(self, row: int, column: int) -> str:
-        """A number as it is written."""
-        return self._words[row][column][:40] if self.is_text else f"{self.values[row, column]:.15g}"
-
-    def require_rows(self, mesh_x: Mesh) -> None:
-        """One for each source vertex."""
-        m = len(mesh_x.vertices)
-        if self.rows != m:
-            raise InputError(
-                f"{self.path}: has {self.rows} {'lines' if self.is_text else 'rows'}, but one is needed for "
-                f"each of the {m} vertices of {mesh_x.name}: give the file that belongs to this pair, in "
-                "this direction."
-            )
-
-    def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """A column as 0-based vertices of a mesh."""
-        return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
-
-    def faces(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """A column as 0-based faces of a mesh, where the file counts those that cleaning dropped, too."""
-        count = len(mesh.faces) + len(mesh.dropped_faces)
-        given = self.indices(column, count, f"faces of {mesh.name}", base)
-        faces = np.searchsorted(mesh.face_numbers, given)
-        dropped = np.isin(given, mesh.dropped_faces)
-        if dropped.any():
-            row = int(dropped.argmax())
-            raise InputError(
-                f"{self._at(row)}: face {self._word(row, column)} was dropped from {mesh.name}, for it "
-                "repeats a vertex or another face: name a face that was kept."
-            )
-        return faces
-
-    def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """A column as 0-based indices below a count."""
-        numbers = self.values[:, column]
-        good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)
-        if not good.all():
-            row = int(good.argmin())
-            cure = "correct it, or give the file that belongs to this pair"
-            if base == 0 and numbers.min() >= 1 and numbers.max() == count:
-                cure = "the file looks 1-based: pass index_base=1 (--index-base 1)"
-            elif base == 1 and numbers.min() == 0 and numbers.max() < count:
-                cure = "the file looks 0-based: pass index_base=0 (--index-base 0)"
-            raise InputError(
-                f"{self._at(row)}: {self._word(row, column)} is not one of the {what}, which are "
-                f"numbered {base} to {count - 1 + base}: {cure}."
-            )
-        return numbers.astype(np.int64) - base
-
-    def weights(self, column: int) -> Float64[np.ndarray, "p 3"]:
-        """Three columns as barycentric weights."""
-        weights = self.values[:, column : column + 3]
-        good = (weights >= -_WEIGHT_TOLERANCE).all(axis=1)
-        good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE
-        if not good.all():
-            row = int(good.argmin())
-            written = " ".join(self._word(row, at) for at in range(column, self.columns))
-            raise InputError(
-                f"{self._at(row)}: {written[:80]} are no barycentric weights, "
-                "which are at least 0 and sum to 1: correct the line."
-            )
-        weights = np.maximum(weights, 0)
-        return weights / weights.sum(axis=1, keepdims=True)
+    weights = np.maximum(weights, 0)
+    return weights / weights.sum(axis=1, keepdims=True)

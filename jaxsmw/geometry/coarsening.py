@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import eigsh
 
-from jaxsmw.geometry.sampling import independent_vertices
+from jaxsmw.geometry.sampling import maximal_independent_set
 
 Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
@@ -85,7 +85,7 @@ _LARGE, _MOST_IN_LARGE = 4, 0.1
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
     """Which vertex is in which cell, (n, c): with the seed that is the fewest edges away."""
     n = graph.shape[0]
-    seeds = independent_vertices(graph, radius)
+    seeds = maximal_independent_set(graph, radius)
     _, _, nearest = dijkstra(graph, indices=seeds, unweighted=True, min_only=True, return_predecessors=True)
     cell = np.searchsorted(seeds, nearest)
     return sp.csr_matrix((np.ones(n), cell, np.arange(n + 1)), shape=(n, len(seeds)))

@@ -14,11 +14,12 @@ from jaxtyping import Float64
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
+from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.coarsening import coarsen
-from jaxsmw.geometry.laplacian import Laplacian, assemble_laplacian, choose_laplacian
+from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
@@ -30,15 +31,11 @@ _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Below this many vertices a dense solver is as fast, and never in doubt.
 _DENSE = 400
-# From this many vertices of a mesh on `"auto"` approximates.
-_APPROXIMATE_FROM = 50_000
-
-Eigensolver = Literal["auto", "exact", "approximate"]
 
 
 def compute_spectrum(
     mesh: Mesh,
-    number_of_eigenvectors: int = 100,
+    number_of_eigenvectors: int = NUMBER_OF_EIGENVECTORS,
     *,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
@@ -143,7 +140,7 @@ def eigenpairs(
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
     """What `"auto"` means for meshes that are to be compared: the same for all, by the largest."""
     most = max(int(mesh.used_vertices.sum()) for mesh in meshes)
-    return "exact" if most < _APPROXIMATE_FROM else "approximate"
+    return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 
 def _solve(

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -22,11 +22,10 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from jaxsmw.choices import GeodesicMethod
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
-
-GeodesicMethod = Literal["strips", "exact"]
 
 # How many edges the straight lines of the graph cross.
 _DEPTH = 10

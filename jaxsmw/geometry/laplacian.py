@@ -10,38 +10,37 @@ import robust_laplacian
 import scipy.sparse as sp
 from jaxtyping import Float64
 
+from jaxsmw.choices import Laplacian
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 
-Laplacian = Literal["auto", "cotangent", "robust"]
-
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
-    """What `"auto"` means for a mesh: robust where cotangents are undefined or an edge has three faces."""
+    """Resolve `"auto"`: robust if cotangents are undefined or an edge has more than two faces."""
     return "robust" if mesh.degenerate_faces.any() or len(mesh.nonmanifold_edges) else "cotangent"
 
 
 def assemble_laplacian(
     mesh: Mesh, *, laplacian: Laplacian = "auto"
 ) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
-    """The stiffness matrix W and the lumped vertex areas A of `W phi = lambda A phi`.
+    """Assemble the stiffness matrix W and the lumped vertex areas A of `W phi = lambda A phi`.
 
     **Arguments:**
 
-    - `mesh`: the surface.
-    - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas; `"robust"` for the
-      tufted intrinsic Delaunay Laplacian (Sharp and Crane 2020), which takes non-manifold and badly shaped
-      meshes; `"auto"` for the first unless the mesh needs the second (`choose_laplacian`).
+    - `mesh`: the surface with n vertices.
+    - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas; `"robust"` for the tufted
+      intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles non-manifold and badly shaped
+      meshes; `"auto"` for the cotangent Laplacian unless the mesh needs the robust one (`choose_laplacian`).
 
-    **Returns:** W (n, n), symmetric positive semi-definite, and A (n,) in squared units of the mesh. Rows
-    of unused vertices are zero in both.
+    **Returns:** W (n, n), symmetric and positive semi-definite, and A (n,) in squared units of the mesh. Both
+    are zero in rows of unreferenced vertices.
 
-    **Raises:** `InputError` where the cotangent Laplacian is undefined.
+    **Raises:** `InputError` if the cotangent Laplacian is undefined.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
-        # The library wants every vertex used.
+        # robust_laplacian requires that every vertex has a face.
         used = np.flatnonzero(mesh.used_vertices)
         compact = np.full(len(mesh.vertices), -1)
         compact[used] = np.arange(len(used))
@@ -56,7 +55,7 @@ def assemble_laplacian(
     areas = mesh.vertex_areas
     if not np.isfinite(stiffness.data).all() or (areas[mesh.used_vertices] <= 0).any():
         raise InputError(
-            f"{mesh.name}: the cotangent Laplacian is undefined on its zero-area faces; use the robust "
-            "Laplacian (laplacian='robust', on the command line --laplacian robust)."
+            f"{mesh.name}: the cotangent Laplacian is undefined on zero-area faces: use the robust Laplacian "
+            "(laplacian='robust', on the command line --laplacian robust)."
         )
     return stiffness, areas

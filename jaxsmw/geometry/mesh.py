@@ -1,4 +1,4 @@
-"""Triangle meshes on the host: what they are, and what is wrong with them."""
+"""Triangle meshes: checks, cleaning, areas, normals, and a diagnosis of defects."""
 
 from __future__ import annotations
 
@@ -18,34 +18,40 @@ from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 
-# A mesh of another library, told by its attributes, as none of those is imported; see `make_mesh`.
+# A mesh of another library, recognized by its attributes; no such library is imported. See `make_mesh`.
 MeshLike: TypeAlias = Any
 
-# A triangle lower than this fraction of its longest edge counts as degenerate: well above the rounding error
-# of coordinates that lie a few sizes of the body away from the origin, well below any triangle on purpose.
+# A triangle whose height is less than this fraction of its longest edge is degenerate. The fraction is far
+# above the rounding errors of a mesh that lies a few extents from the origin, and far below any intended
+# triangle.
 DEGENERATE_HEIGHT = 1e-10
 
-# Between these sizes squares of areas, which come up in descriptors, neither overflow nor vanish.
-SMALLEST_SIZE, LARGEST_SIZE = 1e-60, 1e60
+# The coordinates that can be computed with; any others are damaged, or in a useless unit.
+# Between these extents of a mesh, squares of areas (which occur in descriptors) neither overflow nor vanish.
+SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
+# In median edge lengths. So far from the origin float64 rounds positions by 1e-4 of an edge. So far from the
+# middle of a mesh float32, in which maps are refined, rounds positions by 0.1 of an edge. (The meshes of the
+# data sets reach to 1e4.)
+LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh whose vertices keep the numbers they had in the file.
+    """A triangle mesh whose vertices keep their numbers from the file.
 
-    Nothing ever renumbers vertices: cleaning changes faces only, and a vertex that no face uses stays
-    where it is (`used_vertices` tells). So vertex i here is vertex i of the user's file, always.
+    Vertex i of the mesh is always vertex i of the user's file. Cleaning drops faces only. A vertex without
+    faces keeps its place and its number; `used_vertices` is False there.
 
-    Made by `read_mesh` and `make_mesh`, which check everything; the class itself checks nothing.
+    `read_mesh` and `make_mesh` check everything and return a `Mesh`. The class itself checks nothing.
 
     **Attributes:**
 
-    - `vertices`: positions (n, 3), float64, in the file's unit.
+    - `vertices`: positions (n, 3), float64, in the unit of the file.
     - `faces`: vertex indices (f, 3), 0-based.
-    - `name`: how messages call this mesh (for a file: its path).
-    - `notes`: what was noticed and what was mended on the way in, one sentence each.
-    - `dropped_faces`: numbers (d,), 0-based and ascending, that cleaned-away faces had among the faces given;
-      all others moved up. Files that name faces by number mean those given.
+    - `name`: the name of the mesh in messages; for a file, its path.
+    - `notes`: repairs and peculiarities, one sentence each.
+    - `dropped_faces`: the numbers (d,), 0-based and ascending, of the given faces that cleaning dropped.
+      Files that refer to faces by number count the dropped faces, too.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -56,12 +62,12 @@ class Mesh:
 
     @property
     def face_numbers(self) -> Int64[np.ndarray, " f"]:
-        """The number (0-based) that each face had among the faces given, as files mean it."""
+        """The number (0-based) of each face among the given faces, by which files refer to it."""
         return np.delete(np.arange(len(self.faces) + len(self.dropped_faces)), self.dropped_faces)
 
     @cached_property
     def _area_vectors(self) -> Float64[np.ndarray, "f 3"]:
-        """Normals as long as twice the area."""
+        """The normal of each face, with twice the area of the face as its length."""
         corners = self.vertices[self.faces]
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -72,65 +78,68 @@ class Mesh:
 
     @cached_property
     def area(self) -> float:
-        """Total surface area."""
+        """The total surface area."""
         return float(self.face_areas.sum())
 
     @cached_property
     def vertex_areas(self) -> Float64[np.ndarray, " n"]:
-        """Lumped barycentric areas: a third of every face at the vertex; 0 for unused vertices."""
+        """Lumped barycentric areas: a third of each face at the vertex. Unreferenced vertices have area 0."""
         return self._sum_at_vertices(self.face_areas / 3)
 
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "n 3"]:
-        """Unit normals, the faces' normals weighted by area; 0 where they cancel or no face is."""
+        """Unit normals: the mean normals of the faces, weighted by area.
+
+        The normal is 0 where the normals of the faces cancel, and at vertices without faces.
+        """
         total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        # Without cancellation the length is near twice the area of the faces around: six vertex areas.
+        # Without cancellation, the length is about twice the area of the faces, which is six vertex areas.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
 
     @cached_property
     def is_inside_out(self) -> bool:
-        """Whether normals point inwards, by the sign of the volume that faces and centroid enclose."""
+        """Whether the normals point inward: the faces then enclose a negative volume with the centroid."""
         corners = self.vertices[self.faces] - self.vertices[self.used_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
     @cached_property
     def used_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True for vertices that at least one face uses."""
+        """True for vertices with at least one face, False for unreferenced vertices."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         return used
 
     @cached_property
     def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
-        """True for triangles without area: lower than 1e-10 of their longest edge."""
+        """True for triangles without area: their height is at most 1e-10 of their longest edge."""
         longest = igl.squared_edge_lengths(self.vertices, self.faces).max(axis=1)
         return 2 * self.face_areas <= DEGENERATE_HEIGHT * longest
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """Undirected edges, each once, smaller vertex first, in lexicographic order."""
+        """Undirected edges in lexicographic order, each once, with the smaller vertex first."""
         return self._edge_table.edges
 
     @cached_property
     def boundary_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """The edges with exactly one face."""
+        """Edges with exactly one face."""
         return self.edges[self._edge_table.faces == 1]
 
     @cached_property
     def nonmanifold_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """The edges with more than two faces."""
+        """Edges with more than two faces."""
         return self.edges[self._edge_table.faces > 2]
 
     @cached_property
     def misoriented_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """The edges whose two faces run the same way along them: one of the faces is inside out."""
+        """Edges whose two faces have opposite orientations: both run along the edge in the same direction."""
         return self.edges[(self._edge_table.faces == 2) & (self._edge_table.balance != 0)]
 
     @cached_property
     def nonmanifold_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True where the faces around a vertex fall apart into fans that share no edge."""
+        """True for vertices whose faces form several fans that share no edge."""
         one_fan = igl.is_vertex_manifold(self.faces)
         pinched = self.used_vertices.copy()
         pinched[: len(one_fan)] &= ~one_fan
@@ -138,7 +147,7 @@ class Mesh:
 
     @cached_property
     def _edge_table(self) -> _EdgeTable:
-        """`edges`, the number of faces at each, and how often these run up less how often down."""
+        """The edges, their numbers of faces, and the sums of the directions (1 or -1) of the faces."""
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         key = np.minimum(tail, head) * n + np.maximum(tail, head)
@@ -158,18 +167,20 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is unusual about a mesh, in numbers. All of it is legal; `str` says what it means.
+    """Counts of everything unusual in a mesh. Nothing here is an error; `str` explains the counts.
 
     **Attributes:**
 
-    - `vertices`, `faces`: how many there are.
-    - `components`: connected components, not counting unused vertices.
-    - `unused_vertices`: vertices of no face.
-    - `boundary_edges`, `boundary_loops`: edges with one face, and the connected chains they form.
-    - `nonmanifold_edges`: edges with more than two faces.
-    - `nonmanifold_vertices`: vertices whose faces fall apart into fans that share no edge.
-    - `misoriented_edges`: edges whose two faces disagree about the outside; 0 means consistently oriented.
-    - `degenerate_faces`: triangles without area.
+    - `vertices`, `faces`: their numbers.
+    - `components`: the number of connected components, without unreferenced vertices.
+    - `unused_vertices`: the number of unreferenced vertices, which no face references.
+    - `boundary_edges`, `boundary_loops`: the numbers of edges with one face, and of the connected chains that
+      these edges form.
+    - `nonmanifold_edges`: the number of edges with more than two faces.
+    - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
+    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. In a consistently
+      oriented mesh it is 0.
+    - `degenerate_faces`: the number of triangles without area.
     """
 
     vertices: int
@@ -184,14 +195,17 @@ class Diagnosis:
     degenerate_faces: int
 
     def sentences(self) -> tuple[str, ...]:
-        """One sentence on the mesh as a whole, then one for each thing that is there."""
+        """One sentence about the size of the mesh, then one sentence for each count that is not zero."""
         shape = "open" if self.boundary_edges else "closed"
         found = [
             f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
             f"{count_of(self.components, 'connected component')}, {shape}."
         ]
         if self.unused_vertices:
-            found.append(f"{count_of(self.unused_vertices, 'vertex')} in no face: never matched to.")
+            found.append(
+                f"{count_of(self.unused_vertices, 'unreferenced vertex')} (in no face): never chosen as a "
+                "match."
+            )
         if self.boundary_edges:
             found.append(
                 f"{count_of(self.boundary_edges, 'boundary edge')} in "
@@ -205,7 +219,7 @@ class Diagnosis:
         if self.nonmanifold_vertices:
             found.append(
                 f"{count_of(self.nonmanifold_vertices, 'non-manifold vertex')}: "
-                "parts of the surface touch in a single point there."
+                "sheets of surface touch in a single point there."
             )
         if self.misoriented_edges:
             found.append(
@@ -214,7 +228,8 @@ class Diagnosis:
             )
         if self.degenerate_faces:
             found.append(
-                f"{count_of(self.degenerate_faces, 'face')} without area: corners coincide or lie on a line."
+                f"{count_of(self.degenerate_faces, 'degenerate triangle')} without area: corners coincide or "
+                "lie on a line."
             )
         return tuple(found)
 
@@ -223,11 +238,11 @@ class Diagnosis:
 
 
 def diagnose(mesh: Mesh) -> Diagnosis:
-    """Count what is unusual about a mesh.
+    """Count everything unusual in a mesh, such as boundary edges and degenerate triangles.
 
     **Arguments:**
 
-    - `mesh`: any mesh from `read_mesh` or `make_mesh`.
+    - `mesh`: a mesh of `read_mesh` or `make_mesh`.
 
     **Returns:**
 
@@ -250,19 +265,33 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
 
 def connected_pieces(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
-    """How many pieces n vertices with some edges form, and which one each vertex belongs to."""
+    """The connected components of a graph with n vertices.
+
+    **Returns:** The number of components, and the component of each vertex (n,).
+    """
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)
 
 
 def units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
-    """In what lengths on two shapes compare: the square root of each area, of a partial pair the larger's."""
+    """The units in which lengths on two shapes are comparable: the square root of each shape's area.
+
+    For a partial pair, both units are the square root of the larger area.
+    """
     areas = mesh_x.area, mesh_y.area
     return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
 
 
 def extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
-    """Give vertices that no face uses the match of the nearest one that a face does use."""
+    """Copy to each unreferenced vertex the match of the nearest referenced vertex.
+
+    **Arguments:**
+
+    - `mesh_x`: X with m vertices.
+    - `matches`: one row per vertex of X (m, ...): matches, points, or any other values.
+
+    **Returns:** The rows (m, ...), unchanged at referenced vertices.
+    """
     used = mesh_x.used_vertices
     if used.all():
         return matches
@@ -273,6 +302,7 @@ def extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shap
 
 
 def count_of(number: int, noun: str) -> str:
+    """A number with its noun in the singular or the plural."""
     if number != 1:
         noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"
     return f"{number} {noun}"
@@ -286,65 +316,56 @@ def make_mesh(
     weld: bool = False,
     notes: Sequence[str] = (),
 ) -> Mesh:
-    """Check and clean vertices and faces: the one door through which every mesh comes.
+    """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
-    Meshes of other libraries come through it, too: `make_mesh(mesh)`. Vertex i is vertex i of their mesh.
-
-    Faces that repeat a vertex and faces with the same three vertices as an earlier one are dropped. Vertices
-    are never dropped or renumbered.
+    All meshes are made by this function. It drops faces that repeat a vertex, and faces with the same three
+    vertices as an earlier face. It never drops or renumbers vertices.
 
     **Arguments:**
 
-    - `vertices`: positions (n, 3), any integer or float type, in any unit; copied. Or all in one, and then no
-        `faces`: a mesh of trimesh, pyFM or geomfum (whatever has `vertices` and `faces`), a `PolyData` of
-        PyVista (`points` and `faces`), or a tuple of vertices and faces, as potpourri3d takes and gives.
-    - `faces`: vertex indices (f, 3), 0-based, any integer type (or whole floats); copied.
-    - `name`: how messages call this mesh.
-    - `weld`: let faces use the lowest-numbered of all vertices at exactly the same position. The others stay
-        as unused vertices. Closes the seams along which some programs double their vertices.
-    - `notes`: sentences to put before this function's own.
+    - `vertices`: positions (n, 3) of any integer or float type, in any unit; copied. Or, without `faces`, a
+        mesh of another library: of trimesh, pyFM or geomfum (any object with `vertices` and `faces`), a
+        `PolyData` of PyVista (`points` and `faces`), or a tuple of vertices and faces, as in potpourri3d.
+    - `faces`: vertex indices (f, 3), 0-based, of any integer type (or whole floats); copied.
+    - `name`: the name of the mesh in messages.
+    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position; the other
+        vertices stay, unreferenced. This closes seams along which some programs duplicate vertices.
+    - `notes`: sentences that precede the notes of this function.
 
     **Returns:**
 
-    A `Mesh`; its `notes` tell what was dropped, welded or looks like a seam.
+    A `Mesh`. Its `notes` say which faces were dropped or welded, and where vertices look like a seam.
 
     **Raises:**
 
-    `InputError` for arrays of another shape or type, coordinates that are not finite, a size beyond
-    1e-60 … 1e60, indices out of range, no faces, no area, or something that is no triangle mesh.
+    `InputError` for arrays of another shape or type, coordinates that are not finite, an extent outside
+    1e-60 … 1e60, a vertex more than 1e12 median edge lengths from the origin or (on a face) 1e6 from the
+    middle of the mesh, indices out of range, no faces, no area, or an object that is not a triangle mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
     position = _numeric(vertices, "vertices", name)
-    with np.errstate(over="ignore"):  # from a wider float type; the infinity is reported
+    with np.errstate(over="ignore"):  # wider float types may overflow; the check below reports infinities
         position = np.array(position, dtype=np.float64, order="C")
-    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
-    if len(lost):
-        raise InputError(
-            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
-            "with a coordinate that is not a finite number: repair the positions."
-        )
-    with np.errstate(over="ignore"):
-        size = float(np.ptp(position, axis=0).max())
-    if size > LARGEST_SIZE or 0 < size < SMALLEST_SIZE:
-        raise InputError(
-            f"{name}: the mesh measures {size:.0e} across, which is beyond what can be computed with: "
-            "choose another unit."
-        )
+    _check_extent(position, name)
     triangles = _indices(_numeric(faces, "faces", name), len(position), name)
     notes = list(notes)
 
     if weld:
-        twin = lowest_twins(position)
+        twin = first_equal_rows(position)
         welded = int((twin[triangles] != triangles).any(axis=1).sum())
         triangles = twin[triangles]
-        notes.append(f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one.")
+        notes.append(
+            f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one."
+            if welded
+            else "Welding changed nothing: no two vertices of faces have the same position."
+        )
     ordered = np.sort(triangles, axis=1)
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeating.any():
         notes.append(f"{count_of(int(repeating.sum()), 'face')} with a repeated vertex dropped.")
     number, ordered = np.flatnonzero(~repeating), ordered[~repeating]
-    first = lowest_twins(ordered) == np.arange(len(ordered))
+    first = first_equal_rows(ordered) == np.arange(len(ordered))
     if not first.all():
         notes.append(f"{count_of(int((~first).sum()), 'face')} with the vertices of an earlier face dropped.")
     number = number[first]
@@ -352,59 +373,96 @@ def make_mesh(
     mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
     if mesh.degenerate_faces.all():
         raise InputError(
-            f"{name}: no triangle has an area, their corners coincide or lie on a line: "
+            f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
             "check the positions and the faces."
         )
+    _check_resolution(mesh)
     rim = np.unique(mesh.boundary_edges)
-    twin = lowest_twins(position[rim])
+    twin = first_equal_rows(position[rim])
     seam = int((np.bincount(twin, minlength=len(rim))[twin] > 1).sum())
     if seam:
         notes.append(
-            f"{count_of(seam, 'boundary vertex')} with another at the same position: if the surface should "
-            "be closed there, weld it (`weld=True`, on the command line `--weld`)."
+            f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
+            "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
     unused = int((~mesh.used_vertices).sum())
     if unused:
-        notes.append(f"{count_of(unused, 'vertex')} of {len(position)} in no face.")
+        notes.append(f"{count_of(unused, 'unreferenced vertex')} (in no face) of {len(position)}.")
     return replace(mesh, notes=tuple(notes))
 
 
+def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
+    """Refuse coordinates that are not finite, and a mesh too large or too small for float64."""
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if len(lost):
+        raise InputError(
+            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
+            "with a coordinate that is not a finite number: repair the positions."
+        )
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(position, axis=0).max())
+    if extent > LARGEST_EXTENT or 0 < extent < SMALLEST_EXTENT:
+        raise InputError(
+            f"{name}: the mesh measures {extent:.0e} across, which is beyond what can be computed with: "
+            "choose another unit."
+        )
+
+
+def _check_resolution(mesh: Mesh) -> None:
+    """Refuse positions that floating-point numbers cannot tell from those of their neighbors."""
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    median = np.median(lengths[lengths > 0])
+    used = np.flatnonzero(mesh.used_vertices)
+    middle = np.median(mesh.vertices[used], axis=0)
+    for vertices, center, limit, place in (
+        (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
+        (used, middle, LARGEST_DISTANCE, "middle of the mesh"),
+    ):
+        distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
+        if distances.max() > limit:
+            raise InputError(
+                f"{mesh.name}: vertex {vertices[distances.argmax()]} (counted from 0) lies "
+                f"{distances.max():.0e} median edge lengths from the {place}, where numbers are too coarse "
+                "for its triangles: repair the position, or move the mesh to the origin."
+            )
+
+
 def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
-    """The vertices and faces of a mesh of any library, told by the names of its attributes."""
+    """The vertices and faces of a mesh of another library, recognized by its attributes."""
     if isinstance(mesh, tuple) and len(mesh) == 2:
         return mesh
     faces = getattr(mesh, "faces", None)
     if faces is not None and hasattr(mesh, "vertices"):
         return mesh.vertices, faces
-    if faces is not None and hasattr(mesh, "points"):  # each face after the number of its corners
+    if faces is not None and hasattr(mesh, "points"):  # each face is preceded by its number of corners
         table = np.asarray(faces)
         if table.ndim == 1:
             if len(table) % 4 or (table[::4] != 3).any():
-                raise InputError(f"{name}: not all its faces are triangles: triangulate it first.")
+                raise InputError(f"{name}: not all faces are triangles: triangulate the mesh first.")
             table = table.reshape(-1, 4)[:, 1:]
         return mesh.points, table
     if isinstance(mesh, str | os.PathLike):
-        raise InputError(f"{name}: {str(mesh)!r} is the name of a file: read it with jaxsmw.read_mesh first.")
+        raise InputError(f"{name}: {str(mesh)!r} is a file name: read the file with jaxsmw.read_mesh first.")
     raise InputError(
-        f"{name}: {type(mesh).__name__} is no triangle mesh, for it has no faces beside vertices: give "
-        "vertices and faces, or a mesh of trimesh, pyFM, geomfum or PyVista."
+        f"{name}: {type(mesh).__name__} is not a triangle mesh, because it lacks vertices or faces: give "
+        "both, or a mesh of trimesh, pyFM, geomfum or PyVista."
     )
 
 
 def to_host(values: Any) -> Any:
-    """What NumPy can make an array of, also from a PyTorch tensor on a device or with a gradient."""
+    """Values that NumPy can convert, even if they are a PyTorch tensor on a device or with a gradient."""
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 
 def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
-    """The values as a non-empty array (…, 3) of integers or floats."""
+    """The values as a non-empty array (number of values, 3) of integers or floats."""
     expected = f"{name}: {what} must be a numeric array of shape (number of {what}, 3)"
     try:
         array = np.asarray(to_host(values))
-        if array.dtype == object:  # integers too large for any integer type end here
+        if array.dtype == object:  # NumPy stores integers too large for any integer type as objects
             array = array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{expected}, and these cannot be made into one.") from None
+        raise InputError(f"{expected}, but these cannot be converted to one.") from None
     if array.size == 0:
         raise InputError(f"{name}: there are no {what}: a triangle mesh is needed.")
     if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
@@ -414,7 +472,7 @@ def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
 
 def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
     """The faces as valid indices of n vertices."""
-    # Compared before they are cast: a cast would wrap what int64 cannot hold.
+    # The comparison precedes the cast, which would wrap numbers too large for int64.
     outside = ~((faces >= 0) & (faces < n))
     if outside.any():
         at = int(outside.any(axis=1).argmax())
@@ -422,10 +480,10 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
         if faces.min() == 1 and faces.max() == n:
             cure = "the faces seem to count from 1, so subtract 1"
         raise InputError(
-            f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but counted from 0 the "
-            f"vertices are 0 to {n - 1}: {cure}."
+            f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but the vertices are 0 to "
+            f"{n - 1}: {cure}."
         )
-    # Filled, as a copy would keep the "long long" that libigl gives, which is another type of the same size.
+    # A copy would keep libigl's "long long", which is another type of the same size.
     triangles = np.empty(faces.shape, np.int64)
     triangles[...] = faces
     if (triangles != faces).any():
@@ -433,9 +491,9 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
     return triangles
 
 
-def lowest_twins(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """For each row of (n, 3) numbers the index of the first row that equals it."""
-    order = np.lexsort(rows.T)  # stable: among equals the first row comes first
+def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """For each row of numbers (n, 3), the index of the first equal row."""
+    order = np.lexsort(rows.T)  # a stable sort puts the first of equal rows first
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)
     starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)

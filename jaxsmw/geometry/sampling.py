@@ -1,4 +1,4 @@
-"""Evenly spread vertices."""
+"""Samples of a surface: evenly spread vertices."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarray, " s"]:
-    """Vertices chosen one by one, each the farthest from those before, in Euclidean distance.
+    """Choose vertices one by one, each as far as possible from all earlier ones, in Euclidean distance.
 
-    The first is the one farthest from the centroid, so that renumbering the vertices chooses the same
-    points (ties, which go to the lowest index, aside).
+    The first sample is the vertex farthest from the centroid, so the samples do not depend on the order of
+    the vertices. (Ties go to the lowest index.)
 
     **Arguments:**
 
-    - `mesh`: the surface; unused vertices are never chosen.
-    - `number_of_samples`: at least 1, at most the number of used vertices.
+    - `mesh`: the surface. Unreferenced vertices are never chosen.
+    - `number_of_samples`: s, from 1 to the number of referenced vertices.
 
-    **Raises:** `InputError` if that many cannot be chosen.
+    **Returns:** The samples (s,), in the order of choice.
+
+    **Raises:** `InputError` if the mesh has fewer referenced vertices.
     """
     used = np.flatnonzero(mesh.used_vertices)
     if not 1 <= number_of_samples <= len(used):
         raise InputError(
-            f"{mesh.name}: {number_of_samples} samples were asked for, but it has {len(used)} used vertices; "
-            f"ask for between 1 and {len(used)}."
+            f"{mesh.name}: cannot choose {number_of_samples} samples from {len(used)} referenced vertices: "
+            f"choose a number from 1 to {len(used)}."
         )
     positions = mesh.vertices[used]
     chosen = np.empty(number_of_samples, dtype=np.int64)
@@ -45,12 +47,12 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
 
 class Samples(NamedTuple):
-    """Vertices that stand for a surface.
+    """Samples that represent a surface.
 
     **Attributes:**
 
-    - `vertices`: (s,), ascending.
-    - `nearest`: (n,), for every vertex of the mesh the position in `vertices` of the nearest sample.
+    - `vertices`: the sampled vertices (s,), ascending.
+    - `nearest`: for every vertex of the mesh (n,), the position of the nearest sample in `vertices`.
     """
 
     vertices: Int64[np.ndarray, " s"]
@@ -58,22 +60,24 @@ class Samples(NamedTuple):
 
 
 def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
-    """About so many vertices, spread evenly over the area however dense the mesh is where.
+    """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    As many as fit no two of which are nearer to each other, in space, than a distance that follows from the
-    area (Poisson-disk sampling); much faster than `farthest_point_samples` when they are many. Two sheets
-    nearer to each other than that share their samples.
+    This is Poisson-disk sampling: no two samples are closer in space than a distance derived from the area,
+    and no sample can be added. It is much faster than `farthest_point_samples` for many samples. Two sheets
+    of surface that are closer than this distance share their samples.
 
     **Arguments:**
 
-    - `mesh`: the surface; unused vertices are never chosen.
-    - `number_of_samples`: near the outcome where the mesh is finer than the samples; there are fewer where
-      vertices are farther apart than they would be.
+    - `mesh`: the surface with n vertices. Unreferenced vertices are never chosen.
+    - `number_of_samples`: the approximate number of samples. There are fewer where the mesh is coarser than
+      the samples.
+
+    **Returns:** The samples, and the nearest sample of each vertex.
     """
     candidates = np.flatnonzero(mesh.used_vertices)
-    # A set to which nothing can be added has about 0.7 area / distance² members on a surface.
+    # A maximal set of samples at this distance has about 0.7 area / distance² members on a surface.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
-    # One in each box is enough to choose from; that of the lowest number, in a grid from the centroid on.
+    # The candidates are thinned to one vertex, the lowest-numbered, per box of a grid around the centroid.
     positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)
     boxes = np.floor(positions[candidates] / (distance / 3)).astype(np.int64)
     _, first = np.unique(boxes, axis=0, return_index=True)
@@ -81,16 +85,19 @@ def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     tree = KDTree(positions[candidates])
     pairs = tree.sparse_distance_matrix(tree, distance, output_type="coo_matrix")
     near = sp.csr_matrix((np.ones(pairs.nnz, bool), (pairs.row, pairs.col)), pairs.shape)
-    vertices = candidates[independent_vertices(near, 1)]
+    vertices = candidates[maximal_independent_set(near, 1)]
     _, nearest = KDTree(positions[vertices]).query(positions)
     return Samples(vertices, nearest)
 
 
 @lru_cache(maxsize=2)
 def spread_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
-    """Pairs of neighbours not too near to each other; and which vertex of these each is nearest to.
+    """The edges of a coarse graph of the surface.
 
-    The edges of the mesh, or if it has more than 15 000 vertices those between 5000 evenly spread ones.
+    These are the edges of the mesh or, if it has more than 15 000 vertices, the edges between 5000 evenly
+    spread samples. Samples are connected if an edge of the mesh connects vertices nearest to them.
+
+    **Returns:** The edges (e, 2), as pairs of vertices of the mesh, and the node nearest to each vertex (n,).
     """
     n = len(mesh.vertices)
     if n <= _DENSE:
@@ -100,25 +107,27 @@ def spread_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
 
 
-# Between neighbours that are much nearer to each other than maps are accurate, every map is rough.
+# Between vertices much closer together than the accuracy of maps, every map looks discontinuous.
 _DENSE, _SPREAD = 15_000, 5000
 
 
-def independent_vertices(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
-    """Vertices of a graph more than a number of edges apart, as many as fit, ascending.
+def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
+    """A maximal set of vertices of a graph that are more than `radius` edges apart.
 
     Luby, "A simple parallel algorithm for the maximal independent set problem", SIAM J. Comput. 1986, with a
     fixed seed.
 
     **Arguments:**
 
-    - `graph`: (n, n), symmetric; every row has its diagonal.
+    - `graph`: (n, n), symmetric, with a stored diagonal.
     - `radius`: the number of edges, at least 1.
+
+    **Returns:** The vertices (s,), ascending.
     """
     n = graph.shape[0]
     rank = np.random.default_rng(0).permutation(n)
     undecided, chosen = np.ones(n, bool), np.zeros(n, bool)
-    # What is gathered around a vertex includes the vertex, by its diagonal.
+    # Because of the diagonal, a vertex is among its own neighbors.
     around, start = graph.indices, graph.indptr[:-1]
     while undecided.any():
         highest = np.where(undecided, rank, -1)

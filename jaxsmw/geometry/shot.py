@@ -1,4 +1,4 @@
-"""SHOT descriptors: histograms of normals in a local frame, telling left from right."""
+"""SHOT descriptors: histograms of normals in a local frame, which distinguish left from right."""
 
 from __future__ import annotations
 
@@ -14,47 +14,48 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import Samples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` counts on the twos
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` relies on the twos
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
-# Vertex–neighbour pairs handled at once, at about 300 bytes per pair: few enough for their histograms to stay
-# in the cache.
+# Pairs of a vertex and a neighbor per block, at about 300 bytes per pair: few enough for the histograms to
+# stay in the processor's cache.
 _PAIRS_PER_BLOCK = 30_000
 
 
 def shot_descriptors(
     mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: Samples | None = None
 ) -> Float32[np.ndarray, "n 352"]:
-    """Signatures of histograms of orientations, one per vertex.
+    """Compute signatures of histograms of orientations (SHOT), one per vertex.
 
     Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
-    CVIU 2014: a local reference frame from the weighted scatter of the neighbours, its signs set by their
-    majority; around it 8 sectors of azimuth, 2 of elevation and 2 of distance, in each a histogram of 11
-    bins of the cosine between a neighbour's normal and the frame's z axis; soft binning in all four; unit
-    length. Neighbours are vertices, each counting the same.
+    CVIU 2014. The weighted scatter of the neighbors gives a local reference frame, and the majority of the
+    neighbors gives its signs. The frame divides the neighborhood into 8 sectors of azimuth, 2 of elevation
+    and 2 of distance. Each sector has a histogram, with 11 bins, of the cosine between a neighbor's normal
+    and the z axis of the frame. Binning is soft in all four directions, and descriptors have unit length.
+    All vertices within the radius are neighbors, with equal weights in the histograms.
 
-    Invariant to rotation, translation and scale, but not to reflection, so that it tells left from right.
-    Renumbering vertices renumbers descriptors. Normals are turned outwards first (by the sign of the
-    enclosed volume), so that an inside-out mesh gives the same. Results are kept on disk
+    Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
+    left from right. Renumbering vertices renumbers descriptors. Normals are first turned outward, by the
+    sign of the enclosed volume, so an inside-out mesh has the same descriptors. Results are cached on disk
     (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
-    - `mesh`: the surface, n vertices, consistently oriented.
-    - `radius`: of the neighbourhood, as a fraction of the square root of the area.
-    - `samples`: vertices that stand for all others (`jaxsmw.geometry.sampling`), each with the mean normal of
-      those it is nearest to: only they count as neighbours, and only they get descriptors. Otherwise the time
-      grows with the square of the number of vertices.
+    - `mesh`: the surface with n vertices, consistently oriented.
+    - `radius`: the radius of the neighborhood, as a fraction of the square root of the area.
+    - `samples`: if given, only the samples count as neighbors and get descriptors
+      (`jaxsmw.geometry.sampling`). Each sample has the mean normal of the vertices nearest to it. Without
+      samples, the time grows with the square of the number of vertices.
 
-    **Returns:** One row per vertex, or per sample. It is zero for unused vertices and where there are fewer
-    than 3 neighbours; a warning says when there are many.
+    **Returns:** One row per vertex, or per sample. The row is zero for unreferenced vertices and for vertices
+    with fewer than 3 neighbors; a warning is given if more than 1 % of the vertices have so few.
 
-    **Raises:** `InputError` if the radius is not positive, or holds too few neighbours for most vertices.
+    **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbors.
     """
     if not radius > 0:
-        raise InputError(f"the SHOT radius is {radius}, but it must be positive; 0.06 is the usual choice.")
+        raise InputError(f"the SHOT radius is {radius}, but must be positive: the usual choice is 0.06.")
 
     def compute() -> dict[str, np.ndarray]:
         if samples is None:
@@ -76,12 +77,12 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        # Seven digits are more than anything in them means.
+        # Descriptors are less precise than the seven digits of float32.
         descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            # Vertices at the same place have no direction to each other.
+            # Two vertices at the same position have no direction between them.
             apart = pairs["v"] > 0
             center, neighbor, distance = (pairs[column][apart] for column in "ijv")
             descriptors[rows[block]] = _describe(
@@ -98,9 +99,9 @@ def shot_descriptors(
 
 def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
-        f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} others within "
-        f"the SHOT radius of {radius:.3g} sqrt(area), as the mesh is coarse there; use a finer mesh or do "
-        "without SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
+        f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbors within the "
+        f"SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh, or no "
+        "SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
     )
 
 
@@ -113,20 +114,29 @@ def _describe(
     distance: Float64[np.ndarray, " p"],
     radius: float,
 ) -> Float64[np.ndarray, "b 352"]:
-    """The descriptors of a block of vertices, from pairs (position in the block, vertex, distance)."""
+    """The descriptors of a block of vertices.
+
+    **Arguments:**
+
+    - `positions`, `normals`: of all vertices, in square roots of the area.
+    - `block`: the vertices to describe.
+    - `center`, `neighbor`, `distance`: pairs of a position in the block and a vertex, and their distances.
+    - `radius`: the radius of the neighborhood.
+    """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
     frames = _local_frames(offsets, center, radius - distance, len(block)).take(center, axis=0)
     x, y, z = np.einsum("pad,pd->ap", frames, offsets)
     cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
 
-    # Coordinates in units of bins, with the centre of bin b at b.
+    # Coordinates in units of bins, with the center of bin b at b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
     elevation = np.arcsin(np.clip(z / distance, -1, 1)) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
-    # A pair has two bins in each direction. Of elevation and distance there are no more, and every pair has
-    # weights in all of them; azimuth and cosine say to which rows of the histogram these are added.
+    # A pair contributes to two bins in each direction. Elevation and distance have only two bins, so every
+    # pair has weights for all four combinations. Azimuth and cosine select the rows of the histogram for
+    # these weights.
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
     shares = np.empty((len(center), _ELEVATION * _RADIAL))
     for low, of_elevation in enumerate((1 - upper, upper)):
@@ -137,7 +147,7 @@ def _describe(
     for sector, sector_weight in _two_nearest(azimuth):
         start = first + sector % _AZIMUTH * _COSINE
         for level, level_weight in _two_nearest(bin_of_cosine):
-            rows = start + np.clip(level, 0, _COSINE - 1)  # beyond the last bin the weight is zero
+            rows = start + np.clip(level, 0, _COSINE - 1)  # beyond the last bin, the weight is zero
             weights = sector_weight * level_weight
             histogram += sp.csc_array((weights, rows, each), (len(histogram), len(center))) @ shares
     shape = len(block), _AZIMUTH, _COSINE, _ELEVATION * _RADIAL
@@ -153,7 +163,7 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """One right-handed frame per centre, rows x, y, z: x along the largest scatter, z along the least."""
+    """One right-handed frame per center: rows x, y, z, with x along the largest scatter, z along the least."""
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
         for column in range(row, 3):
@@ -164,7 +174,7 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Regular meshes do have ties, and the sign that `eigh` happens to give must not decide them.
+        # Regular meshes have ties, which must not be decided by the arbitrary signs of `eigh`.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

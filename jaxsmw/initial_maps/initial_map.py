@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import InitialMap
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
 from jaxsmw.errors import InputError
@@ -19,7 +20,6 @@ from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.initial_maps.signatures import SIGNATURES, signature_features
 from jaxsmw.pair import Pair
 
-InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional"]
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
 """The initial maps that have a name."""
 

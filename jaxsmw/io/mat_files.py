@@ -1,9 +1,9 @@
-"""MATLAB's `.mat` files: variables in and out, and which of them is meant.
+"""Variables of MATLAB's `.mat` files.
 
-What the field's MATLAB code calls things: `T12`, the pointwise map from shape 1 to shape 2, counted from 1;
-`C21`, the functional map that takes functions on shape 2 to functions on shape 1; a shape is a struct with
-`surface` (`X`, `Y`, `Z`, `TRIV`), `evals`, `evecs` and the areas `A`. Our X is shape 1 and our Y shape 2, so
-`T12` is T and `C21` is C.
+MATLAB code for functional maps uses these names: `T12` is the pointwise map from shape 1 to shape 2, counted
+from 1. `C21` is the functional map that takes functions on shape 2 to functions on shape 1. A shape is a
+struct with the fields `surface` (`X`, `Y`, `Z`, `TRIV`), `evals`, `evecs` and the areas `A`. Our X is shape
+1 and our Y is shape 2, so `T12` is T and `C21` is C.
 """
 
 from __future__ import annotations
@@ -20,45 +20,47 @@ from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.io.mat_format import unpacked
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
 
 
 def is_mat_file(path: str | os.PathLike[str]) -> bool:
-    """Whether the name says that it is one."""
+    """Whether a name has the suffix `.mat`."""
     return Path(path).suffix.lower() == ".mat"
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
-    """The variables of a file, structs as dictionaries, axes of length 1 left out.
+    """The variables of a `.mat` file. Structs become dictionaries, and axes of length 1 are dropped.
 
-    **Raises:** `InputError`, without the file's name, if it is none, damaged, or in format 7.3.
+    **Arguments:**
+
+    - `data`: the contents of the file.
+
+    **Returns:** The variables by name.
+
+    **Raises:** `InputError`, without the name of the file, if the contents are damaged, too large for the
+    memory (`jaxsmw.io.mat_format`), or in format 7.3.
     """
-    if data.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise InputError("is in MATLAB's format 7.3, which is not read: save it there with save(..., '-v7').")
     try:
-        # SciPy answers damaged files with whatever goes wrong first.
-        variables = scipy.io.loadmat(io.BytesIO(data), simplify_cells=True)
-    except Exception:
+        variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
+    except InputError:
+        raise
+    except Exception:  # SciPy answers damaged files with whatever goes wrong first
         raise InputError(
-            "is damaged or no file of MATLAB's: save it again, with save(..., '-v7') there or "
-            "scipy.io.savemat here."
+            "is damaged or not a .mat file: save it again, with save(..., '-v7') in MATLAB or "
+            "scipy.io.savemat in Python."
         ) from None
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
 def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """`parse_variables` of a file.
+    """Read a file with `parse_variables`.
 
     **Raises:** `InputError` that names the file.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}): check the path and its permissions."
-        ) from error
+    data = read_bytes(path, largest=None)
     try:
         return parse_variables(data)
     except InputError as error:
@@ -66,7 +68,15 @@ def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mapping[str, Any]]:
-    """All structs with some fields, by name: the file itself (`""`), its variables, what is in those."""
+    """Find all structs that have certain fields.
+
+    **Arguments:**
+
+    - `variables`: the variables of a file. The file itself counts as a struct with an empty name.
+    - `fields`: the names of the fields.
+
+    **Returns:** The structs, nested ones included, by name, such as `S.surface`.
+    """
     found: dict[str, Mapping[str, Any]] = {}
     pending: list[tuple[str, Mapping[str, Any]]] = [("", variables)]
     while pending:
@@ -82,18 +92,23 @@ def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mappin
 def read_matrix(
     path: str | os.PathLike[str], name: str, *, columns: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
-    """The one matrix of real numbers that a file holds, or of several the one with a given name.
+    """Read a matrix of real numbers.
 
-    A row is read as a column, since MATLAB does not care which a list is.
+    A file with a single matrix is read whatever the name of the matrix is. A single row is read as a column,
+    because lists in MATLAB may be either.
 
     **Arguments:**
 
-    - `columns`: how many it must have. Others do not count, and one of them is a list.
+    - `path`: the file.
+    - `name`: the name of the matrix, if the file holds more than one.
+    - `columns`: the number of columns; matrices with another number are ignored. 1 stands for a list.
 
-    **Raises:** `InputError` that names the file and what it holds instead.
+    **Returns:** The matrix as float64 (rows, columns).
+
+    **Raises:** `InputError` that names the file and lists its variables if there is no such matrix.
     """
     variables = read_variables(path)
-    matrices = {key: value for key, value in variables.items() if _is_real(value)}
+    matrices = {key: value for key, value in variables.items() if is_real(value)}
     if columns == 1:
         matrices = {key: value for key, value in matrices.items() if value.ndim == 1}
     elif columns is not None:
@@ -105,16 +120,17 @@ def read_matrix(
         (chosen,) = matrices.values()
     elif matrices:
         raise InputError(
-            f"{path}: holds more than one {what}, {', '.join(matrices)}: call the one that is meant {name}."
+            f"{path}: holds more than one {what}, {', '.join(matrices)}: save the right one as {name}."
         )
     else:
         held = f"holds {', '.join(map(ascii, variables))}" if variables else "is empty"
-        raise InputError(f"{path}: {held}, and no {what}: save the one that is meant as {name}.")
+        raise InputError(f"{path}: {held}, but no {what}: save one as {name}.")
     matrix = chosen.astype(np.float64)
     return matrix[:, None] if matrix.ndim == 1 else matrix
 
 
-def _is_real(value: Any) -> bool:
+def is_real(value: Any) -> bool:
+    """Whether a variable is a list or a matrix of real numbers."""
     return (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "iuf"
@@ -124,15 +140,14 @@ def _is_real(value: Any) -> bool:
 
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
-    """Write variables as MATLAB reads them: lists as columns, numbers as doubles; never half of it.
+    """Write variables for MATLAB, lists as columns. The file appears whole or not at all.
 
-    **Raises:** `InputError` if the file cannot be written.
+    **Raises:** `InputError` if a variable is too large for the format, or the file cannot be written.
     """
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         try:
             scipy.io.savemat(file, dict(variables), do_compression=True, oned_as="column")
         except MatWriteError:
             raise InputError(
-                f"{path}: what should be written is larger than a .mat file can be (4 GiB): write fewer "
-                "eigenvectors."
+                f"{path}: a variable is larger than a .mat file can hold (4 GiB): write fewer eigenvectors."
             ) from None

@@ -1,8 +1,8 @@
-"""Meshes in and out of files.
+"""Mesh files: OFF, OBJ, PLY, STL and MAT.
 
-Files are read by code of our own because vertex i must stay vertex i and a lying file must end in one
-sentence: libigl's reader lets indices out of range through and aborts the process on some bad headers;
-trimesh splits and drops vertices of OBJ files and cannot read polygons of mixed size from binary PLY files.
+We read files with our own code, because vertex i must stay vertex i and a damaged file must end in one
+sentence. libigl's reader accepts indices out of range and aborts the process on some bad headers. trimesh
+splits and drops vertices of OBJ files, and cannot read polygons of mixed size from binary PLY files.
 """
 
 from __future__ import annotations
@@ -19,56 +19,46 @@ from jaxtyping import Float64, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, count_of, lowest_twins, make_mesh
-from jaxsmw.io.mat_files import find_structs, parse_variables
-from jaxsmw.runtime.files import atomic_write
-
-# Reading takes up to fifteen times a file's size in memory; text of this size has ten million vertices.
-LARGEST_FILE = 2**30
+from jaxsmw.geometry.mesh import Mesh, count_of, first_equal_rows, make_mesh
+from jaxsmw.io.mat_files import find_structs, is_real, parse_variables
+from jaxsmw.io.text import is_number
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     """Read a triangle mesh from an OFF, OBJ, PLY, STL or MAT file.
 
-    Vertex i is the i-th vertex of the file. STL files know no vertices, only corners: those at exactly the
-    same position become one vertex, numbered by first appearance. Faces with more than three corners are
-    split into fans of triangles. Colours, normals and texture coordinates are passed over.
+    Vertex i of the mesh is the i-th vertex of the file. An STL file has no vertices, only corners of
+    triangles: corners at exactly the same position become one vertex, and vertices are numbered in the order
+    of the file. Faces with more than three corners are split into fans of triangles. Colors, normals and
+    texture coordinates are ignored.
 
     **Arguments:**
 
-    - `path`: the file; its suffix, in either case, tells the format. OFF: text, also with colours or normals
+    - `path`: the file. The suffix, in either case, tells the format. OFF: text, also with colors or normals
         (COFF, NOFF). OBJ: `v` and `f` lines. PLY: text and binary, either byte order. STL: text and binary.
-        MAT: a struct `surface` with X, Y, Z (or VERT) and TRIV, counted from 1, as TOSCA comes, or a shape of
-        which it is a field, as `write_spectrum` writes.
-    - `weld`: as in `make_mesh`.
+        MAT: a struct `surface` with X, Y, Z (or VERT) and TRIV, counted from 1, as in the TOSCA data set. The
+        struct may be a field of another struct, as in the files of `write_spectrum`.
+    - `weld`: as in `make_mesh`. Welding changes nothing in an STL file, because its corners are merged
+      already.
 
     **Returns:**
 
-    A `Mesh` called by its path; `notes` tell what was mended and noticed.
+    A `Mesh` named by its path. Its `notes` list repairs and peculiarities.
 
     **Raises:**
 
-    `InputError` when the file cannot be read, is not what its suffix says, ends early or goes on after its
-    end, or when `make_mesh` refuses what is in it.
+    `InputError` if the file cannot be read, does not match its suffix, ends early or continues after its
+    end, or if `make_mesh` refuses the mesh.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            fault = "is not a regular file" if path.exists() else "does not exist"
-            raise InputError(f"{path}: {fault}: give the path of a mesh file.")
-        parse = _PARSERS.get(path.suffix.lower())
-        if parse is None:
-            raise InputError(
-                f"{path}: the suffix {path.suffix!r} is not that of a known mesh format: convert the mesh to "
-                f"one of {', '.join(_PARSERS)}."
-            )
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path}: is larger than {LARGEST_FILE >> 30} GiB: decimate the mesh first.")
-        data = path.read_bytes()
-    except OSError as error:
+    data = read_bytes(path)
+    parse = _PARSERS.get(path.suffix.lower())
+    if parse is None:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}): check the path and its permissions."
-        ) from error
+            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the mesh to "
+            f"one of {', '.join(_PARSERS)}."
+        )
     try:
         polygons = parse(data)
         faces = _fans(polygons.corners, polygons.sizes)
@@ -82,7 +72,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
 
 class _Polygons(NamedTuple):
-    """What a parser finds: positions, all faces' corners in a row, and how many belong to each face."""
+    """The polygons of a file: positions, the corners of all faces in one list, and the size of each face."""
 
     vertices: Float64[np.ndarray, "n 3"]
     corners: np.ndarray
@@ -94,7 +84,9 @@ def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
     """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1); (t, 3)."""
     if (sizes < 3).any():
         at = int((sizes < 3).argmax())
-        raise InputError(f"face {at} has {count_of(int(sizes[at]), 'corner')}, three are needed: remove it.")
+        raise InputError(
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs three: remove the face."
+        )
     per_face = sizes - 2
     apex = np.repeat(np.cumsum(sizes) - sizes, per_face)
     step = np.arange(len(apex)) - np.repeat(np.cumsum(per_face) - per_face, per_face)
@@ -102,37 +94,35 @@ def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
 
 
 def _text(data: bytes) -> str:
-    """Text without comments whose lines end in a newline, whatever they ended in."""
-    # Latin-1 never fails; only ASCII means anything to a parser.
+    """Text without comments, with a newline at the end of each line on all systems."""
+    # Latin-1 decodes all bytes, and the parsers only look for ASCII.
     text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
     return re.sub("#[^\n]*", "", text) if "#" in text else text
 
 
 def _numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines columns"]:
-    """The first so many numbers of each line."""
+    """The numbers in the first columns of each line."""
     if not lines:
         return np.empty((0, columns))
     try:
-        if "" in lines:  # which loadtxt would skip
+        if "" in lines:  # loadtxt would skip an empty line
             raise ValueError
         return np.loadtxt(lines, usecols=range(columns), comments=None, ndmin=2)
     except ValueError:
         culprit = next((line for line in lines if not _starts_with_numbers(line, columns)), lines[0])
         raise InputError(
             f"{_excerpt(culprit)} stands where {count_of(columns, 'number')} should be: "
-            "the file is damaged or its header is wrong, export it again."
+            "the file is damaged or its header is wrong, export the mesh again."
         ) from None
 
 
 def _starts_with_numbers(line: str, columns: int) -> bool:
-    try:
-        return len([float(word) for word in line.split()[:columns]]) == columns
-    except ValueError:
-        return False
+    words = line.split()[:columns]
+    return len(words) == columns and all(is_number(word, finite=False) for word in words)
 
 
 def _excerpt(line: str) -> str:
-    """A piece of a file as a message may quote it."""
+    """The beginning of a line, escaped for a message."""
     return ascii(" ".join(line.split())[:40])
 
 
@@ -143,8 +133,8 @@ def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], I
     possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
     if not possible.all():
         raise InputError(
-            f"{_excerpt(lines[int(possible.argmin())])} stands where a face should be, its number of corners "
-            "first: the file is damaged or its header is wrong, export it again."
+            f"{_excerpt(lines[int(possible.argmin())])} stands where a face should be, with its number of "
+            "corners first: the file is damaged or its header is wrong, export the mesh again."
         )
     sizes = sizes.astype(np.int64)
     starts = np.cumsum(sizes) - sizes
@@ -157,45 +147,45 @@ def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], I
 
 
 def _parse_off(data: bytes) -> _Polygons:
-    """Object File Format: http://www.geomview.org/docs/html/OFF.html, of which text in three dimensions."""
+    """Object File Format, text, in three dimensions: http://www.geomview.org/docs/html/OFF.html."""
     lines = [line for line in _text(data).split("\n") if line and not line.isspace()]
-    # Some programs write the counts right behind the keyword, even without a space.
+    # Some programs write the counts on the line of the keyword, even without a space.
     keyword = re.match(r"\s*(?:ST)?C?N?OFF\s*(.*)", lines[0]) if lines else None
     if keyword is None:
-        raise InputError("does not begin with OFF, COFF or NOFF: this is no OFF file, export it again.")
+        raise InputError("does not begin with OFF, COFF or NOFF: export the mesh again as an OFF file.")
     if keyword[1].startswith("BINARY"):
-        raise InputError("is a binary OFF file: save it as text, or as binary PLY.")
+        raise InputError("is a binary OFF file: save the mesh as text, or as binary PLY.")
     lines = ([keyword[1]] if keyword[1] else []) + lines[1:]
     counts = re.match(r"\s*(\d{1,18})\s+(\d{1,18})(\s|$)", lines[0]) if lines else None
     if counts is None:
-        raise InputError("OFF is not followed by the numbers of vertices and faces: export it again.")
+        raise InputError("lacks the numbers of vertices and faces after OFF: export the mesh again.")
     n, f = int(counts[1]), int(counts[2])
     lines = lines[1:]
     if len(lines) != n + f:
         raise InputError(
             f"the header promises {n} vertices and {f} faces, but {count_of(len(lines), 'line')} follow: "
-            "the file is truncated or its header is wrong, export it again."
+            "the file is truncated or its header is wrong, export the mesh again."
         )
     return _Polygons(_numbers(lines[:n], 3), *_polygon_lines(lines[n:]))
 
 
 def _parse_obj(data: bytes) -> _Polygons:
-    """Wavefront OBJ: the `v` and `f` statements; all groups and objects are one mesh."""
+    """Wavefront OBJ: the `v` and `f` statements. All groups and objects become one mesh."""
     text = re.sub(r"\\\n+", " ", _text(data)) if b"\\" in data else _text(data)
     vertex, face = (re.compile(rf"^[^\S\n]*{keyword}(?!\S)[^\S\n]*(.*)$", re.MULTILINE) for keyword in "vf")
     vertices = _numbers(vertex.findall(text), 3)
     if not len(vertices):
-        raise InputError("has no line that begins with v: this is no OBJ file, export it again.")
+        raise InputError("has no line that begins with v: export the mesh again as an OBJ file.")
     lines = face.findall(text)
     ends_in_face = bool(lines) and not text.endswith("\n") and text.endswith(lines[-1])
     if any("/" in line for line in lines):  # texture and normal indices: corner/texture/normal
         lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
     corners, sizes = _polygon_lines([f"{len(line.split())} {line}" for line in lines])
     if ends_in_face and sizes[-1] < 3:
-        raise InputError("ends in the middle of a face: the file is truncated, export it again.")
+        raise InputError("ends in the middle of a face: the file is truncated, export the mesh again.")
     if (corners == 0).any():
-        raise InputError("a face uses vertex 0, but OBJ files count from 1: export it again.")
-    if (corners < 0).any():  # counted back from the vertices above the face
+        raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
+    if (corners < 0).any():  # negative indices count backward from the last vertex above the face
         vertex_at = [match.start() for match in vertex.finditer(text)]
         face_at = [match.start() for match in face.finditer(text)]
         above = np.repeat(np.searchsorted(vertex_at, face_at), sizes)
@@ -207,10 +197,10 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 
 
 def _parse_stl(data: bytes) -> _Polygons:
-    """Stereolithography: triangles without vertices, https://www.fabbers.com/tech/STL_Format."""
+    """Stereolithography, a list of triangles without shared vertices: https://www.fabbers.com/tech/STL_Format."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
-    # Binary files may begin with "solid" too, so their length decides.
+    # Binary files may begin with "solid", too, so the length decides.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
         corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
@@ -222,18 +212,18 @@ def _parse_stl(data: bytes) -> _Polygons:
         if len(corners) != 3 * facets or "endsolid" not in text:
             raise InputError(
                 f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in all "
-                "are not triangles: the file is truncated or damaged, export it again."
+                "are not triangles: the file is truncated or damaged, export the mesh again."
             )
     elif len(data) >= header:
         raise InputError(
             f"the header promises {count} triangles, which does not fit the file's {len(data)} bytes: "
-            "it is truncated or no STL file, export it again."
+            "the file is truncated or not in the STL format, export the mesh again."
         )
     else:
-        raise InputError("is neither a text nor a binary STL file: export it again.")
-    appearance, faces = np.unique(lowest_twins(corners), return_inverse=True)
+        raise InputError("is neither a text nor a binary STL file: export the mesh again.")
+    appearance, faces = np.unique(first_equal_rows(corners), return_inverse=True)
     note = (
-        "STL files do not number vertices: corners at the same position were merged into "
+        "STL files have no shared vertices: corners at the same position were merged into "
         f"{count_of(len(appearance), 'vertex')}, numbered by first appearance."
     )
     return _Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), (note,))
@@ -248,14 +238,14 @@ _PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endia
 
 
 class _Property(NamedTuple):
-    """A number in every row of a PLY table or, where `length` is the type of one, a list of so many."""
+    """A property of a PLY element: one number per row, or a list whose length has the type `length`."""
 
     type: np.dtype
     length: np.dtype | None
 
 
 class _Column(NamedTuple):
-    """All numbers of one property, and how many belong to each row."""
+    """All numbers of one property, and the number of them in each row."""
 
     values: np.ndarray
     sizes: np.ndarray
@@ -265,20 +255,25 @@ def _parse_ply(data: bytes) -> _Polygons:
     """Polygon File Format, text and binary: https://paulbourke.net/dataformats/ply/."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
-        raise InputError("does not begin with ply: this is no PLY file, export it again.")
+        raise InputError("does not begin with ply: export the mesh again as a PLY file.")
     newline = first[1]
     last = re.search(newline + rb"end_header[ \t]*" + newline, data)
     if last is None:
-        raise InputError("the header has no end: the file is truncated or damaged, export it again.")
+        raise InputError("the header has no end: the file is truncated or damaged, export the mesh again.")
     header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
     encoding, elements = _ply_header(header)
     body = data[last.end() :]
     if encoding == "ascii":
-        # Text becomes a binary body in which every number is a float64.
+        # The text becomes a binary body in which every number is a float64.
+        words = body.split()
         try:
-            body = np.array(body.split(), dtype=np.float64).tobytes()
+            if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
+                raise ValueError
+            body = np.array(words, dtype=np.float64).tobytes()
         except ValueError:
-            raise InputError("has a word where a number should be: export it again.") from None
+            texts = (word.decode("latin-1") for word in words)
+            culprit = _excerpt(next(text for text in texts if not is_number(text, finite=False)))
+            raise InputError(f"{culprit} stands where a number should be: export the mesh again.") from None
 
     tables, offset = {}, 0
     for name, (count, properties) in elements.items():
@@ -287,15 +282,15 @@ def _parse_ply(data: bytes) -> _Polygons:
         except EOFError:
             raise InputError(
                 f"the header promises {count} rows of {_excerpt(name)}, but the file ends within them: "
-                "it is truncated or its header is wrong, export it again."
+                "the file is truncated or its header is wrong, export the mesh again."
             ) from None
     if body[offset:].strip():
-        raise InputError("goes on after what its header promises: the header is wrong, export it again.")
+        raise InputError("goes on after the last promised row: the header is wrong, export the mesh again.")
 
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
     if len(position) < 3:
-        raise InputError("has no x, y and z for its vertices: export it again.")
+        raise InputError("has no x, y and z for its vertices: export the mesh again.")
     corners = face.get("vertex_indices", face.get("vertex_index"))
     if corners is None:
         raise InputError("has no faces with vertex_indices: a triangle mesh is needed.")
@@ -303,13 +298,14 @@ def _parse_ply(data: bytes) -> _Polygons:
 
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
-    """The encoding, and for each element the number of rows and the properties."""
-    formats = [line.split()[1] for line in lines if re.match(r"format\s+\S", line)]
-    if len(formats) != 1 or formats[0] not in _PLY_BYTE_ORDERS:
+    """The encoding, and the number of rows and the properties of each element."""
+    formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
+    if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
         raise InputError(
-            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)}: export it again."
+            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)} in version 1.0: "
+            "export the mesh again."
         )
-    encoding = formats[0]
+    encoding = formats[0][0]
 
     def number(name: str) -> np.dtype:
         return np.dtype(np.float64 if encoding == "ascii" else _PLY_BYTE_ORDERS[encoding] + _PLY_TYPES[name])
@@ -336,7 +332,7 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
                 properties[name] = _Property(number(kind), None)
             case _:
                 raise InputError(
-                    f"the header has a line {_excerpt(line)} that makes no sense: export it again."
+                    f"the header has a line {_excerpt(line)} that makes no sense: export the mesh again."
                 )
     return encoding, elements
 
@@ -344,14 +340,17 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
 def _ply_table(
     body: bytes, offset: int, count: int, properties: dict[str, _Property]
 ) -> tuple[dict[str, _Column], int]:
-    """The columns of the table that begins at `offset`, and where it ends; `EOFError` when the body does."""
+    """The columns of the table that begins at `offset`, and the end of the table.
+
+    **Raises:** `EOFError` if the body ends early.
+    """
     shortest = sum((p.length or p.type).itemsize for p in properties.values())
     if count * shortest > len(body) - offset:
         raise EOFError
     if not count or not properties:
         return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
 
-    # Nearly always all lists of a property have the same length: then the table is one array of records.
+    # If all lists of a property have the same length, as in most files, the table is one array of records.
     spans, _ = _ply_row(body, offset, properties)
     sizes = {name: size for name, (_, size) in zip(properties, spans, strict=True)}
     lengths = {name: f"length of {name}" for name, (_, length) in properties.items() if length}
@@ -380,7 +379,7 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """Where the numbers of each property of a row start and how many they are; where the row ends."""
+    """The start and the number of each property's values in a row, and the end of the row."""
     spans = []
     for kind, length in properties.values():
         size = 1
@@ -391,7 +390,8 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
             written = np.frombuffer(body, length, 1, start)[0]
             if not 0 <= written <= len(body) or written % 1:
                 raise InputError(
-                    f"a list claims to have {written:.15g} numbers: the file is damaged, export it again."
+                    f"a list claims to have {written:.15g} numbers: the file is damaged, export the mesh "
+                    "again."
                 )
             size = int(written)
         spans.append((offset, size))
@@ -402,24 +402,30 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
 
 
 def _parse_mat(data: bytes) -> _Polygons:
-    """MATLAB's format: a struct with faces TRIV and columns X, Y, Z (or a matrix VERT), at any depth."""
+    """MATLAB's format: a struct, at any depth, with faces TRIV and columns X, Y, Z (or a matrix VERT)."""
     structs = find_structs(parse_variables(data), "TRIV")
     if len(structs) > 1:
         raise InputError(
-            f"holds {len(structs)} shapes, {', '.join(structs)}: save each in a file of its own."
+            f"holds {len(structs)} shapes, {', '.join(structs)}: save each shape in a separate file."
         )
-    try:
-        (surface,) = structs.values()
-        columns = [surface[axis] for axis in "XYZ"] if "X" in surface else surface["VERT"].T
-        vertices = np.stack(list(columns), axis=-1).astype(np.float64)
+    name, surface = next(iter(structs.items()), ("", {}))
+    columns = ("X", "Y", "Z") if "X" in surface else ("VERT",)
+    given = [field for field in ("TRIV", *columns) if field in surface]
+    for field in given:
+        if not is_real(surface[field]):  # a conversion to float64 would drop imaginary parts
+            raise InputError(
+                f"{f'{name}.{field}'.lstrip('.')} is not an array of real numbers: save real coordinates and "
+                "vertex indices."
+            )
+    vertices = faces = np.empty(0)
+    if len(given) == 1 + len(columns) and len({len(surface[field]) for field in columns}) == 1:
+        vertices = np.column_stack([surface[field] for field in columns]).astype(np.float64)
         faces = surface["TRIV"].astype(np.float64)
-        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-            raise ValueError
-    except (ValueError, KeyError, TypeError, AttributeError):
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(
-            "holds no struct 'surface' with X, Y, Z (or VERT) and TRIV, as the TOSCA shapes do: save it so, "
-            "or export the mesh as OFF or PLY."
-        ) from None
+            "holds no struct 'surface' with X, Y, Z (or VERT) and TRIV, as the TOSCA shapes do: save such a "
+            "struct, or export the mesh as OFF or PLY."
+        )
     return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
 
 
@@ -436,18 +442,19 @@ MESH_SUFFIXES = tuple(_PARSERS)
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None) -> None:
     """Write a mesh to an OFF (text) or PLY (binary, little endian) file.
 
-    What `read_mesh` reads back has the same vertices, bit for bit, and the same faces. The file appears whole
-    or not at all.
+    `read_mesh` reads back the same vertices, bit for bit, and the same faces. The file appears whole or not
+    at all.
 
     **Arguments:**
 
-    - `path`: the file to create or replace; its suffix, `.off` or `.ply`, tells the format.
+    - `path`: the file to create or to replace. The suffix, `.off` or `.ply`, tells the format.
     - `mesh`: the mesh.
-    - `colors`: red, green and blue of each vertex (n, 3), floats from 0 to 1 or uint8 (as OFF: COFF).
+    - `colors`: red, green and blue of each vertex (n, 3), as floats from 0 to 1 or as uint8. An OFF file with
+        colors begins with COFF.
 
     **Raises:**
 
-    `InputError` for another suffix, colors of another shape or range, or a place that cannot be written to.
+    `InputError` for another suffix, colors of another shape or range, or a file that cannot be written.
     """
     path = Path(path)
     form = _FORMATTERS.get(path.suffix.lower())
@@ -465,17 +472,17 @@ def _bytes_of_colors(colors: ArrayLike, n: int) -> UInt8[np.ndarray, "n 3"]:
     array = np.asarray(colors)
     if array.shape != (n, 3):
         raise InputError(
-            f"colors have shape {array.shape}, but {n} vertices need ({n}, 3): give one row for each."
+            f"colors have shape {array.shape}, but {n} vertices need ({n}, 3): give one row for each vertex."
         )
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
-        raise InputError("colors are neither uint8 nor floats from 0 to 1: convert them.")
+        raise InputError("colors are neither uint8 nor floats from 0 to 1: convert the colors.")
     return np.rint(255 * array.astype(np.float64)).astype(np.uint8)
 
 
 def _format_off(mesh: Mesh, colors: UInt8[np.ndarray, "n 3"] | None) -> bytes:
-    # repr of a float is the shortest text that reads back as the same float.
+    # `repr` gives the shortest text that is read back as the same float.
     vertices = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     if colors is not None:
         vertices = [f"{v} {r} {g} {b} 255" for v, (r, g, b) in zip(vertices, colors.tolist(), strict=True)]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import get_args
 
 import igl
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.ndimage import uniform_filter
 
+from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
-
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Proper rotations that turn the named axis up. Y-up and z-up files then face the same way: forward is +z in
 # the one convention and -y in the other, and x runs across the body in both.

@@ -65,7 +65,7 @@ def write_report(
     errors: Mapping[str, GeodesicError] | None = None,
     settings: Mapping[str, Any] | None = None,
     up: Axis | None = None,
-) -> None:
+) -> list[Path]:
     """Write the pictures of a match, an interactive page and a summary to a directory.
 
     The error that is to be expected (`Correspondence.expected_error`) is among them, and if given the true
@@ -81,6 +81,8 @@ def write_report(
       of `correspondence.pointwise_map`.
     - `settings`: what else to note in the summary.
     - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+
+    **Returns:** The files that were written.
 
     **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
     """
@@ -156,6 +158,8 @@ def write_report(
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+    names = ("report.html", *(f"{name}.png" for name in figures), "summary.json")
+    return [directory / name for name in names]
 
 
 def write_comparison(

@@ -1,8 +1,8 @@
-"""Results on disk that are expensive to compute and depend on nothing but numbers: spectra, geodesic graphs.
+"""A cache on disk for expensive results, such as spectra, SHOT descriptors and geodesic graphs.
 
-An entry is found by a hash of everything it depends on, so it never goes stale; it is written in one step, so
-any number of processes share the directory without locks; and nothing in it is believed that its checksums
-do not confirm. Losing the directory costs time and nothing else.
+The name of an entry is a hash of everything that the result depends on, so entries never go stale. Entries
+are written atomically, so any number of processes share the directory without locks. Checksums are verified
+when an entry is read. Deleting the directory costs only time.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ import platformdirs
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
-# Part of every key: count it up when what is stored under the same inputs changes.
+# Part of every key. Increment this number when a change of the code changes results for the same inputs.
 _FORMAT = 4
 
-# The entries, and what a killed process may have left of one.
+# The names of entries, and of temporary files that a killed process left behind.
 _OWN_FILES = re.compile(r"([a-z-]+-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
 
 
@@ -35,21 +35,22 @@ def cached(
     inputs: Sequence[np.ndarray | str | int | float],
     compute: Callable[[], dict[str, np.ndarray]],
 ) -> dict[str, np.ndarray]:
-    """What `compute` returns, from the disk if it was computed before.
+    """Return the result of `compute`, from the disk if it was computed before.
 
-    `JAXSMW_CACHE` names the directory, by default the user's cache directory; empty or `off` means none.
-    `JAXSMW_CACHE_LIMIT` is its size in GiB, by default 4: what was used least recently is removed first. A
-    damaged entry is computed again. Where nothing can be written, a warning says so and work goes on.
+    The environment variable `JAXSMW_CACHE` names the directory; the default is the user's cache directory,
+    and an empty name or `off` disables the cache. `JAXSMW_CACHE_LIMIT` is the size of the cache in GiB, by
+    default 4; the least recently used entries are removed first. A damaged entry is computed again. If an
+    entry cannot be written, the function warns and returns the result.
 
     **Arguments:**
 
-    - `kind`: what is computed, in lower-case words joined by hyphens; begins the entry's name.
-    - `inputs`: all that the result depends on.
-    - `compute`: computes the arrays, by name.
+    - `kind`: the first part of the entry's name, in lower-case words joined by hyphens.
+    - `inputs`: everything that the result depends on.
+    - `compute`: computes the arrays and returns them by name.
 
     **Returns:** The arrays, bit for bit as computed.
 
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number, or below 0.
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number, or negative.
     """
     place, limit = _place(), _limit()
     if place is None:
@@ -66,10 +67,10 @@ def cached(
                 np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
             _remove_oldest(path.parent, limit)
         except (OSError, InputError):
-            # Text and place are the same for every entry, so that Python shows it once.
+            # The text and the line are the same for every entry, so Python shows the warning only once.
             warnings.warn(
-                f"results cannot be kept in {place} and will be computed again next time: make room there, "
-                "or name another directory in JAXSMW_CACHE ('off' for none).",
+                f"results cannot be cached in {place} and will be computed again next time: make room there, "
+                "or name another directory in JAXSMW_CACHE ('off' for no cache).",
                 RuntimeWarning,
                 stacklevel=1,
             )
@@ -81,7 +82,7 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Compute everything in the block anew, as if nothing had been kept, but keep it: to measure the time."""
+    """Compute everything in the block anew, to measure the time; results are still written to the cache."""
     token = _recomputing.set(True)
     try:
         yield
@@ -90,11 +91,11 @@ def recomputing() -> Iterator[None]:
 
 
 def keep_programs() -> None:
-    """Let JAX, not imported yet, keep what it compiles beside our results, for the next process.
+    """Let JAX cache compiled programs beside our results, up to 0.25 GiB, for the next process.
 
-    By settings of its own in the environment, unless some are there already; at most 0.25 GiB. What is
-    compiled for one kind of processor must not run on another, which JAX does not tell apart, and a cache may
-    be on a shared disk.
+    This function sets JAX's environment variables, unless the user has set one of them. It must run before
+    JAX is imported. Each kind of processor gets a directory of its own: JAX does not distinguish processors,
+    and the cache may be on a disk that different machines share.
     """
     place = _place()
     if place is None:
@@ -109,9 +110,9 @@ def keep_programs() -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return  # `cached` says so
+        return  # `cached` will warn
     if not os.access(directory, os.W_OK):
-        return  # JAX would warn of every program
+        return  # JAX would warn about every program
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
@@ -124,7 +125,7 @@ def keep_programs() -> None:
 
 
 def _place() -> Path | None:
-    """The directory, if there is to be one."""
+    """The directory, or None if the cache is disabled."""
     place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
     return None if place in ("", "off") else Path(place)
 
@@ -145,30 +146,30 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
-        # The header tells how many bytes follow, so that no two lists of inputs read the same.
+        # The header tells how many bytes follow, so that different lists of inputs give different bytes.
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
 
 
 def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
-    """The arrays of an entry, or None if it is missing, damaged or not what its name says."""
-    # Whatever goes wrong while reading bytes of unknown origin, there is one remedy: compute.
+    """The arrays of an entry, or None if the entry is missing, damaged, or does not match its name."""
+    # Damaged bytes can raise any exception, and the remedy is always to compute again.
     with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
-        # Zip files have checksums for their members, but none for the list of them.
+        # A zip file has checksums for its members, but not for the list of members.
         if arrays.pop("contents").tolist() == [key, *arrays]:
             with suppress(OSError):
-                os.utime(path)  # used now: `_remove_oldest` goes by this
+                os.utime(path)  # `_remove_oldest` reads the time of the last use
             return arrays
     return None
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:
-    """Bring our files in the directory below the limit."""
+    """Remove our least recently used files until the rest fits the limit (in bytes)."""
     files = []
     for entry in os.scandir(directory):
-        with suppress(FileNotFoundError):  # another process removes, too
+        with suppress(FileNotFoundError):  # another process may remove files, too
             if _OWN_FILES.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
                 files.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
     excess = sum(size for _, size, _ in files) - limit

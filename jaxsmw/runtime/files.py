@@ -1,24 +1,85 @@
-"""Writing files so that a reader never meets half of one."""
+"""Reading and writing files: every failure is one sentence, and no reader ever sees half a file."""
 
 from __future__ import annotations
 
 import os
-import tempfile
+import stat
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from jaxsmw.errors import InputError
 
+LARGEST_FILE = 2**30
+"""The largest file, in bytes, that is read whole: 1 GiB.
+
+Parsing a text file takes up to fifteen times its size in memory. A text file of this size describes a mesh of
+ten million vertices.
+"""
+
+
+def largest_contents(size_of_file: int) -> int:
+    """The size up to which the contents of a compressed file are plausible, in bytes.
+
+    Contents may always take 1 GiB, as a mesh of ten million vertices does. Larger contents are eigenvectors,
+    which hardly compress: four times the size of their file is generous. A hostile file unpacks to a thousand
+    times its size.
+    """
+    return max(2**30, 4 * size_of_file)
+
+
+def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FILE) -> bytes:
+    """Read a whole file.
+
+    **Arguments:**
+
+    - `path`: a regular file. Pipes and devices are refused, since they may never end.
+    - `largest`: the largest size in bytes; None for no limit.
+
+    **Returns:** The contents.
+
+    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large or unreadable.
+    """
+    size = size_of_file(path)
+    if largest is not None and size > largest:
+        raise InputError(
+            f"{path}: is larger than {largest >> 30} GiB, the limit for reading: decimate the mesh."
+        )
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def size_of_file(path: str | os.PathLike[str]) -> int:
+    """The size of a regular file in bytes.
+
+    **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be looked at.
+    """
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: does not exist: check the path.") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise _unreadable(path, error) from error
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: is not a regular file: give the path of a file.")
+    return status.st_size
+
+
+def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
+    return InputError(f"{path}: cannot be read ({_reason(error)}): check the path and its permissions.")
+
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to; it becomes `path` when the block ends well, and is gone otherwise.
+    """Give a temporary path to write to, and move the file to `path` when the block succeeds.
 
-    The temporary file lies in the target's directory (so that the move is one atomic step) and has the
-    target's suffix (because writers such as `numpy.savez` and `savefig` look at it). Where `path` is a link,
-    the file it points to is replaced.
+    After an exception the temporary file is removed, and `path` is as it was. The temporary file lies in the
+    directory of `path`, so that the move is atomic. It has the suffix of `path`, because writers such as
+    `numpy.savez` and `savefig` look at the suffix. If `path` is a symbolic link, the file behind the link is
+    replaced.
 
     **Arguments:**
 
@@ -30,80 +91,131 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     **Raises:**
 
-    `InputError` when the target cannot be written, be it before the block (no such directory, no permission,
-    not a regular file) or by an `OSError` in it (disk full).
+    `InputError` if the place or the name makes writing impossible (before the block starts), or after an
+    `OSError` inside the block, such as a full disk.
     """
-    target = Path(os.path.realpath(path))
-    temporary = target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+    target = _target(path)
+    temporary = _temporary(target)
+    _unfinished.add(temporary)
     try:
-        _check_target(path)
+        _check_target(path, target)
         temporary.touch(exist_ok=False)
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
-        # Nothing is left to remove after success, nor where the directory itself was the trouble.
+        # The file is gone after success, and was never there if the directory does not exist.
         if os.path.lexists(temporary):
+            temporary.unlink()
+        _unfinished.discard(temporary)
+
+
+# The temporary files of all open blocks.
+_unfinished: set[Path] = set()
+
+
+def remove_unfinished() -> None:
+    """Remove the temporary files of all open blocks of `atomic_write`.
+
+    A process calls this function if it ends while a block is open.
+    """
+    for temporary in _unfinished.copy():
+        with suppress(OSError):
             temporary.unlink()
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Tell now what would make `atomic_write` fail later.
+    """Check before long work that `atomic_write` will be able to write a file; leave nothing behind.
 
     **Raises:**
 
-    `InputError` if there is no such directory, or it or the file in it may not be written to.
+    `InputError` if the directory does not exist, the name is impossible, or permissions forbid writing.
     """
-    _check_target(path)
-    try:  # permissions do not tell all
-        with tempfile.TemporaryFile(dir=Path(os.path.realpath(path)).parent):
-            pass
+    target = _target(path)
+    temporary = _temporary(target)
+    try:
+        _check_target(path, target)
+        # Permissions alone do not tell: some file systems refuse all new files.
+        temporary.touch(exist_ok=False)
+        temporary.unlink()
     except OSError as error:
         raise _unwritable(path, error) from error
 
 
-def _check_target(path: str | os.PathLike[str]) -> None:
-    """Refuse what no file can or may be put in place of."""
-    target = Path(os.path.realpath(path))
+def _target(path: str | os.PathLike[str]) -> Path:
+    """The file that a path means, with symbolic links resolved."""
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError as error:  # a null character in the name
+        raise _unwritable(path, error) from error
+
+
+def _temporary(target: Path) -> Path:
+    """A new hidden name beside a file, with the same suffix."""
+    return target.parent / f".{uuid.uuid4().hex}{target.suffix}"
+
+
+def _check_target(path: str | os.PathLike[str], target: Path) -> None:
+    """Refuse a target that cannot become a regular file.
+
+    **Raises:** `InputError`; `OSError` if the system does not accept the name.
+    """
     if not target.parent.is_dir():
         raise InputError(
             f"{path}: cannot be written because {target.parent} is not a directory: "
             "create it first or choose another place."
         )
-    if target.exists() and not target.is_file():
+    try:
+        status = os.stat(target)
+    except FileNotFoundError:
+        return
+    if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: cannot be written because it is not a file: choose another name.")
-    if target.exists() and not os.access(target, os.W_OK):
+    if not os.access(target, os.W_OK):
         raise InputError(f"{path}: is write-protected: choose another name or change permissions.")
 
 
-def _unwritable(path: str | os.PathLike[str], error: OSError) -> InputError:
+def _unwritable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
     return InputError(
-        f"{path}: cannot be written ({error.strerror or error}): choose a place with free space where you "
-        "may create files."
+        f"{path}: cannot be written ({_reason(error)}): choose a valid name in a place with free space where "
+        "you may create files."
     )
 
 
+def _reason(error: OSError | ValueError) -> str:
+    """The system's own words for an error."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 def check_directory(path: str | os.PathLike[str]) -> None:
-    """Tell now what would make `make_directory` fail later; nothing is left behind.
+    """Check before long work that `make_directory` will succeed; leave nothing behind.
 
     **Raises:**
 
-    `InputError` if it cannot be made or written to.
+    `InputError` if the directory cannot be made, or nothing can be written to it.
     """
-    missing = [place for place in (Path(path), *Path(path).parents) if not place.exists()]
-    make_directory(path)
-    for place in missing:
-        place.rmdir()
+    missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
+    try:
+        make_directory(path)
+    finally:
+        for place in missing:
+            with suppress(OSError, ValueError):  # never made, or already in use by another process
+                place.rmdir()
 
 
 def make_directory(path: str | os.PathLike[str]) -> Path:
-    """The directory, made if it is not there yet."""
+    """Make a directory and its parents, unless they exist.
+
+    **Returns:** The path.
+
+    **Raises:** `InputError` if the directory cannot be made, or nothing can be written to it.
+    """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
         raise InputError(
-            f"{path}: cannot be made a directory ({error.strerror}); choose another place."
+            f"{path}: cannot be made a directory ({_reason(error)}); choose another place."
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{path}: cannot be written to; choose another place or change its permissions.")

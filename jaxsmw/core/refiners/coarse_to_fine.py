@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
+from jaxsmw.choices import Search
 from jaxsmw.core.checks import check_choice
-from jaxsmw.core.pointwise_map import Search
 from jaxsmw.core.refiner import PreparedT, Refiner, State, StateT
 from jaxsmw.core.spectrum import Spectrum
 

@@ -8,10 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
+from jaxsmw.choices import Search
 from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import Search, chosen_patches, spectral_embeddings
+from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_vertices

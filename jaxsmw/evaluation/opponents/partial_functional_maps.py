@@ -76,9 +76,9 @@ from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.presets import Stage
 from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
 """The weight of the fidelity term beside mu_1 to mu_3; column norms are averaged."""

@@ -13,9 +13,9 @@ from jaxtyping import Array, Int, Int64
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.evaluation.ground_truth import read_pointwise_map
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.map_files import read_pointwise_map
 from jaxsmw.runtime.batches import pad_rows
 
 

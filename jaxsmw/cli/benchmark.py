@@ -1,0 +1,122 @@
+"""`jaxsmw benchmark`: match and measure many pairs of a data set."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import get_args
+
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName
+from jaxsmw.cli.arguments import path, whole_number
+from jaxsmw.cli.console import report_progress, show
+from jaxsmw.cli.interruption import announce_consequence, quiet_children
+from jaxsmw.cli.outputs import check_outputs
+from jaxsmw.errors import InputError
+
+HELP = "match and measure many pairs of a data set; continues an interrupted run"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument(
+        "data",
+        metavar="DATASET_DIRECTORY",
+        type=path,
+        help="FAUST, SCAPE, TOSCA, a SHREC set or a remeshed set, in the published layout",
+    )
+    parser.add_argument(
+        "--methods",
+        metavar="METHOD",
+        type=path,
+        nargs="+",
+        help=f"methods: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} where these "
+        "libraries are installed; or directories with maps X_Y.map made elsewhere (default: all methods that "
+        "suit the pairs; cpd takes half a minute per pair, bcicp a quarter of a minute; pfm is for partial "
+        "shapes only)",
+    )
+    parser.add_argument(
+        "--pairs",
+        metavar="N|FILE",
+        type=path,
+        help="N random pairs, or the pairs in a file (default: all pairs)",
+    )
+    parser.add_argument(
+        "--init",
+        metavar="INITIAL_MAP",
+        type=path,
+        default=DEFAULT_INITIAL_MAP,
+        help=f"initial map of all methods: {', '.join(get_args(InitialMap))}, or a directory with maps "
+        "X_Y.map (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--mirrored",
+        action="store_true",
+        help="measure against the mirrored ground truth where a map is nearer to the mirrored one",
+    )
+    parser.add_argument(
+        "--evaluation-samples",
+        metavar="N",
+        type=whole_number(1),
+        help="measure the error at N random points (default: at all points)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=whole_number(0),
+        default=0,
+        help="seed for the choice of pairs and points (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--output",
+        metavar="DIR",
+        type=path,
+        help="directory for tables and figures (default: jaxsmw-benchmark-NAME, after the data set)",
+    )
+    processes = parser.add_mutually_exclusive_group()
+    processes.add_argument(
+        "--workers",
+        metavar="N",
+        type=whole_number(1),
+        default=os.cpu_count() or 1,
+        help="number of processes with one core each; times are most exact with one process (default: "
+        "%(default)s, the number of cores)",
+    )
+    processes.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of a Dask cluster")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Match and measure the pairs that have no results yet, then write and print the tables of all pairs."""
+    from jaxsmw.report.figures import check_drawable
+
+    check_drawable()
+    try:
+        from jaxsmw.evaluation.benchmark import run_benchmark
+        from jaxsmw.evaluation.datasets import choose_pairs
+        from jaxsmw.evaluation.measurement import Settings
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"benchmarks need {error.name}, which is not installed: pip install 'jaxsmw[benchmark]'"
+        ) from error
+    from jaxsmw.evaluation.datasets import open_data_set
+    from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
+    from jaxsmw.evaluation.workers import open_executor
+    from jaxsmw.report.tables import markdown_table, write_tables
+    from jaxsmw.runtime.files import make_directory
+
+    data_set = open_data_set(options.data)
+    pairs = choose_pairs(data_set, options.pairs, options.seed)
+    settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
+    methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
+    output = options.output or f"jaxsmw-benchmark-{data_set.name}"
+    check_outputs([options.pairs], directories=[(output, ())])
+    directory = make_directory(output)
+    report_progress(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
+    announce_consequence(f"finished pairs are kept in {output}, and the same command continues from there")
+    with (
+        quiet_children(),
+        open_executor(options.workers, options.scheduler) as executor,
+    ):
+        results = run_benchmark(data_set, pairs, directory, methods, settings, executor)
+    if results.rows:
+        show(markdown_table(write_tables(directory, data_set, results, settings, methods)).rstrip("\n"))
+    report_progress(f"the results are in {output}")
+    results.check()

@@ -1,0 +1,89 @@
+"""`jaxsmw evaluate`: measure maps against the ground truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from jaxsmw.cli.arguments import (
+    MAP_FORMS,
+    add_index_base,
+    add_partial,
+    add_source_and_target,
+    add_up,
+    add_weld,
+    path,
+    refuse_without,
+)
+from jaxsmw.cli.console import show
+from jaxsmw.cli.inputs import read_maps, read_mesh_file, read_truth
+from jaxsmw.cli.measurement import (
+    add_evaluation,
+    add_ground_truth,
+    check_evaluation,
+    evaluation_settings,
+    measure_errors,
+)
+from jaxsmw.cli.outputs import check_outputs, report_written, write_comparison_page
+
+HELP = "measure maps against the ground truth"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_source_and_target(parser)
+    parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps: {MAP_FORMS}")
+    add_ground_truth(parser, required=True, purpose="true map")
+    parser.add_argument(
+        "--output", metavar="FILE", type=path, help="write the errors here as JSON, with their curves"
+    )
+    parser.add_argument(
+        "--figure", metavar="FILE", type=path, help="draw the correspondence quality curves here"
+    )
+    parser.add_argument(
+        "--page",
+        metavar="FILE.html",
+        type=path,
+        help="write an interactive page here that shows one map at a time, with its errors",
+    )
+    add_partial(parser)
+    add_up(parser)
+    add_weld(parser)
+    add_index_base(parser)
+    add_evaluation(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the errors of all maps, and write the requested files."""
+    check_evaluation(options)
+    refuse_without(options, "--page", bool(options.page), "partial", "up")
+    check_outputs(
+        [options.source, options.target, *options.map, *options.ground_truth],
+        files=[options.output],
+        figures=[options.figure],
+        pages=[options.page],
+    )
+    mesh_x = read_mesh_file(options.source, weld=options.weld)
+    mesh_y = read_mesh_file(options.target, weld=options.weld)
+    truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+    maps = read_maps(options.map, mesh_x, mesh_y, index_base=options.index_base)
+    errors = measure_errors(mesh_y, maps, truth, evaluation_settings(options))
+    if options.page:
+        write_comparison_page(
+            options.page, mesh_x, mesh_y, maps, errors, partial=options.partial, up=options.up
+        )
+    for name, error in errors.items():
+        show(f"{name}: {error}")
+    if options.figure:
+        from jaxsmw.report.figures import save_figure
+        from jaxsmw.report.summary import draw_errors
+
+        save_figure(options.figure, draw_errors(errors))
+        report_written(options.figure)
+    if options.output:
+        from jaxsmw.runtime.files import atomic_write
+
+        results = {name: error.as_dictionary() for name, error in errors.items()}
+        with atomic_write(options.output) as temporary:
+            temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
+        report_written(options.output)

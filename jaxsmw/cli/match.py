@@ -1,0 +1,212 @@
+"""`jaxsmw match`: match two meshes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxsmw.cli.arguments import (
+    add_index_base,
+    add_partial,
+    add_source_and_target,
+    add_up,
+    add_weld,
+    path,
+    refuse_without,
+)
+from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
+from jaxsmw.cli.console import Stopwatch, report_progress
+from jaxsmw.cli.inputs import initial_map_file, read_mesh_file, read_truth
+from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
+from jaxsmw.cli.method import add_method, check_preset, match_meshes
+from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxsmw.matching import Correspondence
+
+HELP = "match two meshes"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_source_and_target(parser)
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        type=path,
+        required=True,
+        help="write the map here: the target vertex of each source vertex, one per line, counted from 0; "
+        "with the suffix .npy an array for numpy.load; with .mat the column T12 for MATLAB, counted from 1",
+    )
+    parser.add_argument(
+        "--surface-points",
+        metavar="FILE.baryc_gt",
+        type=path,
+        help="write a point between target vertices for each source vertex: a face, counted from 1, and "
+        "barycentric weights of its corners",
+    )
+    parser.add_argument(
+        "--expected-error",
+        metavar="FILE",
+        type=path,
+        help="write the expected error of each match, estimated without ground truth, as a fraction of the "
+        "square root of the target's area",
+    )
+    parser.add_argument(
+        "--one-to-one",
+        metavar="FILE",
+        type=path,
+        help="write a map that uses no target vertex twice, in the forms of --output; for meshes with the "
+        "same triangulation, because for others this map is much less accurate",
+    )
+    parser.add_argument(
+        "--texture",
+        metavar="DIR",
+        type=path,
+        help="write both meshes here as OBJ files with one picture, projected onto the target and "
+        "transferred to the source",
+    )
+    parser.add_argument(
+        "--report", metavar="DIR", type=path, help="write pictures, a 3D page and a summary here"
+    )
+    add_up(parser)
+    add_ground_truth(parser, required=False, purpose="true map, for the errors before and after refinement")
+    add_partial(parser)
+    add_method(parser)
+    add_weld(parser)
+    add_index_base(parser)
+    add_evaluation(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Match two meshes, write the requested files, and print errors and times."""
+    stopwatch = Stopwatch()
+    with stopwatch.step("loading"):
+        _check(options)
+    with stopwatch.step("reading"):
+        mesh_x = read_mesh_file(options.source, weld=options.weld)
+        mesh_y = read_mesh_file(options.target, weld=options.weld)
+        truth = None
+        if options.ground_truth:
+            truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
+    if options.one_to_one:
+        from jaxsmw.geometry.assignment import check_one_to_one
+
+        check_one_to_one(int(mesh_x.used_vertices.sum()), int(mesh_y.used_vertices.sum()))
+    correspondence = match_meshes(
+        options, mesh_x, mesh_y, stopwatch, partial=options.partial, index_base=options.index_base
+    )
+    others = _write_files(options, correspondence, stopwatch)
+    settings = evaluation_settings(options)
+    errors = measure_match(correspondence, truth, settings, stopwatch, others)
+    if options.report:
+        write_match_report(options.report, correspondence, errors, options, stopwatch, up=options.up)
+    show_match(errors, stopwatch)
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse options and outputs that would fail after minutes of work, and load the libraries."""
+    init_file = initial_map_file(options.init)
+    check_preset(options)
+    check_evaluation(options)
+    refuse_without(options, "--report", bool(options.report), "up")
+    reads_indices = bool(options.ground_truth or init_file)
+    refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
+    points, expected = options.surface_points, options.expected_error
+    if points and Path(points).suffix != ".baryc_gt":
+        raise InputError(
+            f"{points}: surface points are written as .baryc_gt: choose a name that ends in .baryc_gt."
+        )
+    if expected and Path(expected).suffix in (".npy", ".mat"):
+        raise InputError(
+            f"{expected}: expected errors are written as text: choose another name, such as one in .txt."
+        )
+    from jaxsmw.io.map_files import check_map_name
+
+    for file in filter(None, (options.output, options.one_to_one)):
+        check_map_name(file)
+    check_outputs(
+        [options.source, options.target, init_file, *(options.ground_truth or ())],
+        files=[options.output, points, options.one_to_one, expected],
+        directories=_directories(options),
+    )
+    import jaxsmw.matching  # noqa: F401 (imported here for the stopwatch)
+
+
+def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
+    """Returns the requested directories with the names of their files."""
+    directories: list[tuple[str, tuple[str, ...]]] = []
+    if options.report or options.texture:
+        from jaxsmw.report.figures import check_drawable
+
+        check_drawable()
+    if options.texture:
+        from jaxsmw.report.texture import TEXTURE_FILES
+
+        directories.append((options.texture, TEXTURE_FILES))
+    if options.report:
+        from jaxsmw.report.summary import REPORT_FILES
+
+        directories.append((options.report, REPORT_FILES))
+    return directories
+
+
+def _write_files(
+    options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
+) -> dict[str, Any]:
+    """Write all files but the report; returns the maps besides the refined one, by name."""
+    from jaxsmw.io.map_files import write_pointwise_map
+
+    others: dict[str, Any] = {}
+    with stopwatch.step("writing"):
+        write_pointwise_map(options.output, correspondence.pointwise_map)
+    report_written(options.output)
+    if options.one_to_one:
+        report_progress("one-to-one map ...")
+        with stopwatch.step("one-to-one map"):
+            others["one-to-one"] = correspondence.one_to_one()
+            write_pointwise_map(options.one_to_one, others["one-to-one"])
+        report_written(options.one_to_one)
+    if options.surface_points or options.texture:
+        report_progress("points on the surface ...")
+        with stopwatch.step("surface points"):
+            points = correspondence.surface_points()
+        with stopwatch.step("writing"):
+            _write_points(options, correspondence, points)
+        if options.surface_points:
+            others["surface"] = points
+    if options.expected_error:
+        report_progress("expected error ...")
+        with stopwatch.step("expected error"):
+            _write_numbers(options.expected_error, correspondence.expected_error())
+        report_written(options.expected_error)
+    return others
+
+
+def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: Any) -> None:
+    """Write the surface points and the texture."""
+    if options.surface_points:
+        from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
+
+        truth = GroundTruth.of_all_vertices(points)
+        write_ground_truth(options.surface_points, truth, correspondence.mesh_y)
+        report_written(options.surface_points)
+    if options.texture:
+        from jaxsmw.report.texture import TEXTURE_FILES, write_textured_pair
+        from jaxsmw.runtime.files import make_directory
+
+        directory = make_directory(options.texture)
+        write_textured_pair(directory, correspondence.mesh_x, correspondence.mesh_y, points)
+        report_written(*(directory / name for name in TEXTURE_FILES))
+
+
+def _write_numbers(file: str, numbers: Any) -> None:
+    """Write one number per line."""
+    import numpy as np
+
+    from jaxsmw.runtime.files import atomic_write
+
+    with atomic_write(file) as temporary:
+        np.savetxt(temporary, numbers, "%.6f")

@@ -1,0 +1,140 @@
+"""The files that commands write: their check before the work, and messages about them after it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxsmw.cli.console import report_progress
+from jaxsmw.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxsmw.choices import Axis
+    from jaxsmw.evaluation.metrics import GeodesicError
+    from jaxsmw.geometry.mesh import Mesh
+
+
+def check_outputs(
+    inputs: Iterable[str | None],
+    *,
+    files: Iterable[str | None] = (),
+    figures: Iterable[str | None] = (),
+    pages: Iterable[str | None] = (),
+    directories: Sequence[tuple[str, Sequence[str]]] = (),
+) -> None:
+    """Check before the work that every output can be written, and replaces no input and no other output.
+
+    Paths are compared after symbolic links are resolved. Entries that are None are skipped.
+
+    **Arguments:**
+
+    - `inputs`: the files that the command reads.
+    - `files`: the files that the command writes, other than figures and pages.
+    - `figures`: pictures (PNG, PDF or SVG).
+    - `pages`: interactive HTML pages.
+    - `directories`: the directories that the command makes, each with the names of its files. A directory may
+      occur several times.
+
+    **Raises:** `InputError` that names the path.
+    """
+    files, figures, pages = ([path for path in paths if path] for paths in (files, figures, pages))
+    written = [*files, *figures, *pages]
+    written += [os.path.join(directory, name) for directory, names in directories for name in names]
+    _refuse_clashes(filter(None, inputs), written, [directory for directory, _ in directories])
+    for path in files:
+        _check_writable(path)
+    for path in figures:
+        from jaxsmw.report.figures import check_figure_path
+
+        check_figure_path(path)
+    for path in pages:
+        _check_page(path)
+    for path, _ in directories:
+        from jaxsmw.runtime.files import check_directory
+
+        check_directory(path)
+
+
+def _refuse_clashes(inputs: Iterable[str], files: Iterable[str], directories: Iterable[str]) -> None:
+    read = {os.path.realpath(path) for path in inputs}
+    taken: set[str] = set()
+    for path in files:
+        _refuse_place(path, read, taken)
+        taken.add(os.path.realpath(path))
+    for path in directories:
+        _refuse_place(path, read, taken)
+        if parents := taken.intersection(map(str, Path(os.path.realpath(path)).parents)):
+            raise InputError(
+                f"{path}: lies in {parents.pop()}, which is an output file: choose another place for one of "
+                "them."
+            )
+
+
+def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
+    place = os.path.realpath(path)
+    if place in read:
+        raise InputError(f"{path}: is an input and would be overwritten: choose another name.")
+    if place in taken:
+        raise InputError(f"{path}: two outputs have this name: choose another name for one of them.")
+
+
+def is_page(path: str) -> bool:
+    """Returns whether the name is that of an HTML page."""
+    return Path(path).suffix.lower() in (".html", ".htm")
+
+
+def _check_page(path: str) -> None:
+    from jaxsmw.report.figures import check_drawable
+
+    if not is_page(path):
+        raise InputError(f"{path}: pages are written as .html: choose a name that ends in .html.")
+    check_drawable()
+    _check_writable(path)
+
+
+def _check_writable(path: str) -> None:
+    from jaxsmw.runtime.files import check_writable
+
+    check_writable(path)
+
+
+def report_written(*paths: str | os.PathLike[str]) -> None:
+    """Name written files on standard error, except with `--quiet`."""
+    for path in paths:
+        report_progress(f"wrote {path}")
+
+
+def write_comparison_page(
+    path: str,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    maps: Mapping[str, Any],
+    errors: Mapping[str, GeodesicError],
+    *,
+    partial: bool,
+    up: Axis | None,
+) -> None:
+    """Write a page that compares maps. The page calls each map by as much of its path as is unique.
+
+    **Arguments:**
+
+    - `maps`, `errors`: by the paths of the maps; see `jaxsmw.report.summary.write_comparison`.
+    """
+    from jaxsmw.report.summary import write_comparison
+
+    for shorten in (lambda path: Path(path).stem, lambda path: Path(path).name, str):
+        names = {path: shorten(path) for path in maps}
+        if len(set(names.values())) == len(maps):
+            break
+    write_comparison(
+        path,
+        mesh_x,
+        mesh_y,
+        {names[path]: pointwise_map for path, pointwise_map in maps.items()},
+        errors={names[path]: error for path, error in errors.items()},
+        partial=partial,
+        up=up,
+    )
+    report_written(path)

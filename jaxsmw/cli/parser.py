@@ -1,0 +1,71 @@
+"""The parser of the command line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum
+from jaxsmw.cli.arguments import add_quiet
+from jaxsmw.cli.console import say, show
+
+# The help lists them in this order.
+_COMMANDS = {
+    "demo": demo,
+    "match": match,
+    "evaluate": evaluate,
+    "benchmark": benchmark,
+    "spectrum": spectrum,
+    "render": render,
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that refuses bad arguments with one sentence and exit code 2."""
+
+    def __init__(self, **settings: Any) -> None:
+        # An abbreviation would change its meaning with every new option that begins alike.
+        super().__init__(allow_abbrev=False, **settings)
+
+    def print_help(self, file: Any = None) -> None:
+        """Print the help on standard output; argparse would ignore errors."""
+        show(self.format_help().rstrip())
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message on standard error and exit with code 2."""
+        say(f"{self.prog}: {message} (see {self.prog} --help)")
+        sys.exit(2)
+
+
+def make_parser() -> Parser:
+    """Returns the parser of all commands. Parsed options have the function of the command in `run`."""
+    parser = Parser(
+        prog="jaxsmw",
+        description="Match two triangle meshes (OFF, OBJ, PLY, STL or MATLAB's MAT) of the same kind of body "
+        "in different poses: find for every vertex of one mesh the same point on the other.",
+    )
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, command in _COMMANDS.items():
+        subparser = commands.add_parser(name, help=command.HELP)
+        command.add_arguments(subparser)
+        add_quiet(subparser)
+        subparser.set_defaults(run=command.run)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Print the version. The look-up is slow, so it waits until someone asks for the version."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(
+            option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help="print the version"
+        )
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        import jaxsmw
+
+        show(f"jaxsmw {jaxsmw.__version__}")
+        parser.exit()

@@ -1,0 +1,86 @@
+"""`jaxsmw render`: draw a mesh or a correspondence."""
+
+from __future__ import annotations
+
+import argparse
+
+from jaxsmw.cli.arguments import (
+    MAP_FORMS,
+    add_index_base,
+    add_partial,
+    add_up,
+    add_weld,
+    path,
+    refuse_without,
+)
+from jaxsmw.cli.inputs import read_maps, read_mesh_file
+from jaxsmw.cli.outputs import check_outputs, is_page, report_written, write_comparison_page
+from jaxsmw.errors import InputError
+
+HELP = "draw a mesh, or a correspondence by its colours"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("source", type=path, metavar="SOURCE", help="mesh to draw, or the source mesh")
+    parser.add_argument("target", type=path, metavar="TARGET", nargs="?", help="target mesh")
+    parser.add_argument(
+        "map", type=path, metavar="MAP", nargs="*", help=f"map: {MAP_FORMS}; a page may show several maps"
+    )
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        type=path,
+        required=True,
+        help="write a picture here (.png, .pdf, .svg), or for a correspondence an interactive page (.html)",
+    )
+    add_partial(parser)
+    add_up(parser)
+    add_weld(parser)
+    add_index_base(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Draw a mesh, a correspondence, or a page with one or several correspondences."""
+    page = is_page(options.output)
+    _check(options, page)
+    mesh_x = read_mesh_file(options.source, weld=options.weld)
+    if not options.map:
+        from jaxsmw.report.figures import draw_mesh, save_figure
+
+        save_figure(options.output, draw_mesh(mesh_x, up=options.up))
+        report_written(options.output)
+        return
+    mesh_y = read_mesh_file(options.target, weld=options.weld)
+    maps = read_maps(options.map, mesh_x, mesh_y, index_base=options.index_base)
+    if page:
+        write_comparison_page(
+            options.output, mesh_x, mesh_y, maps, {}, partial=options.partial, up=options.up
+        )
+        return
+    from jaxsmw.report.figures import draw_correspondence, save_figure
+
+    (pointwise_map,) = maps.values()
+    save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map, up=options.up))
+    report_written(options.output)
+
+
+def _check(options: argparse.Namespace, page: bool) -> None:
+    """Refuse arguments that contradict each other, and outputs that cannot be written."""
+    output = options.output
+    if options.target and not options.map:
+        raise InputError(f"{options.target}: a second mesh needs a map; give the map as the third file.")
+    if page and not options.map:
+        raise InputError(f"{output}: a page shows a correspondence; give a target mesh and a map as well.")
+    if not page and len(options.map) > 1:
+        raise InputError(
+            f"{output}: a picture shows one map; leave {options.map[1]} out, or name a page (.html)."
+        )
+    if not page and options.partial:
+        raise InputError(f"--partial: is for pages; leave --partial out, or write {output} as .html.")
+    refuse_without(options, "a map", bool(options.map), "index_base")
+    check_outputs(
+        [options.source, options.target, *options.map],
+        figures=[] if page else [output],
+        pages=[output] if page else [],
+    )

@@ -1,0 +1,48 @@
+"""One command, from its arguments to its exit code."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+from jaxsmw.cli.console import flush_output, log_to_console, say
+from jaxsmw.cli.parser import make_parser
+from jaxsmw.errors import InputError
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Run a command and return its exit code: 0 for success, 2 for bad input, 1 for any other failure.
+
+    A failure is explained by one sentence on standard error.
+    """
+    try:
+        try:
+            _run(arguments)
+        finally:
+            flush_output()
+    except SystemExit as ending:  # from the parser, for help and bad arguments
+        return int(ending.code or 0)
+    except InputError as error:
+        say(f"jaxsmw: {error}")
+        return 2
+    except ArithmeticError as error:
+        say(f"jaxsmw: {error}")
+        return 1
+    except MemoryError as error:
+        detail = f" ({error})" if str(error) else ""
+        say(f"jaxsmw: this machine has too little memory{detail}: give smaller meshes or smaller numbers.")
+        return 1
+    except BrokenPipeError:  # nobody reads standard output any more, for example after `head`
+        return 1
+    return 0
+
+
+def _run(arguments: Sequence[str]) -> None:
+    options = make_parser().parse_args(arguments)
+    log_to_console(quiet=options.quiet)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+        from jaxsmw.runtime.cache import keep_programs
+
+        keep_programs()
+        options.run(options)

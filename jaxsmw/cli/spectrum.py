@@ -1,0 +1,90 @@
+"""`jaxsmw spectrum`: inspect a mesh and its eigenbasis."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from jaxsmw.choices import NUMBER_OF_EIGENVECTORS
+from jaxsmw.cli.arguments import add_eigenproblem, add_weld, path, refuse_without, whole_number
+from jaxsmw.cli.banks import add_bank, make_bank
+from jaxsmw.cli.console import show
+from jaxsmw.cli.inputs import describe_mesh
+from jaxsmw.cli.outputs import check_outputs, report_written
+
+if TYPE_CHECKING:
+    import numpy as np
+
+HELP = "inspect a mesh and its eigenbasis"
+
+_EIGENVALUES_PER_LINE = 10
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("mesh", type=path, metavar="MESH", help="mesh to inspect")
+    parser.add_argument(
+        "--eigenvectors",
+        metavar="N",
+        type=whole_number(1),
+        default=NUMBER_OF_EIGENVECTORS,
+        help="number of eigenvectors (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        type=path,
+        help="write eigenvalues, eigenvectors and vertex_areas here, for area 1, as .npz; or as .mat a "
+        "struct S with evals, evecs, A and surface",
+    )
+    parser.add_argument(
+        "--figure", metavar="FILE", type=path, help="draw the filter bank over the eigenvalues here"
+    )
+    add_bank(parser)
+    add_eigenproblem(parser)
+    add_weld(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Describe the mesh, print its eigenvalues, and write the requested files."""
+    refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
+    check_outputs([options.mesh], files=[options.output], figures=[options.figure])
+    if options.output:
+        from jaxsmw.io.spectra import check_spectrum_path
+
+        check_spectrum_path(options.output)
+    bank = make_bank(options.bank, options.filters)
+    from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
+    from jaxsmw.geometry.laplacian import choose_laplacian
+    from jaxsmw.io.mesh_files import read_mesh
+
+    mesh = read_mesh(options.mesh, weld=options.weld)
+    laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
+    pairs = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver)
+    eigenvalues, _, _ = pairs
+    show("\n".join(describe_mesh(mesh)))
+    show(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
+    show("\n".join(_lines(eigenvalues)))
+    if options.output:
+        import jax
+
+        from jaxsmw.io.spectra import write_spectrum
+
+        with jax.enable_x64(True):
+            write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
+        report_written(options.output)
+    if options.figure:
+        from jaxsmw.report.figures import save_figure
+        from jaxsmw.report.summary import draw_bank
+
+        save_figure(options.figure, draw_bank(bank, eigenvalues))
+        report_written(options.figure)
+
+
+def _lines(eigenvalues: np.ndarray) -> list[str]:
+    """Returns lines of eigenvalues; each line begins with the number of its first eigenvalue."""
+    lines = []
+    for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
+        row = " ".join(f"{value:9.2f}" for value in eigenvalues[first : first + _EIGENVALUES_PER_LINE])
+        lines.append(f"{first:5}  {row}")
+    return lines

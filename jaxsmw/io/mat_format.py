@@ -1,0 +1,127 @@
+"""The size of a `.mat` file's contents, checked before SciPy reads them.
+
+A compressed variable can unpack to a thousand times its size, and a cell array can declare a billion cells
+that the file does not hold. SciPy allocates memory for all of that. So this module unpacks the variables
+itself, up to a limit, and adds up the sizes of all arrays, nested ones included.
+
+Format: The MathWorks, "MAT-File Format", level 5.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import zlib
+
+from scipy.io.matlab import matfile_version
+
+from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import largest_contents
+
+_MATRIX, _COMPRESSED = 14, 15
+# By data type; 1 for all others.
+_BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18: 4}
+# The array classes cell, struct and object.
+_CONTAINERS = 1, 2, 3
+
+# SciPy takes 10 microseconds for an array however small, as long as for a few KiB of numbers.
+_LEAST_BYTES_OF_ARRAY = 4096
+# The names of a struct's fields: 64 bytes for each of 1000 fields. Shapes have about ten fields.
+_LONGEST_NAMES = 64 * 1000
+
+
+def unpacked(data: bytes) -> bytes:
+    """Unpack all variables of a file and check their sizes.
+
+    **Arguments:**
+
+    - `data`: the contents of the file.
+
+    **Returns:** The contents of an equivalent file in which no variable is compressed.
+
+    **Raises:** `InputError`, without the name of the file, for format 7.3 and for contents larger than
+    `largest_contents`; `ValueError`, `struct.error` or `zlib.error` if the file is damaged.
+    """
+    if data.startswith((b"MATLAB 7.3", b"\x89HDF")) or matfile_version(io.BytesIO(data))[0] == 2:
+        raise InputError("is in MATLAB's format 7.3, which is not read: save it there with save(..., '-v7').")
+    if matfile_version(io.BytesIO(data))[0] == 0:
+        return data  # level 4 knows neither compression nor nesting
+    order = "<" if data[126:128] == b"IM" else ">"
+    remaining = largest_contents(len(data))
+    elements, position = [data[:128]], 128
+    while position < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, position)
+        element = data[position : position + 8 + size]
+        if len(element) < 8 + size:
+            raise ValueError("a variable ends early")
+        position += len(element)
+        if kind == _COMPRESSED:
+            element = _inflated(element[8:], order, remaining)
+        remaining -= _memory(element, order, remaining)
+        elements.append(element)
+    return b"".join(elements)
+
+
+def _inflated(data: bytes, order: str, limit: int) -> bytes:
+    """A variable, unpacked to the size that it declares."""
+    stream = zlib.decompressobj()
+    tag = stream.decompress(data, 8)
+    _, size = struct.unpack(f"{order}II", tag)
+    if size > limit:
+        raise _too_large()
+    contents = stream.decompress(stream.unconsumed_tail, size) if size else b""  # 0 would mean no limit
+    if len(contents) < size:
+        raise ValueError("a compressed variable ends early")
+    return tag + contents
+
+
+def _memory(variable: bytes, order: str, limit: int) -> int:
+    """The memory that a variable takes, in bytes, if every number becomes a float64."""
+    memory, pending = 0, [(0, len(variable), False)]
+    while pending:
+        position, stop, in_container = pending.pop()
+        while position + 8 <= stop:
+            kind, size = struct.unpack_from(f"{order}II", variable, position)
+            if kind >> 16:  # a small element, whose data of up to 4 bytes lie within the tag
+                position += 8
+                continue
+            start, end = position + 8, position + 8 + size
+            if end > stop:
+                raise ValueError("an array ends early")
+            if kind == _MATRIX:
+                memory += _LEAST_BYTES_OF_ARRAY
+                if size:
+                    pending.append((start, end, _is_container(variable, start, size, order)))
+            elif in_container and size > _LONGEST_NAMES:
+                raise ValueError("a struct has too many fields")
+            else:
+                memory += 8 * (size // _BYTES_OF_NUMBER.get(kind, 1))
+            if memory > limit:
+                raise _too_large()
+            position = end + -size % 8
+    return memory
+
+
+def _is_container(variable: bytes, start: int, size: int, order: str) -> bool:
+    """Whether an array is a cell, struct or object array.
+
+    **Raises:** `ValueError` if it declares more elements than it holds.
+    """
+    kind, length, flags, _, _, bytes_of_shape = struct.unpack_from(f"{order}6I", variable, start)
+    if (kind, length) != (6, 8):
+        raise ValueError("an array does not begin with its flags")
+    if flags & 0xFF not in _CONTAINERS:
+        return False
+    shape = struct.unpack_from(f"{order}{min(bytes_of_shape, size) // 4}i", variable, start + 24)
+    # Every element takes at least a tag of 8 bytes.
+    if min(shape) < 0 or math.prod(shape) > size // 8:
+        raise ValueError("a cell array declares more cells than it holds")
+    return True
+
+
+def _too_large() -> InputError:
+    return InputError(
+        "would take more than 1 GiB of memory and more than four times its own size: save only the variables "
+        "that are needed."
+    )

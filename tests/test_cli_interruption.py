@@ -1,0 +1,207 @@
+"""Ctrl-C at any moment: one line, death of the signal, no unfinished files."""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from command_line import write_pair
+from synthetic import bumpy_mesh
+
+from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.runtime.files import atomic_write, remove_unfinished
+
+LINE = "jaxsmw: interrupted; output files are complete or were not written.\n"
+# Tests that run in the background ignore the signal, and so would the processes that they start.
+PROLOGUE = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+"""
+RUN = "from jaxsmw.cli import main; main()"
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> Path:
+    return write_pair(tmp_path_factory.mktemp("pair"))
+
+
+def started(program: str, *arguments: object, start_new_session: bool = False) -> subprocess.Popen[str]:
+    """A process with `program` before the command line."""
+    return subprocess.Popen(
+        [sys.executable, "-c", PROLOGUE + textwrap.dedent(program) + RUN, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=start_new_session,
+    )
+
+
+def assert_interrupted(process: subprocess.Popen[str], directory: Path | None, *, line: str = LINE) -> None:
+    """The process dies of the signal with one line, and leaves no file in the directory."""
+    try:
+        output, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == -signal.SIGINT, errors
+    assert errors.endswith(line) and errors.count("jaxsmw: interrupted") == 1
+    for complaint in ("Traceback", "Exception", "Error", "leaked"):
+        assert complaint not in errors
+    assert output == ""
+    assert directory is None or list(directory.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["argparse", "jaxsmw.cli.match", "numpy", "jax", "jaxlib._jax", "equinox", "scipy.sparse", "igl"],
+)
+def test_interrupted_imports(pair, tmp_path, module):
+    program = f"""
+    class Interrupting:
+        def find_spec(name, *_):
+            if name == {module!r}:
+                interrupt()
+    sys.meta_path.insert(0, Interrupting)
+    """
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m")
+    assert_interrupted(started(program, *call), tmp_path)
+
+
+# Python swallows exceptions in functions that run at a garbage collection, as one of JAX does.
+IN_GARBAGE_COLLECTION = """
+    import gc
+    def interrupt_late(phase, _):
+        if phase == "start" and "jaxsmw.matching" in sys.modules:
+            gc.callbacks.clear()
+            interrupt()
+    gc.callbacks.append(interrupt_late)
+    """
+IN_A_WRITE = """
+    import numpy as np
+    def interrupt_and_write(file, *_):
+        open(file, "w").write("half")
+        interrupt()
+        while True:
+            pass
+    np.savetxt = interrupt_and_write
+    """
+IN_COMPILED_CODE = """
+    import threading
+    import jaxsmw.matching
+    from jaxsmw.runtime.files import atomic_write
+    def match_forever(*_, **__):
+        # This thread waits for itself, without the signal, as if in code that never returns to Python.
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        with atomic_write(sys.argv[5]) as temporary:
+            temporary.write_text("half")
+            interrupt()
+            lock = threading.Lock()
+            lock.acquire()
+            lock.acquire()
+    jaxsmw.matching.match = match_forever
+    """
+
+
+@pytest.mark.parametrize("program", [IN_GARBAGE_COLLECTION, IN_A_WRITE, IN_COMPILED_CODE])
+def test_interrupted_work(pair, tmp_path, program):
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
+    call += ("--expected-error", tmp_path / "e") if program == IN_A_WRITE else ()
+    process = started(program, *call)
+    if program == IN_A_WRITE:  # the map is complete by then
+        process.wait(timeout=60)
+        (tmp_path / "m").unlink()
+    assert_interrupted(process, tmp_path)
+
+
+def test_interrupted_refinement(pair, tmp_path):
+    """Compiled code that runs for hours ends at once."""
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--iterations", "10000000")
+    process = started("", *call)
+    for line in process.stderr:
+        if line.startswith("refinement"):
+            break
+    time.sleep(3)
+    process.send_signal(signal.SIGINT)
+    assert_interrupted(process, tmp_path)
+
+
+def test_an_interrupted_benchmark(tmp_path):
+    """A terminal sends the signal to the workers as well, and all processes are silent but one."""
+    data, output = tmp_path / "data", tmp_path / "output"
+    data.mkdir()
+    for number in range(3):
+        write_mesh(data / f"mesh00{number}.off", bumpy_mesh(3))
+    call = ("benchmark", data, "--methods", "start", "--workers", "1", "--output", output)
+    process = started("", *call, start_new_session=True)
+    while not (output / "shapes.csv").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    kept = f"finished pairs are kept in {output}, and the same command continues from there"
+    assert_interrupted(process, None, line=f"\njaxsmw: interrupted; {kept}.\n")
+
+
+def test_a_second_interruption_changes_nothing(pair, tmp_path):
+    program = """
+    import jaxsmw.matching
+    def match_forever(*_, **__):
+        interrupt(), interrupt(), interrupt()
+    jaxsmw.matching.match = match_forever
+    """
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
+    assert_interrupted(started(program, *call), tmp_path)
+
+
+def test_an_ignored_signal_stays_ignored(pair):
+    """As in a script's background job, and under nohup."""
+    program = "signal.signal(signal.SIGINT, signal.SIG_IGN); import atexit; atexit.register(interrupt)\n"
+    process = started(program, "spectrum", pair / "x.off", "--eigenvectors", "5")
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0 and not errors and "area" in output
+
+
+def test_a_shell_ends_its_loop(pair, tmp_path):
+    """A shell goes on with its loop where an interrupted command exits instead of dying of the signal."""
+    call = (
+        sys.executable,
+        "-m",
+        "jaxsmw",
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        tmp_path / "m",
+    )
+    loop = f"for i in 1 2; do {shlex.join(map(str, call))} --iterations 10000000; echo next; done"
+    shell = f"os.execvp('bash', ['bash', '-c', {loop!r}])"
+    program = PROLOGUE + "signal.signal(signal.SIGINT, signal.SIG_DFL)\n" + shell
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    for line in process.stderr:
+        if line.startswith("refinement"):
+            break
+    os.killpg(process.pid, signal.SIGINT)
+    assert_interrupted(process, tmp_path)
+
+
+def test_unfinished_files_are_removed(tmp_path):
+    block = atomic_write(tmp_path / "file")
+    block.__enter__().write_text("half")
+    assert len(list(tmp_path.iterdir())) == 1
+    remove_unfinished()
+    assert list(tmp_path.iterdir()) == []
+    with atomic_write(tmp_path / "file") as temporary:
+        temporary.write_text("whole")
+    remove_unfinished()
+    assert (tmp_path / "file").read_text() == "whole"

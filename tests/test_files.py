@@ -1,0 +1,166 @@
+"""Reading and writing files: failures are one sentence, and no reader sees half a file."""
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory, read_bytes
+
+
+def test_the_file_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "result.npz"
+    with atomic_write(str(path)) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary.read_bytes() == b""
+        temporary.write_bytes(b"one")
+        assert not path.exists()
+    assert path.read_bytes() == b"one"
+
+    def fail() -> None:
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(b"half of")
+            raise KeyError("in the middle")
+
+    with pytest.raises(KeyError):
+        fail()
+    assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
+
+
+def test_system_errors_become_one_sentence(tmp_path):
+    def fill() -> None:
+        with atomic_write(tmp_path / "a.txt"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match=r"a\.txt: cannot be written \(No space left on device\)"):
+        fill()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "missing/a.txt", "/dev/null", ".", "/"])
+def test_unwritable_places(tmp_path, name):
+    with pytest.raises(InputError, match=r"cannot be written"), atomic_write(tmp_path / name) as temporary:
+        temporary.write_text("x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_write_protection_is_respected(tmp_path, monkeypatch):
+    path = tmp_path / "kept.txt"
+    path.write_text("old")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind the superuser
+    with pytest.raises(InputError, match="write-protected"), atomic_write(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "old"
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    (tmp_path / "plain").touch()
+    with atomic_write(tmp_path / "atomic"):
+        pass
+    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_links_are_followed(tmp_path):
+    (tmp_path / "store").mkdir()
+    (tmp_path / "link.txt").symlink_to(tmp_path / "store" / "real.txt")
+    with atomic_write(tmp_path / "link.txt") as temporary:
+        temporary.write_text("x")
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "store" / "real.txt").read_text() == "x"
+
+
+def test_many_writers_of_one_file_leave_one_whole_file(tmp_path):
+    path = tmp_path / "shared.txt"
+
+    def write(letter: str) -> None:
+        with atomic_write(path) as temporary:
+            temporary.write_text(letter * 100_000)
+
+    threads = [threading.Thread(target=write, args=(letter,)) for letter in "abcdefgh"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert path.stat().st_size == 100_000 and len(set(path.read_text())) == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_check_writable_raises_what_atomic_write_would_raise_later(tmp_path):
+    check_writable(tmp_path / "new.txt")
+    (tmp_path / "old.txt").write_text("x")
+    check_writable(tmp_path / "old.txt")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["old.txt"]
+    # Nobody can create files in /proc, although its permissions allow it.
+    for path in (
+        tmp_path,
+        tmp_path / "no" / "such.txt",
+        *([Path("/proc/x")] if Path("/proc").exists() else []),
+    ):
+        with pytest.raises(InputError, match="cannot be written"):
+            check_writable(path)
+
+
+LONG = "x" * 300
+NAMES = {
+    "too long": f"{LONG}.txt",
+    "too long, in a new directory": f"new/{LONG}",
+    "too long a directory": f"{LONG}/map.txt",
+    "with a null character": "a\0b.txt",
+    "a loop of links": "loop",
+    "through a file": "file/map.txt",
+}
+CALLS = {
+    "atomic_write": lambda path: atomic_write(path).__enter__(),
+    "check_writable": check_writable,
+    "check_directory": check_directory,
+    "make_directory": make_directory,
+    "read_bytes": read_bytes,
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)
+def test_impossible_names_end_in_one_sentence(tmp_path, name, call):
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    path = tmp_path / name
+    if call is make_directory and name.startswith("new"):
+        path.parent.mkdir()  # otherwise the parents that can be made are made
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError) as caught:
+        call(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message and message.endswith(".")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_writable_name_is_writable_with_the_temporary_suffix(tmp_path):
+    """The temporary name is longer than the name itself if most of that is a suffix."""
+    path = tmp_path / ("a." + "x" * 250)
+    for write in (check_writable, lambda path: atomic_write(path).__enter__()):
+        with pytest.raises(InputError, match="File name too long"):
+            write(path)
+
+
+def test_read_bytes(tmp_path):
+    (tmp_path / "data").write_bytes(b"\0\1")
+    assert read_bytes(tmp_path / "data") == b"\0\1" == read_bytes(str(tmp_path / "data"), largest=2)
+    with pytest.raises(InputError, match="data: is larger than 0 GiB"):
+        read_bytes(tmp_path / "data", largest=1)
+    with pytest.raises(InputError, match="missing: does not exist"):
+        read_bytes(tmp_path / "missing")
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", "/dev/zero"):
+        with pytest.raises(InputError, match="is not a regular file"):
+            read_bytes(path)
+
+
+def test_check_directory_raises_before_the_work_and_leaves_nothing(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "kept").mkdir()
+    check_directory(tmp_path / "new" / "one")
+    check_directory(tmp_path / "kept")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "kept"]
+    with pytest.raises(InputError, match="cannot be made a directory"):
+        check_directory(tmp_path / "file" / "one")

@@ -1,0 +1,141 @@
+"""MATLAB files that would fill the memory are refused before they do; all others read as before."""
+
+import io
+import struct
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse as sp
+from synthetic import bumpy_mesh
+
+import jaxsmw
+from jaxsmw import InputError
+from jaxsmw.io import mat_format
+from jaxsmw.io.mat_files import parse_variables, read_variables
+
+HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+NUMERIC, CELL, STRUCT = 6, 1, 2
+
+
+def element(kind: int, data: bytes, size: int | None = None) -> bytes:
+    """An element that declares a size, by default the true one."""
+    return struct.pack("<II", kind, len(data) if size is None else size) + data + bytes(-len(data) % 8)
+
+
+def array(kind: int, shape: tuple[int, ...], contents: bytes = b"", size: int | None = None) -> bytes:
+    """An array called x of a class and a shape."""
+    flags, name = element(6, struct.pack("<II", kind, 0)), element(1, b"x")
+    return element(14, flags + element(5, struct.pack(f"<{len(shape)}i", *shape)) + name + contents, size)
+
+
+def compressed(data: bytes) -> bytes:
+    packed = zlib.compress(data, 1)
+    return struct.pack("<II", 15, len(packed)) + packed
+
+
+ZEROS = element(9, bytes(8 * 1000))
+HUGE = 3 << 30
+BOMBS = {
+    # name: (variables, what the message says)
+    "a compressed variable": (compressed(array(NUMERIC, (1000, 1), ZEROS, size=HUGE)), "more than 1 GiB"),
+    "four smaller ones": (4 * compressed(array(NUMERIC, (6250, 8), element(2, bytes(50_000_000)))), "more than 1 GiB"),
+    "a cell array that declares too much": (array(CELL, (2**31 - 1, 2**10), 10 * element(14, b"")), "damaged"),
+    "a nested one that declares too much": (array(CELL, (1, 1), array(CELL, (2**30, 2**30))), "damaged"),
+    "a struct array without fields": (array(STRUCT, (2**20, 2**12), element(5, struct.pack("<i", 8)) + element(1, b"")), "damaged"),
+    "a struct with a million fields": (
+        compressed(array(STRUCT, (1, 1), element(5, struct.pack("<i", 1)) + element(1, b"a" * 10**6))), "damaged",
+    ),
+    "a negative shape": (array(CELL, (-1, -1), element(14, b"")), "damaged"),
+    "more than it declares": (compressed(array(NUMERIC, (5000, 1000), element(9, bytes(40_000_000)), size=100)), "damaged"),
+    "less than it declares": (compressed(array(NUMERIC, (1000, 1), ZEROS, size=10_000)), "damaged"),
+    "no flags": (element(14, element(9, bytes(80))), "damaged"),
+    "an array beyond its variable": (element(14, element(6, bytes(8)) + element(5, b"", size=1000)), "damaged"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("variables", "fault"), BOMBS.values(), ids=BOMBS)
+def test_bombs_are_refused_before_they_fill_the_memory(tmp_path, variables, fault):
+    path = tmp_path / "bomb.mat"
+    path.write_bytes(HEADER + variables)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=fault) as caught:
+            read_variables(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message and message.endswith(".")
+    assert peak < 300_000_000
+
+
+CONTENTS = {
+    "numbers": {"x": np.arange(40_000.0)},
+    "small numbers": {"x": np.ones(40_000, np.uint8)},
+    "complex numbers": {"x": np.ones(20_000) * 1j},
+    "a sparse matrix": {"x": sp.eye_array(20_000).tocsc()},
+    "a struct": {"s": {"a": {"b": np.arange(40_000.0)}}},
+    "a cell array": {"c": np.array([np.arange(20_000.0), np.arange(30_000.0), "word"], dtype=object)},
+    "a struct array": {"s": np.array([(np.arange(40_000.0),)] * 2, dtype=[("f", object)])},
+    "many variables": {f"x{i}": np.arange(1000.0) for i in range(40)},
+    "many small arrays": {"c": np.array([np.ones(i % 3) for i in range(75)], dtype=object)},
+}
+
+
+@pytest.mark.parametrize("compression", [False, True])
+@pytest.mark.parametrize("contents", CONTENTS.values(), ids=CONTENTS)
+def test_the_limit_holds_for_all_contents_together(monkeypatch, contents, compression):
+    """Numbers count as float64: 40 000 of them take 320 000 bytes."""
+    file = io.BytesIO()
+    scipy.io.savemat(file, contents, do_compression=compression)
+    monkeypatch.setattr(mat_format, "largest_contents", lambda size: 300_000)
+    with pytest.raises(InputError, match="save only the variables that are needed"):
+        parse_variables(file.getvalue())
+    monkeypatch.setattr(mat_format, "largest_contents", lambda size: 1_000_000)
+    assert parse_variables(file.getvalue()).keys() == contents.keys()
+
+
+def test_unpacking_changes_nothing():
+    variables = {
+        "matrix": np.random.default_rng(0).normal(size=(30, 4)),
+        "flag": True,
+        "text": "words",
+        "empty": np.empty((0, 3)),
+        "nested": {"list": np.arange(3), "inner": {"sparse": sp.eye_array(5).tocsc()}, "cell": np.array([1, "a"], object)},
+    }  # fmt: skip
+    plain, packed = io.BytesIO(), io.BytesIO()
+    scipy.io.savemat(plain, variables, do_compression=False)
+    scipy.io.savemat(packed, variables, do_compression=True)
+    assert len(packed.getvalue()) < len(plain.getvalue())
+    assert mat_format.unpacked(plain.getvalue()) == plain.getvalue()
+    assert mat_format.unpacked(packed.getvalue())[128:] == plain.getvalue()[128:]
+
+
+def test_files_of_big_endian_machines():
+    parts = (6, (6, 0)), (5, (2, 1)), (9, np.array([3.5, -1], ">f8").tobytes())
+    contents = [data if isinstance(data, bytes) else struct.pack(">2i", *data) for _, data in parts]
+    elements = [struct.pack(">2I", kind, len(c)) + c for (kind, _), c in zip(parts, contents, strict=True)]
+    elements.insert(2, struct.pack(">2H", 1, 1) + b"x\0\0\0")  # the name, as a small element
+    packed = zlib.compress(struct.pack(">2I", 14, sum(map(len, elements))) + b"".join(elements))
+    data = HEADER[:124] + b"\x01\x00MI" + struct.pack(">2I", 15, len(packed)) + packed
+    assert parse_variables(data)["x"].tolist() == [3.5, -1]
+
+
+def test_files_of_level_4(tmp_path):
+    path = tmp_path / "old.mat"
+    mesh = bumpy_mesh(1)
+    scipy.io.savemat(path, {"T12": np.arange(1.0, 43)}, format="4")
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(path, mesh, mesh), np.arange(42))
+
+
+def test_eigenvectors_beyond_the_limit_are_read(monkeypatch, tmp_path):
+    """They hardly compress, so that four times the size of their file leaves room for them."""
+    monkeypatch.setattr(mat_format, "largest_contents", lambda size: max(10_000, 4 * size))
+    spectrum = jaxsmw.compute_spectrum(bumpy_mesh(2), 20)
+    jaxsmw.io.write_spectrum(tmp_path / "s.mat", spectrum)
+    np.testing.assert_allclose(
+        jaxsmw.io.read_spectrum(tmp_path / "s.mat").eigenvectors, spectrum.eigenvectors, rtol=1e-6
+    )
