@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsmw.core.banks.filters import Meyer
+from jaxsmw.core.banks import Meyer
 from matplotlib.image import imread
 from report_helpers import TALL, decode, embedded, renumbered
 
