@@ -342,9 +342,9 @@ def make_mesh(
     notes = list(notes)
 
     if weld:
-        twin = first_equal_rows(position)
-        welded = int((twin[triangles] != triangles).any(axis=1).sum())
-        triangles = twin[triangles]
+        lowest = first_equal_rows(position)
+        welded = int((lowest[triangles] != triangles).any(axis=1).sum())
+        triangles = lowest[triangles]
         notes.append(
             f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one."
             if welded
@@ -367,9 +367,9 @@ def make_mesh(
             "check the positions and the faces."
         )
     _check_resolution(mesh)
-    rim = np.unique(mesh.boundary_edges)
-    twin = first_equal_rows(position[rim])
-    seam = int((np.bincount(twin, minlength=len(rim))[twin] > 1).sum())
+    boundary = np.unique(mesh.boundary_edges)
+    lowest = first_equal_rows(position[boundary])
+    seam = int((np.bincount(lowest, minlength=len(boundary))[lowest] > 1).sum())
     if seam:
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
@@ -487,6 +487,6 @@ def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)
     starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)
-    twins = np.empty(len(rows), dtype=np.int64)
-    twins[order] = order[starts][np.cumsum(starts) - 1]
-    return twins
+    lowest = np.empty(len(rows), dtype=np.int64)
+    lowest[order] = order[starts][np.cumsum(starts) - 1]
+    return lowest
