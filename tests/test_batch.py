@@ -232,6 +232,7 @@ def run_processes(output, count: int) -> None:
 
 
 @pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.cluster
 def test_four_devices_give_the_results_of_one(tmp_path, processes):
     """The host devices belong to one process, or to two processes connected by the network."""
     spectra, starts = make_problem()
