@@ -196,16 +196,17 @@ TOO_LONG = "x" * 300
 
 
 def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
-    calls = [
-        (["benchmark", TOO_LONG], "is not a directory"),
-        (["benchmark", str(scape), "--methods", TOO_LONG], "is not a method"),
-        (["benchmark", str(scape), "--init", TOO_LONG], "is not an initial map"),
-        (["benchmark", str(scape), "--pairs", TOO_LONG], "cannot be read as text"),
-    ]
-    for call, message in calls:
-        assert run_command(call) == 2
-        errors = capsys.readouterr().err
-        assert message in errors and TOO_LONG in errors and "Traceback" not in errors
+    for call in (
+        [TOO_LONG],
+        [str(scape), "--methods", TOO_LONG],
+        [str(scape), "--init", TOO_LONG],
+        [str(scape), "--pairs", TOO_LONG],
+    ):
+        assert run_command(["benchmark", *call]) == 2
+        (message,) = capsys.readouterr().err.splitlines()
+        option = call[1] if len(call) > 1 else "DATASET_DIRECTORY"
+        assert option in message and TOO_LONG[:50] in message
+        assert "cannot be used (File name too long): choose another name" in message
 
 
 class Here(Executor):
