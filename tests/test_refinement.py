@@ -481,5 +481,5 @@ def test_what_is_of_another_kind_is_named():
         "the samples of X is list, but an array is needed",
         "the mesh is 'mesh.off', but a Mesh is needed",
         "source mesh: 'mesh.off' is a file name: read the file with jaxsmw.read_mesh first.",
-        "'Robust' is no Laplacian: choose auto, cotangent, robust.",
+        "'Robust' is not a Laplacian: choose auto, cotangent, robust.",
     ]
