@@ -20,7 +20,7 @@ class ScoreSettings:
       eigenvectors.
     - `orientation_threshold`: orientation is reversed where the smoothed density is below this value; an
       isometry has density 1.
-    - `orientation_weight`: the weight of the share of reversed area in the distortion.
+    - `orientation_weight` (Table R6): the weight of the share of reversed area in the distortion.
     - `same_map_distance`, `same_map_area`: two maps are the same if they differ by more than this distance on
       less than this share of the area.
     """
@@ -41,7 +41,8 @@ class ExpectedErrorSettings:
 
     **Attributes:**
 
-    - `detour_weight`: the weight of the distance from a vertex to the reverse map's match of its match.
+    - `detour_weight` (Tables R17 and R18): the weight of the distance from a vertex to the reverse map's
+      match of its match.
     - `distortion_weight`: the weight of the mean change of the lengths of a vertex's edges. With both weights
       errors on real pairs are 0.8 to 1.4 times the expected errors.
     - `misplaced_weight`: the error expected of a misplaced limb, in square roots of the limb's area.
@@ -72,33 +73,34 @@ class ExtremitySettings:
 
 @dataclass(frozen=True)
 class RepairSettings:
-    """When a map counts as wrong, and how it is repaired. `docs/research_log.md` has the tables named here.
+    """When a map counts as wrong, and how it is repaired. `docs/research_log.md` has the tables and entries
+    named here.
 
     **Attributes:**
 
     - `stage`: the position among the stages of the stage that repair repeats; its refiner has levels.
-    - `fallback_levels`: the levels of that stage in the last attempt, which starts coarser.
-    - `suspicious`: a map with a larger distortion is repaired. Right maps between poses of one body have
-      less.
-    - `doubtful`: after repair a map still counts as right up to this distortion, if no fault is left; between
-      non-isometric shapes some right maps have that much.
+    - `fallback_levels` (entry R4): the levels of that stage in the last attempt, which starts coarser.
+    - `suspicious` (Table R3): a map with a larger distortion is repaired. Right maps between poses of one
+      body have less.
+    - `doubtful` (Table R3): after repair a map still counts as right up to this distortion, if no fault is
+      left; between non-isometric shapes some right maps have that much.
     - `negligible_area`, `excessive_area`: faults on smaller and on larger shares of the area are not
       repaired. (Fingertips come and go. The rest of a body that is mapped upside down does not help.)
-    - `rounds`: the number of rounds of repair, with all later stages.
+    - `rounds` (Table R5): the number of rounds of repair, with all later stages.
     - `rough_rounds`: the number of rounds for alternative initial maps, without later stages.
     - `finalists`: the number of alternative initial maps that go through all stages.
-    - `agreeing`: if no map looks right, the map to which this number of initial maps leads is taken. (Two
-      wrong maps are sometimes the same, three seldom.)
-    - `uncertainty_weight`: the weight of the regression's uncertainty beside the logarithm of the distortion
-      in the score. Upside-down maps are more uncertain, mirrored maps are more distorted. From 6 to 12 the
-      choices are nearly the same.
-    - `score_tolerance`: the fallback is preferred if its score is worse by less than this. Right maps mostly
-      differ by less, upside-down maps by more.
-    - `alternatives`: alternative initial maps by functional maps: SHOT radii in multiples of the usual
-      radius, and the weight of the reverse map.
+    - `agreeing` (entry R7): if no map looks right, the map to which this number of initial maps leads is
+      taken. (Two wrong maps are sometimes the same, three seldom.)
+    - `uncertainty_weight` (Table R13): the weight of the regression's uncertainty beside the logarithm of the
+      distortion in the score. Upside-down maps are more uncertain, mirrored maps are more distorted. From 6
+      to 12 the choices are nearly the same.
+    - `score_tolerance` (entry R4): the fallback is preferred if its score is worse by less than this. Right
+      maps mostly differ by less, upside-down maps by more.
+    - `alternatives` (Table R13): alternative initial maps by functional maps: SHOT radii in multiples of the
+      usual radius, and the weight of the reverse map.
     - `alternative_eigenvectors`: the number of eigenvectors of these functional maps.
-    - `extremity_levels`, `extremity_descriptors`, `extremity_samples`: the stage that refines alternative
-      initial maps from pairings of extremities.
+    - `extremity_levels`, `extremity_descriptors`, `extremity_samples` (entry R14): the stage that refines
+      alternative initial maps from pairings of extremities.
     - `extremity_pairings`: the number of pairings that are tried.
     - `extremity_maps`: the number of pairings that become alternative initial maps.
     - `extremities`: the numbers by which extremities are found.
