@@ -27,7 +27,7 @@ def test_a_tiny_mesh_is_refused(run, tmp_path):
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
     assert_refused(run(*call), naming="--init wks")
     assert_refused(run(*call, "--eigenvectors", "100"), naming="between 1 and 3")
-    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="with 1 eigenvectors")
+    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="1 eigenvectors only tell to which connected component")
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
 
