@@ -1,6 +1,6 @@
 """The documentation site. Built by `sphinx-build -W --keep-going -b html docs build/site`.
 
-Formulas become MathML here, which browsers draw themselves: no script, no fonts, nothing from the network.
+Formulas become MathML, which browsers draw without scripts, fonts or a network.
 """
 
 import re
@@ -37,7 +37,7 @@ exclude_patterns = ["**/.ipynb_checkpoints"]
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
-# So links to headings lead where they do on GitHub.
+# Links to headings work as on GitHub.
 myst_heading_anchors = 3
 html_math_renderer = "mathml"
 
@@ -45,9 +45,10 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 180
 
-# What docstrings and pages name of this library has to exist.
+# Every name of this library in docstrings and pages must exist.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*")]
+# Type variables, such as StateT, have no entry in the reference.
+nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*"), ("py:class", r"jaxsmw\.[\w.]*[a-z]T")]
 default_role = "code"
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
@@ -59,19 +60,35 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 88
 toc_object_entries_show_parents = "hide"
 
-# Where each public name comes from, and the name under which it is documented.
-_PUBLIC = {name: f"jaxsmw.{name}" for name in jaxsmw.__all__}
-_ORIGINS = {
-    f"{value.__module__}.{value.__qualname__}": public
-    for public, value in ((public, getattr(jaxsmw, name)) for name, public in _PUBLIC.items())
-    if hasattr(value, "__qualname__")
-}
+# The modules of public names. A name that several modules have is documented under the first of them.
+_MODULES = (
+    "jaxsmw",
+    "jaxsmw.banks",
+    "jaxsmw.functional_maps",
+    "jaxsmw.learning",
+    "jaxsmw.geometry",
+    "jaxsmw.io",
+    "jaxsmw.evaluation",
+)
+# The documented path of each public name.
+_PUBLIC: dict[str, str] = {}
+# The documented path of each public object, by its other paths.
+_ORIGINS: dict[str, str] = {}
+for _module in map(import_module, _MODULES):
+    for _name in _module.__all__:
+        _path = f"{_module.__name__}.{_name}"
+        _documented = _PUBLIC.setdefault(_name, _path)
+        _value = getattr(_module, _name)
+        if _path != _documented:
+            _ORIGINS[_path] = _documented
+        if hasattr(_value, "__qualname__"):
+            _ORIGINS[f"{_value.__module__}.{_value.__qualname__}"] = _documented
 
 
 class LinkCode(SphinxTransform):
-    """Inline code that is a public name, such as `Meyer` or `Meyer(8)`, leads to its place in the reference.
+    """Links inline code that is a public name, such as `Meyer` or `Meyer(8)`, to its place in the reference.
 
-    What begins with `jaxsmw.` has to name something.
+    Code that begins with `jaxsmw.` must name something.
     """
 
     default_priority = 600
@@ -84,7 +101,7 @@ class LinkCode(SphinxTransform):
             dotted = found[2]
             target = _PUBLIC.get(dotted.partition(".")[0])
             if found[1] and (target is None or not _exists(dotted)):
-                target = f"jaxsmw.{dotted}"  # looked for as it is, and missed if it is not there
+                target = f"jaxsmw.{dotted}"  # Sphinx warns if there is no such name
             if target is not None:
                 link = addnodes.pending_xref(
                     "", refdomain="py", reftype="obj", reftarget=target, refdoc=self.env.docname
@@ -100,7 +117,7 @@ def _parents(node: nodes.Node) -> Iterator[nodes.Node]:
 
 
 def _exists(dotted: str) -> bool:
-    """Whether `jaxsmw.dotted` is a module, or something in one, to any depth."""
+    """Whether `jaxsmw.dotted` is a module, or the path of an object in a module."""
     value: Any = jaxsmw
     path = "jaxsmw"
     for name in dotted.split("."):
@@ -115,7 +132,7 @@ def _exists(dotted: str) -> bool:
 
 
 def name_tables(app: Sphinx, document: str, content: list[str]) -> None:
-    """Tables of several runs on one data set bear its name: here each bears its run's, too."""
+    """Gives each table the name of its run, because several runs on one data set have the same title."""
     if re.fullmatch(r"results/.*/summary", document):
         run = document.removeprefix("results/").removesuffix("/summary")
         content[0] = content[0].replace(content[0].partition("\n")[0], f"# {run}", 1)
@@ -124,13 +141,13 @@ def name_tables(app: Sphinx, document: str, content: list[str]) -> None:
 def resolve_origin(
     app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Element
 ) -> nodes.Node | None:
-    """What an annotation names by the module it is defined in is documented under its public name."""
+    """Resolves a name by the module that defines it, or by another public path, to its documented path."""
     if node.get("refdomain") != "py":
         return None
     target = node["reftarget"]
     public = _ORIGINS.get(target)
     if public is None:
-        # A module or a private helper that a page mentions: it exists, and has no place of its own.
+        # A module or a private helper that a page mentions exists, but has no entry in the reference.
         named = node.get("reftype") == "obj" and target.startswith("jaxsmw.")
         return content if named and _exists(target.removeprefix("jaxsmw.")) else None
     domain = env.domains.python_domain
@@ -140,7 +157,7 @@ def resolve_origin(
 def shorten_signature(
     app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str | None, returns: str | None
 ) -> tuple[str | None, str | None]:
-    """Defaults and names that Sphinx can take apart."""
+    """Replaces defaults and names that Sphinx cannot parse."""
     short = (
         text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text.replace("<factory>", "..."))
         for text in (signature, returns)
@@ -149,7 +166,7 @@ def shorten_signature(
 
 
 def shorten_arrays(app: Sphinx, domain: str, kind: str, content: addnodes.desc_content) -> None:
-    """`Float[Array, 'n k']`, wherever jaxlib keeps its arrays."""
+    """Writes `Float[Array, 'n k']` without the module of jaxlib that defines arrays."""
     for signature in content.parent.findall(addnodes.desc_signature):
         for text in list(signature.findall(nodes.Text)):
             if "jaxlib._jax." in text:
@@ -157,14 +174,14 @@ def shorten_arrays(app: Sphinx, domain: str, kind: str, content: addnodes.desc_c
 
 
 def describe_results(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    """The members of `RESULTS` are values, whose meaning is their sentence."""
+    """Lists the members of `RESULTS` with their sentences."""
     if name == "jaxsmw.RESULTS":
         members = (member for member in vars(value) if not member.startswith("_"))
         lines += [f"- ``{member}``: {value[getattr(value, member)]}" for member in members] + [""]
 
 
 def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
-    """Every public name has to stand in the reference."""
+    """Warns about public names that the reference lacks."""
     missing = sorted(set(_PUBLIC.values()) - set(env.domains.python_domain.objects))
     if missing:
         logger.warning("the reference lacks %s: add them to a page in docs/api", ", ".join(missing))
@@ -172,7 +189,7 @@ def check_complete(app: Sphinx, env: BuildEnvironment) -> None:
 
 def to_mathml(node: nodes.math | nodes.math_block, display: str) -> str:
     mathml = convert(node.astext(), display=display)
-    # What the converter does not know comes out as it is.
+    # The converter copies commands that it does not know.
     if re.search(r"<m[ion][^>]*>(\\|&<|&amp;|&#x0002A;)", mathml):
         logger.warning("latex2mathml does not know all of this formula: %s", node.astext(), location=node)
     return mathml

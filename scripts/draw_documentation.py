@@ -42,7 +42,7 @@ class Case(NamedTuple):
     name: str
     source: jaxsmw.Mesh
     target: jaxsmw.Mesh
-    truth: jaxsmw.GroundTruth
+    truth: jaxsmw.evaluation.GroundTruth
     failing: dict[str, Any]
     cure: dict[str, Any] | None
     up: str | None = "y"
@@ -51,11 +51,13 @@ class Case(NamedTuple):
 def procedural_cases() -> Iterator[Case]:
     """Whoever has the library has these."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
-    truth = jaxsmw.GroundTruth.of_all_vertices(pair.truth)
+    truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
 
     (source, at_source), (target, at_target) = star(3000, 0), star(2900, 1)
-    truth = jaxsmw.GroundTruth.of_all_vertices(KDTree(at_target).query(at_source)[1].astype(np.int64))
+    truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(
+        KDTree(at_target).query(at_source)[1].astype(np.int64)
+    )
     yield Case("symmetric", source, target, truth, {}, {"init": landmarks_on_arms(at_source, at_target)}, "z")
 
     part, truth = front_of(pair)
@@ -72,7 +74,9 @@ def real_cases(data: Path) -> Iterator[Case]:
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
     ):
-        (pair,) = (pair for pair in jaxsmw.open_data_set(data / directory).pairs if pair.names == names)
+        (pair,) = (
+            pair for pair in jaxsmw.evaluation.open_data_set(data / directory).pairs if pair.names == names
+        )
         source, target = jaxsmw.read_mesh(pair.source_file), jaxsmw.read_mesh(pair.target_file)
         yield Case(name, source, target, pair.ground_truth(source, target), {}, cure, None)
 
@@ -102,22 +106,24 @@ def landmarks_on_arms(
     return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
 
 
-def front_of(pair: jaxsmw.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.GroundTruth]:
+def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
     """The front half of the source, without the vertices of the rest."""
     whole, ahead = pair.source, pair.source.vertices[:, 2]
     faces = whole.faces[(ahead[whole.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
     used, numbers = np.unique(faces, return_inverse=True)
-    truth = jaxsmw.SurfacePoints(pair.truth.faces[used], pair.truth.weights[used])
+    truth = jaxsmw.geometry.SurfacePoints(pair.truth.faces[used], pair.truth.weights[used])
     part = jaxsmw.make_mesh(whole.vertices[used], numbers.reshape(-1, 3), name=f"front of {whole.name}")
-    return part, jaxsmw.GroundTruth.of_all_vertices(truth)
+    return part, jaxsmw.evaluation.GroundTruth.of_all_vertices(truth)
 
 
-def coarser(pair: jaxsmw.CreaturePair, vertices: int) -> tuple[jaxsmw.Mesh, jaxsmw.GroundTruth]:
+def coarser(
+    pair: jaxsmw.geometry.CreaturePair, vertices: int
+) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
     """The target with few vertices, and for each vertex of the source the nearest of them."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
-    return coarse, jaxsmw.GroundTruth.of_all_vertices(nearest.astype(np.int64))
+    return coarse, jaxsmw.evaluation.GroundTruth.of_all_vertices(nearest.astype(np.int64))
 
 
 def draw_case(case: Case) -> str:

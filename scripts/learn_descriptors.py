@@ -6,7 +6,7 @@
 It needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` makes descriptors of
-vertices from SHOT and the wave kernel signature. A `jaxsmw.WaveletPreservationLayer` behind it makes of those
+vertices from SHOT and the wave kernel signature. A `jaxsmw.learning.WaveletPreservationLayer` behind it makes of those
 of two shapes a functional map and a soft map, and by gradients through both the network is trained by Adam
 (optax) on pairs of FAUST's first five people, one at each step: once with the truth, once without.
 
@@ -59,19 +59,18 @@ from jaxsmw import (
     Pair,
     Spectrum,
     WaveletPreservation,
-    WaveletPreservationLayer,
     compute_spectrum,
-    farthest_point_samples,
-    nearest_neighbor,
     prepare,
     read_mesh,
-    shot_descriptors,
 )
 from jaxsmw.core.products import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.evaluation.datasets import DataPair
+from jaxsmw.functional_maps import nearest_neighbor
+from jaxsmw.geometry import farthest_point_samples, shot_descriptors
 from jaxsmw.geometry.shot import SHOT_DIMENSION
+from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0

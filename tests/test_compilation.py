@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsmw import compiler_options, nearest_neighbor
+from jaxsmw import compiler_options
+from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.runtime import compilation
 from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
 

@@ -20,7 +20,8 @@ import trimesh
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
-from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh, make_spectrum
+from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
+from jaxsmw.io import make_spectrum
 from jaxsmw.io.map_files import read_landmarks
 
 K = 12
@@ -400,13 +401,13 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
 def test_spectra_survive_files(bodies, spectra, tmp_path, suffix):
     for body, spectrum in zip(bodies, spectra, strict=True):
         path = tmp_path / f"body{suffix}"
-        jaxsmw.write_spectrum(path, spectrum.scale(4.0), body)
-        same_spectrum(jaxsmw.read_spectrum(path), spectrum, tolerance=1e-12)
+        jaxsmw.io.write_spectrum(path, spectrum.scale(4.0), body)
+        same_spectrum(jaxsmw.io.read_spectrum(path), spectrum, tolerance=1e-12)
 
 
 def test_a_shape_for_matlab(bodies, spectra, tmp_path):
     body, spectrum = bodies[0], spectra[0]
-    jaxsmw.write_spectrum(tmp_path / "x.mat", spectrum, body)
+    jaxsmw.io.write_spectrum(tmp_path / "x.mat", spectrum, body)
     shape = scipy.io.loadmat(tmp_path / "x.mat", squeeze_me=False)["S"][0, 0]
     n = len(body.vertices)
     assert shape["evals"].shape == (K, 1) and shape["evecs"].shape == (n, K) and shape["A"].shape == (n, n)
@@ -441,16 +442,16 @@ def test_shapes_of_other_matlab_code(spectra, tmp_path, form, nested):
         **field,
     }
     path = mat_file(tmp_path / "s.mat", **({"shape": fields, "about": "a body"} if nested else fields))
-    same_spectrum(jaxsmw.read_spectrum(path), spectra[0], tolerance=1e-12)
+    same_spectrum(jaxsmw.io.read_spectrum(path), spectra[0], tolerance=1e-12)
 
 
 def test_matlab_code_can_use_our_files(bodies, spectra, pointwise_map, tmp_path):
     """C21 = S1.evecs' * S1.A * S2.evecs(T12, :), and T12 = knnsearch(S2.evecs * C21', S1.evecs)."""
     x, y = spectra
     ours = encode(jnp.asarray(pointwise_map), x, y)
-    jaxsmw.write_spectrum(tmp_path / "1.mat", x, bodies[0])
-    jaxsmw.write_spectrum(tmp_path / "2.mat", y)
-    jaxsmw.write_functional_map(tmp_path / "c.mat", ours)
+    jaxsmw.io.write_spectrum(tmp_path / "1.mat", x, bodies[0])
+    jaxsmw.io.write_spectrum(tmp_path / "2.mat", y)
+    jaxsmw.io.write_functional_map(tmp_path / "c.mat", ours)
     jaxsmw.write_pointwise_map(tmp_path / "t.mat", pointwise_map)
     s_1, s_2 = (scipy.io.loadmat(tmp_path / f"{i}.mat")["S"][0, 0] for i in (1, 2))
     t_12, c_21 = scipy.io.loadmat(tmp_path / "t.mat")["T12"], scipy.io.loadmat(tmp_path / "c.mat")["C21"]
@@ -459,7 +460,7 @@ def test_matlab_code_can_use_our_files(bodies, spectra, pointwise_map, tmp_path)
     np.testing.assert_allclose(c_21, composed, atol=1e-12)
     distances = np.linalg.norm((s_2["evecs"] @ c_21.T)[None] - s_1["evecs"][:, None], axis=2)
     np.testing.assert_array_equal(distances.argmin(axis=1), decode(ours, x, y))
-    np.testing.assert_array_equal(jaxsmw.read_functional_map(tmp_path / "c.mat", x, y), np.asarray(ours))
+    np.testing.assert_array_equal(jaxsmw.io.read_functional_map(tmp_path / "c.mat", x, y), np.asarray(ours))
     np.testing.assert_array_equal(jaxsmw.read_pointwise_map(tmp_path / "t.mat", *bodies), pointwise_map)
 
 
@@ -521,8 +522,8 @@ def test_damaged_mat_files_end_in_one_sentence(bodies, spectra, tmp_path, kind, 
 
 READERS = {
     "mesh": lambda path, *_: jaxsmw.read_mesh(path),
-    "spectrum": lambda path, *_: jaxsmw.read_spectrum(path),
-    "functional map": lambda path, _, spectra: jaxsmw.read_functional_map(path, *spectra),
+    "spectrum": lambda path, *_: jaxsmw.io.read_spectrum(path),
+    "functional map": lambda path, _, spectra: jaxsmw.io.read_functional_map(path, *spectra),
     "pointwise map": lambda path, bodies, _: jaxsmw.read_pointwise_map(path, *bodies),
 }
 M, N = 642, 162
@@ -588,7 +589,7 @@ def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path):
             archive.writestr(f"{number}.npy", bytes(400_000_000))
     assert (tmp_path / "bomb.npz").stat().st_size < 10_000_000
     with pytest.raises(InputError, match=r"bomb\.npz: would take more than 1 GiB of memory"):
-        jaxsmw.read_spectrum(tmp_path / "bomb.npz")
+        jaxsmw.io.read_spectrum(tmp_path / "bomb.npz")
 
 
 def test_what_cannot_be_written_or_read_is_refused(bodies, spectra, tmp_path):
@@ -596,14 +597,14 @@ def test_what_cannot_be_written_or_read_is_refused(bodies, spectra, tmp_path):
     (tmp_path / "damaged.npz").write_bytes(b"no archive")
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
-        "written as .npz or .mat": lambda: jaxsmw.write_spectrum(tmp_path / "x.txt", x),
-        "has 642 vertices and y 162": lambda: jaxsmw.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
-        "written as .mat": lambda: jaxsmw.write_functional_map(tmp_path / "c.txt", np.eye(3)),
-        "not all finite": lambda: jaxsmw.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
-        "read from .npz and .mat": lambda: jaxsmw.read_spectrum(tmp_path / "x.txt"),
-        "does not exist": lambda: jaxsmw.read_spectrum(tmp_path / "x.npz"),
-        "damaged or lacks": lambda: jaxsmw.read_spectrum(tmp_path / "damaged.npz"),
-        "lacks one of": lambda: jaxsmw.read_spectrum(tmp_path / "fields.npz"),
+        "written as .npz or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
+        "has 642 vertices and y 162": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
+        "written as .mat": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.txt", np.eye(3)),
+        "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
+        "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),
+        "does not exist": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.npz"),
+        "damaged or lacks": lambda: jaxsmw.io.read_spectrum(tmp_path / "damaged.npz"),
+        "lacks one of": lambda: jaxsmw.io.read_spectrum(tmp_path / "fields.npz"),
         "not a pointwise map": lambda: jaxsmw.write_pointwise_map(tmp_path / "t.mat", [0.5]),
     }.items():
         with pytest.raises(InputError, match=fault):

@@ -30,7 +30,8 @@ from learn_descriptors import (
 )
 from learning import train
 
-from jaxsmw import InputError, creature_pair, farthest_point_samples, make_mesh
+from jaxsmw import InputError, creature_pair, make_mesh
+from jaxsmw.geometry import farthest_point_samples
 
 SMALL = Sizes(waves=8, width=12, blocks=2, filters=4, outputs=6)
 SAMPLES, EIGENVECTORS = 90, 20

@@ -135,7 +135,7 @@ def test_eigenvectors_beyond_the_limit_are_read(monkeypatch, tmp_path):
     """They hardly compress, so that four times the size of their file leaves room for them."""
     monkeypatch.setattr(mat_format, "largest_contents", lambda size: max(10_000, 4 * size))
     spectrum = jaxsmw.compute_spectrum(bumpy_mesh(2), 20)
-    jaxsmw.write_spectrum(tmp_path / "s.mat", spectrum)
+    jaxsmw.io.write_spectrum(tmp_path / "s.mat", spectrum)
     np.testing.assert_allclose(
-        jaxsmw.read_spectrum(tmp_path / "s.mat").eigenvectors, spectrum.eigenvectors, rtol=1e-6
+        jaxsmw.io.read_spectrum(tmp_path / "s.mat").eigenvectors, spectrum.eigenvectors, rtol=1e-6
     )

@@ -1,0 +1,36 @@
+"""Functional maps: solutions, energies, searches and spectral signatures; see `docs/mathematics.md`."""
+
+from jaxsmw.core.functional_map import QuadraticEnergy, WaveletProblem, encode, multiscale_kernel
+from jaxsmw.core.pointwise_map import decode, decode_to_triangles, search_patches
+from jaxsmw.core.search import nearest_neighbor
+from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
+from jaxsmw.core.solutions import (
+    DescriptorPair,
+    Filtering,
+    LeastSquares,
+    NearestOrthogonal,
+    RegularizedLeastSquares,
+    Solution,
+)
+from jaxsmw.core.triangles import nearest_point_on_triangles
+
+__all__ = [
+    "DescriptorPair",
+    "Filtering",
+    "LeastSquares",
+    "NearestOrthogonal",
+    "QuadraticEnergy",
+    "RegularizedLeastSquares",
+    "Solution",
+    "WaveletProblem",
+    "decode",
+    "decode_to_triangles",
+    "encode",
+    "heat_kernel_signature",
+    "multiscale_kernel",
+    "nearest_neighbor",
+    "nearest_point_on_triangles",
+    "search_patches",
+    "wave_kernel_signature",
+    "wavelet_signature",
+]

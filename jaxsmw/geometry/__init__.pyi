@@ -1,0 +1,21 @@
+from .assignment import one_to_one_map
+from .creature import CreaturePair, creature_pair
+from .eigenbasis import compute_spectrum
+from .geodesics import SurfacePoints, geodesic_distances
+from .mesh import Mesh, diagnose, make_mesh
+from .sampling import farthest_point_samples
+from .shot import shot_descriptors
+
+__all__ = [
+    "CreaturePair",
+    "Mesh",
+    "SurfacePoints",
+    "compute_spectrum",
+    "creature_pair",
+    "diagnose",
+    "farthest_point_samples",
+    "geodesic_distances",
+    "make_mesh",
+    "one_to_one_map",
+    "shot_descriptors",
+]

@@ -1,0 +1,27 @@
+"""Soft maps and refinement that can be differentiated; see `docs/gradients.md`."""
+
+from jaxsmw.core.soft_maps import (
+    NearestFew,
+    Recovery,
+    Sinkhorn,
+    SoftMap,
+    Softmax,
+    SparseSoftMap,
+    pull_back,
+    sinkhorn,
+)
+from jaxsmw.core.soft_refinement import SoftRefinement, WaveletPreservationLayer, refine_softly
+
+__all__ = [
+    "NearestFew",
+    "Recovery",
+    "Sinkhorn",
+    "SoftMap",
+    "SoftRefinement",
+    "Softmax",
+    "SparseSoftMap",
+    "WaveletPreservationLayer",
+    "pull_back",
+    "refine_softly",
+    "sinkhorn",
+]
