@@ -1,7 +1,7 @@
 """Deformable shape correspondence in JAX by multiscale spectral manifold wavelets preservation.
 
-The public names stand in `__init__.pyi`; they are loaded when first used, so that `jaxsmw --help` need not
-wait for JAX. Nothing else is imported before that, so that the command line handles Ctrl-C from early on.
+`__init__.pyi` lists the public names. A name is loaded at its first use, so `jaxsmw --help` need not wait for
+JAX. This module imports hardly anything, so the command line handles Ctrl-C soon after its start.
 """
 
 from functools import cache
