@@ -47,8 +47,11 @@ nb_execution_timeout = 180
 
 # Every name of this library in docstrings and pages must exist.
 nitpicky = True
-# Type variables, such as StateT, have no entry in the reference.
-nitpick_ignore_regex = [("py:.*", r"(?!jaxsmw\b).*"), ("py:class", r"jaxsmw\.[\w.]*[a-z]T")]
+# Type variables have no entry in the reference.
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!jaxsmw\b).*"),
+    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.Side)"),
+]
 default_role = "code"
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
@@ -76,9 +79,11 @@ _PUBLIC: dict[str, str] = {}
 _ORIGINS: dict[str, str] = {}
 for _module in map(import_module, _MODULES):
     for _name in _module.__all__:
+        _value = getattr(_module, _name)
+        if isinstance(_value, ModuleType):
+            continue
         _path = f"{_module.__name__}.{_name}"
         _documented = _PUBLIC.setdefault(_name, _path)
-        _value = getattr(_module, _name)
         if _path != _documented:
             _ORIGINS[_path] = _documented
         if hasattr(_value, "__qualname__"):

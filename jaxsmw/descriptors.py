@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import Samples, spread_samples
+from jaxsmw.geometry.sampling import SurfaceSamples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
@@ -39,11 +39,11 @@ class SampledShape(NamedTuple):
     """
 
     mesh: Mesh
-    samples: Samples | None
+    samples: SurfaceSamples | None
     spectrum: Spectrum
 
     @classmethod
-    def make(cls, mesh: Mesh, samples: Samples | None, spectrum: Spectrum) -> SampledShape:
+    def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
         """**Raises:** `InputError` if the spectrum belongs to another mesh."""
         if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
             raise InputError(
@@ -85,8 +85,8 @@ def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Sampl
     )
 
 
-def _samples(mesh: Mesh) -> Samples | None:
-    return spread_samples(mesh, _COMPARED) if len(mesh.vertices) > _COMPARED_FROM else None
+def _samples(mesh: Mesh) -> SurfaceSamples | None:
+    return poisson_disk_samples(mesh, _COMPARED) if len(mesh.vertices) > _COMPARED_FROM else None
 
 
 def describe(
@@ -163,7 +163,7 @@ def paired_shot(
         own_radius = radius * unit / mesh.area**0.5
         if radius <= SHOT_RADIUS or len(mesh.vertices) <= _SPREAD:
             return shot_descriptors(mesh, radius=own_radius, samples=samples)
-        fewer = spread_samples(mesh, _SPREAD)
+        fewer = poisson_disk_samples(mesh, _SPREAD)
         nearest = fewer.nearest if samples is None else fewer.nearest[samples.vertices]
         return shot_descriptors(mesh, radius=own_radius, samples=fewer)[nearest]
 

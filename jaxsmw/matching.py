@@ -24,7 +24,7 @@ from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unused
+from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
 from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare, program_size
@@ -116,9 +116,9 @@ class Correspondence:
         **Raises:** `InputError` if faces of X use more vertices than faces of Y.
         """
         queries, database = (np.asarray(points) for points in self._embeddings())
-        used = self.mesh_x.used_vertices
-        found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.used_vertices)
-        return extend_to_unused(self.mesh_x, found)
+        used = self.mesh_x.referenced_vertices
+        found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
+        return extend_to_unreferenced(self.mesh_x, found)
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """A transport plan that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
@@ -172,13 +172,13 @@ class Correspondence:
         expected = expected_error(
             self.pair, self.pointwise_map, np.asarray(reverse_map).astype(np.int64), self.spectrum_x
         )
-        return extend_to_unused(self.mesh_x, expected)
+        return extend_to_unreferenced(self.mesh_x, expected)
 
     def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """The embeddings of the last stage; vertices of X that no face uses lie where the nearest ones do."""
         with self._precision():
             queries, database = compiled(_embeddings)(*self._last_stage())
-            return jax.device_put(extend_to_unused(self.mesh_x, np.asarray(queries))), database
+            return jax.device_put(extend_to_unreferenced(self.mesh_x, np.asarray(queries))), database
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
         problem = Problem(self.spectrum_x, self.spectrum_y, partial=self.pair.partial)
@@ -295,7 +295,7 @@ def _correspondence(
     )
     return Correspondence(
         pair=pair,
-        pointwise_map=extend_to_unused(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
+        pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         stages=preset.stages,
         spectrum_x=spectrum_x,

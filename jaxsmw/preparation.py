@@ -44,7 +44,7 @@ def fewest_vertices(pair: Pair) -> int:
 
     **Raises:** `InputError` if a mesh has too few to be matched.
     """
-    used = [int(mesh.used_vertices.sum()) for mesh in pair.meshes]
+    used = [int(mesh.referenced_vertices.sum()) for mesh in pair.meshes]
     for mesh, number in zip(pair.meshes, used, strict=True):
         if number < _FEWEST_VERTICES:
             raise InputError(

@@ -63,7 +63,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
+from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps import initial_map
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
@@ -284,14 +284,14 @@ def stages(options: argparse.Namespace) -> Iterator[Part]:
     for size in options.sizes:
         mesh = creature_pair(vertices=size).source
         sources = np.arange(0, len(mesh.vertices), len(mesh.vertices) // 100)
-        spread = spread_samples(mesh, 10_000)
+        spread = poisson_disk_samples(mesh, 10_000)
         with tempfile.TemporaryDirectory() as directory:
             file = Path(directory) / "mesh.off"
             write_mesh(file, mesh)
             seconds = medians(
                 {
                     "eigenbasis": lambda mesh=mesh: eigenpairs(mesh, EIGENVECTORS, eigensolver="exact"),
-                    "10 000 samples": lambda mesh=mesh: spread_samples(mesh, 10_000),
+                    "10 000 samples": lambda mesh=mesh: poisson_disk_samples(mesh, 10_000),
                     "SHOT of all": lambda mesh=mesh: shot_descriptors(mesh),
                     "SHOT of samples": lambda mesh=mesh, at=spread: shot_descriptors(mesh, samples=at),
                     "farthest points": lambda mesh=mesh: farthest_point_samples(mesh, SAMPLES),

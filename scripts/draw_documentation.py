@@ -1,11 +1,11 @@
-"""Draw the pictures of docs/tutorial.md and docs/failures.md, and print the figures of the latter.
+"""Draws the pictures of docs/tutorial.md and docs/failures.md, and prints the table of docs/failures.md.
 
     pip install -e ".[report]"
     python scripts/draw_documentation.py [DATA_DIRECTORY]
 
-The tutorial's pictures are what its own code draws. The failure cases are procedural; where DATA_DIRECTORY
-is given, as scripts/compare_frames.py takes it, two more are real: SHREC'16 topology and TOSCA's pairs of
-different classes. Takes some minutes.
+The tutorial's own code draws its pictures. The failure cases are procedural. With a DATA_DIRECTORY, as for
+scripts/compare_frames.py, there are two cases with real shapes: SHREC'16 topology and non-isometric pairs of
+TOSCA. The script takes some minutes.
 """
 
 import argparse
@@ -32,12 +32,12 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# With dithering enough for bodies in smooth colours, in a third of the space.
+# Dithered, this number of colours is enough for smoothly coloured bodies, in a third of the space.
 COLORS = 256
 
 
 class Case(NamedTuple):
-    """A pair, how it is matched so that it fails, and how it should have been matched."""
+    """A pair, options of `jaxsmw.match` with which the match fails, and options that cure the failure."""
 
     name: str
     source: jaxsmw.Mesh
@@ -49,7 +49,7 @@ class Case(NamedTuple):
 
 
 def procedural_cases() -> Iterator[Case]:
-    """Whoever has the library has these."""
+    """The cases that need no data."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
@@ -69,7 +69,7 @@ def procedural_cases() -> Iterator[Case]:
 
 
 def real_cases(data: Path) -> Iterator[Case]:
-    """Two pairs that have no procedural likeness."""
+    """The cases with real shapes."""
     for name, directory, names, cure in (
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
@@ -82,7 +82,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """A body with five equal arms that hang down, and where on a sphere its vertices come from."""
+    """A body with five equal hanging arms, and the points of a sphere that became its vertices (n, 3)."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -101,25 +101,25 @@ def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"
 def landmarks_on_arms(
     at_source: Float[np.ndarray, "m 3"], at_target: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "2 2"]:
-    """The tips of two arms next to each other."""
+    """The tips of two neighbouring arms, as landmarks."""
     tips = np.array([[1, 0, 0], [np.cos(2 * np.pi / 5), np.sin(2 * np.pi / 5), 0]])
     return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
 
 
 def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """The front half of the source, without the vertices of the rest."""
-    whole, ahead = pair.source, pair.source.vertices[:, 2]
-    faces = whole.faces[(ahead[whole.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
+    """The front half of the source, as a mesh of its own, and its ground truth."""
+    full, ahead = pair.source, pair.source.vertices[:, 2]
+    faces = full.faces[(ahead[full.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
     used, numbers = np.unique(faces, return_inverse=True)
     truth = jaxsmw.geometry.SurfacePoints(pair.truth.faces[used], pair.truth.weights[used])
-    part = jaxsmw.make_mesh(whole.vertices[used], numbers.reshape(-1, 3), name=f"front of {whole.name}")
+    part = jaxsmw.make_mesh(full.vertices[used], numbers.reshape(-1, 3), name=f"front of {full.name}")
     return part, jaxsmw.evaluation.GroundTruth.of_all_vertices(truth)
 
 
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """The target with few vertices, and for each vertex of the source the nearest of them."""
+    """The target with few vertices, and as ground truth the nearest of them to each true match."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
@@ -127,7 +127,7 @@ def coarser(
 
 
 def draw_case(case: Case) -> str:
-    """Write a case's picture; a row of the table."""
+    """Writes the picture of a case, and returns its row of the table."""
     cells = []
     for settings in (case.failing, case.cure):
         if settings is None:
@@ -142,19 +142,19 @@ def draw_case(case: Case) -> str:
         expected = result.expected_error()
         cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
         if settings is case.failing:
-            # A vertex of which no truth is known takes the error of the nearest one.
+            # A vertex without ground truth gets the error of the nearest vertex with ground truth.
             known = KDTree(case.source.vertices[error.source_vertices])
             errors = error.errors[known.query(case.source.vertices)[1]]
             panels = {"Error": errors, "Expected error": expected}
             figure = draw_correspondence(
-                case.source, case.target, result.pointwise_map, errors=panels, error_limit=0.25, up=case.up
+                case.source, case.target, result.pointwise_map, errors=panels, up=case.up
             )
             save_small(PICTURES / f"failure_{case.name}.png", figure)
     return f"| {case.name} | {' | '.join(cells)} |"
 
 
 def save_small(path: Path, figure: Figure | Path) -> None:
-    """Write a picture, from a figure or a larger file, at most 1200 pixels wide and of few colours."""
+    """Writes a figure or a larger picture as a PNG of at most 1200 pixels in width and with few colours."""
     if isinstance(figure, Path):
         image = Image.open(figure)
     else:
@@ -166,14 +166,14 @@ def save_small(path: Path, figure: Figure | Path) -> None:
         image = image.resize((1200, round(image.height * 1200 / image.width)), Image.Resampling.LANCZOS)
     few = image.quantize(palette=image.quantize(COLORS), dither=Image.Dither.FLOYDSTEINBERG)
     palette = np.array(few.getpalette()).reshape(-1, 3)
-    palette[(palette >= 248).all(axis=1)] = 255  # the background is white, not nearly so
+    palette[(palette >= 248).all(axis=1)] = 255  # keep the background purely white
     few.putpalette(palette.ravel().tolist())
     with atomic_write(path) as temporary:
         few.save(temporary, format="png", optimize=True)
 
 
 def draw_tutorial() -> None:
-    """Run the tutorial's code, and keep the pictures that it shows."""
+    """Runs the code of the tutorial and keeps its pictures."""
     page = (DOCS / "tutorial.md").read_text("utf-8")
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL))
     began = Path.cwd()
@@ -192,7 +192,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="tutorial, or names of cases")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="draw only these: tutorial, or names of cases"
+    )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
     if not options.only or "tutorial" in options.only:

@@ -1,4 +1,4 @@
-"""A picture of an interactive page: wavelets around one point, in headless Chromium.
+"""Draws an interactive page in headless Chromium, with the wavelets around one point.
 
 Run as `python scripts/draw_page.py PAGE.html PICTURE.png`. Needs the extra `test`, Chromium and its driver.
 """
@@ -13,16 +13,20 @@ from pathlib import Path
 
 from jaxsmw.runtime.files import atomic_write
 
-WIDTH, HEIGHT = 1280, 770
+WIDTH, HEIGHT = 1280, 850
 
 
 def main() -> None:
-    """Draw the page."""
+    """Opens the page, chooses a wavelet and a vertex, and writes a screenshot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", metavar="PAGE.html", type=Path)
     parser.add_argument("picture", metavar="PICTURE.png", type=Path)
-    parser.add_argument("--vertex", type=int, default=4127, help="of the source (default: %(default)s)")
-    parser.add_argument("--scale", type=int, default=4, help="0 is the coarsest (default: %(default)s)")
+    parser.add_argument(
+        "--vertex", type=int, default=4127, help="vertex of the source (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--scale", type=int, default=4, help="scale of the wavelet, 0 for the widest (default: %(default)s)"
+    )
     options = parser.parse_args()
     from PIL import Image
     from selenium import webdriver
@@ -53,7 +57,7 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # 256 colours, dithered, are enough, and half the size.
+        # 256 dithered colours are enough and halve the size.
         picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 

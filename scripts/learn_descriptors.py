@@ -6,7 +6,7 @@
 It needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` makes descriptors of
-vertices from SHOT and the wave kernel signature. A `jaxsmw.learning.WaveletPreservationLayer` behind it makes of those
+vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` behind it makes of those
 of two shapes a functional map and a soft map, and by gradients through both the network is trained by Adam
 (optax) on pairs of FAUST's first five people, one at each step: once with the truth, once without.
 

@@ -7,7 +7,7 @@ It needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `SoftmaxFrame`, a Parseval frame whatever
 its parameters are, starts like Meyer's with six filters and is trained on pairs of FAUST's first five people
-by Adam (optax), one pair at each step, with gradients through `jaxsmw.learning.refine_softly` on samples of both
+by Adam (optax), one pair at each step, with gradients through `refine_softly` on samples of both
 shapes: once with the truth, once without. What is minimised is how far matches are from the truth, or how far
 one is from where one began after going there and back, as the root of the mean square over a soft map.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 from threadpoolctl import threadpool_limits
 
@@ -76,3 +77,9 @@ def forget_programs() -> Iterator[None]:
     """Compiled programs go when their tests are done: those of the whole suite would take gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs the library as users do: without run-time checks of types, which would pre-empt its own messages."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

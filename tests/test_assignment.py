@@ -1,4 +1,4 @@
-"""One-to-one maps: the constraint exactly, and the least sum, against brute force."""
+"""One-to-one maps: the constraint, and the least sum by brute force."""
 
 from itertools import permutations
 
@@ -21,7 +21,7 @@ def cost(x, y, found):
 
 
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 6), (3, 6), (6, 6)])
-def test_is_the_best_of_all(generator, m, n):
+def test_the_map_is_the_best_of_all_permutations(generator, m, n):
     x, y = generator.normal(size=(m, 4)), generator.normal(size=(n, 4))
     found = one_to_one_map(x, y)
     assert found.dtype == np.int64 and len(set(found)) == m
@@ -30,23 +30,23 @@ def test_is_the_best_of_all(generator, m, n):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_no_two_on_one_at_5000(generator, dtype):
+def test_no_target_is_used_twice_among_5000(generator, dtype):
     x = generator.normal(size=(5000, 3)).astype(dtype)
     y = x[generator.permutation(5000)] + (0.02 * generator.normal(size=(5000, 3))).astype(dtype)
     found = one_to_one_map(x, y)
     np.testing.assert_array_equal(np.sort(found), np.arange(5000))
 
 
-def test_finds_a_renumbering_again(generator):
+def test_a_renumbering_is_recovered(generator):
     x, order = generator.normal(size=(400, 5)), generator.permutation(400)
     np.testing.assert_array_equal(one_to_one_map(x, x[order]), np.argsort(order))
-    # Far from the origin as well, and for other signs.
+    # The same holds far from the origin, and with other signs.
     np.testing.assert_array_equal(one_to_one_map(x + 1e3, x[order] + 1e3), np.argsort(order))
     signs = np.array([1, -1, -1, 1, -1])
     np.testing.assert_array_equal(one_to_one_map(signs * x, signs * x[order]), np.argsort(order))
 
 
-def test_masked_vertices_neither_ask_nor_answer(generator):
+def test_masked_vertices_are_not_matched(generator):
     x, y = generator.normal(size=(50, 4)), generator.normal(size=(60, 4))
     mask_x, mask_y = generator.random(50) < 0.7, generator.random(60) < 0.8
     x[~mask_x], y[~mask_y] = np.nan, np.nan
@@ -56,12 +56,12 @@ def test_masked_vertices_neither_ask_nor_answer(generator):
     np.testing.assert_array_equal(found[mask_x], np.flatnonzero(mask_y)[alone])
 
 
-def test_equal_points_share_out_what_there_is():
+def test_equal_points_get_different_targets():
     found = one_to_one_map(np.zeros((7, 3)), np.zeros((7, 3)))
     np.testing.assert_array_equal(np.sort(found), np.arange(7))
 
 
-def test_what_cannot_work_is_refused(generator, monkeypatch):
+def test_impossible_problems_are_refused(generator, monkeypatch):
     x = generator.normal(size=(5, 3))
     with pytest.raises(InputError, match=r"5 vertices of the source .* 4 of the target: swap"):
         one_to_one_map(x, x[:4])

@@ -231,6 +231,7 @@ def run_processes(output, count: int) -> None:
 
 
 @pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.cluster
 def test_four_devices_give_what_one_gives(tmp_path, processes):
     """Forced host devices, of one process or of two that find each other over the network."""
     spectra, starts = make_problem()

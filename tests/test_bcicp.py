@@ -221,10 +221,10 @@ def hostile_mesh() -> Mesh:
 
 def test_hostile_meshes():
     mesh = hostile_mesh()
-    assert len(mesh.nonmanifold_edges) and len(mesh.boundary_edges) and not mesh.used_vertices.all()
+    assert len(mesh.nonmanifold_edges) and len(mesh.boundary_edges) and not mesh.referenced_vertices.all()
     spectrum, n = jaxsmw.compute_spectrum(mesh, K), len(mesh.vertices)
-    used = np.flatnonzero(mesh.used_vertices)
-    unreferenced = np.flatnonzero(~mesh.used_vertices)
+    used = np.flatnonzero(mesh.referenced_vertices)
+    unreferenced = np.flatnonzero(~mesh.referenced_vertices)
     generator = np.random.default_rng(0)
     initial_map = np.where(generator.random(n) < 0.2, generator.choice(used, n), np.arange(n))
     initial_map[unreferenced] = unreferenced
@@ -233,7 +233,7 @@ def test_hostile_meshes():
     assert not steps._outliers(surface, surface, np.arange(len(used))).any()
     for found in bcicp(mesh, mesh, spectrum, spectrum, initial_map, initial_map, iterations=2, smoothing=5):
         assert found.dtype == np.int64 and found.shape == (n,)
-        assert mesh.used_vertices[found[used]].all()
+        assert mesh.referenced_vertices[found[used]].all()
         np.testing.assert_array_equal(found[unreferenced], unreferenced)
 
 

@@ -95,6 +95,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     assert "seed in settings was 0 and not 1" in capsys.readouterr().err
 
 
+@pytest.mark.cluster
 def test_a_dask_cluster_loses_a_worker(scape, tmp_path):
     """A real scheduler and two workers on loopback: all results arrive, and none arrives twice."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}

@@ -16,7 +16,7 @@ from synthetic import sphere_mesh
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
-from jaxsmw.runtime.cache import cached, keep_programs
+from jaxsmw.runtime.cache import cache_compiled_programs, cached
 
 INPUT = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}
@@ -252,5 +252,5 @@ def test_the_users_settings_are_respected(monkeypatch, tmp_path):
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
     before = dict(os.environ)
-    keep_programs()
+    cache_compiled_programs()
     assert dict(os.environ) == before

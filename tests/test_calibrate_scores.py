@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from jaxsmw import creature_pair, match
@@ -12,6 +13,8 @@ from jaxsmw.presets import choose_preset
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from calibrate_scores import WITHOUT_REPAIR, Measured, scores_of, tables
+
+pytestmark = pytest.mark.study
 
 
 def cells(table: str) -> list[list[str]]:

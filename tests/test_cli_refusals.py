@@ -26,8 +26,8 @@ def test_a_tiny_mesh_is_refused(run, tmp_path):
     (tmp_path / "tetrahedron.off").write_text(OFF.format(4, 4, TRIANGLES, FACES))
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
     assert_refused(run(*call), naming="--init wks")
-    assert_refused(run(*call, "--eigenvectors", "100"), naming="between 1 and 3")
-    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="1 eigenvectors only tell to which connected component")
+    assert_refused(run(*call, "--eigenvectors", "100"), naming="choose a number from 1 to 3")
+    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="1 eigenvectors only tell to which")
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
 
@@ -383,7 +383,7 @@ def test_huge_numbers(run, pair, tmp_path, arguments, number):
 def test_the_largest_numbers_get_a_sentence_of_the_library(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet"]
     largest = 2**31 - 1
-    assert_refused(run(*call, "--eigenvectors", largest), naming="between 1 and 641")
+    assert_refused(run(*call, "--eigenvectors", largest), naming="choose a number from 1 to 641")
     assert_refused(run(*call, "--samples", largest), naming="from 642 referenced vertices")
 
 

@@ -35,6 +35,8 @@ from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
 from jaxsmw.runtime.provenance import code_digest
 
+pytestmark = pytest.mark.study
+
 SCRIPTS = Path(compare_frames.__file__).parent
 FILTERS = 4
 

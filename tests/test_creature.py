@@ -1,4 +1,4 @@
-"""Creatures: symmetric bodies, sound triangles, natural poses, and a truth that is one."""
+"""Creatures: symmetric bodies, sound triangles, natural poses, and exact ground truth."""
 
 import igl
 import numpy as np
@@ -33,7 +33,7 @@ def pair(kind):
 
 @pytest.fixture(scope="module")
 def rest(kind):
-    """The source of `pair` at rest."""
+    """The source of `pair` in the rest pose."""
     return creature(kind, vertices=1200, seed=4)
 
 
@@ -47,20 +47,20 @@ def pose_of(mesh):
 
 
 def assert_sphere(mesh):
-    """Closed, manifold, in one piece, without handles, oriented outwards."""
+    """Check that a mesh is closed, manifold, connected, without handles, and oriented outward."""
     edges, _, sides, _ = igl.edge_flaps(mesh.faces)
     assert (sides >= 0).all() and igl.is_edge_manifold(mesh.faces)[0]
     directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     assert len(np.unique(directed, axis=0)) == len(directed) == 2 * len(edges)
     assert np.all(igl.is_vertex_manifold(mesh.faces))
     assert igl.facet_components(mesh.faces)[0] == 1
-    assert mesh.used_vertices.all()
+    assert mesh.referenced_vertices.all()
     assert len(mesh.vertices) - len(edges) + len(mesh.faces) == 2
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     assert np.einsum("fx,fx->", a, np.cross(b, c)) > 0
 
 
-def test_the_body_at_rest_is_its_own_mirror_image(kind):
+def test_the_body_is_mirror_symmetric_in_the_rest_pose(kind):
     points = np.random.default_rng(0).uniform((-1.2, -0.1, -2.2), (1.2, 1.8, 1.2), size=(20000, 3))
     body = _grown(kind, 3)
     value = body.signed_distance(points)
@@ -122,14 +122,14 @@ def test_the_same_seed_gives_the_same_bits():
 
 
 def test_another_seed_gives_another_individual(kind, rest):
-    """Other proportions and another manner of standing."""
+    """The proportions and the variation of the pose differ."""
     assert np.abs(_grown(kind, 5).signed_distance(rest.vertices)).mean() > 0.005
     stand = _KINDS[kind][1]["stand"]
-    manners = [_grown(kind, 4).angles(stand, _random(seed, "stand")) for seed in (4, 5)]
-    assert 0.01 < np.abs(manners[0] - manners[1]).mean() < 0.1
+    angles = [_grown(kind, 4).angles(stand, _random(seed, "stand")) for seed in (4, 5)]
+    assert 0.01 < np.abs(angles[0] - angles[1]).mean() < 0.1
 
 
-def test_poses_bend_the_body_without_stretching_it(kind, rest):
+def test_poses_deform_the_body_without_stretching_it(kind, rest):
     body = _grown(kind, 4)
     before = edge_lengths(rest.vertices, rest.faces)
     joints = {name.removeprefix("left_").removeprefix("right_") for name in body.joints}
@@ -141,7 +141,7 @@ def test_poses_bend_the_body_without_stretching_it(kind, rest):
         assert 0.005 < change.mean() < 0.08 and np.quantile(change, 0.95) < 0.45
         area = igl.doublearea(vertices, rest.faces).sum() / igl.doublearea(rest.vertices, rest.faces).sum()
         assert 0.95 < area < 1.05
-        # Just outside the skin the winding number is 0, unless there the body runs into itself.
+        # Just outside the skin, the winding number is 0 unless the body intersects itself there.
         outside = vertices + 1e-3 * igl.per_vertex_normals(vertices, rest.faces)
         assert (igl.fast_winding_number(vertices, rest.faces, outside) > 0.6).mean() < 0.01
 
@@ -155,7 +155,7 @@ def test_a_vertex_is_the_same_point_in_every_pose(kind, pair, rest):
 
 
 def test_the_truth_is_true(kind, pair):
-    """The source vertices, bent into the target's pose, lie where the truth says."""
+    """The source vertices, deformed into the pose of the target, lie at the true points."""
     m, size = len(pair.source.vertices), np.sqrt(pair.target.area)
     assert pair.truth.faces.shape == (m,) and pair.truth.weights.shape == (m, 3)
     assert pair.truth.faces.min() >= 0 and pair.truth.faces.max() < len(pair.target.faces)
@@ -165,7 +165,7 @@ def test_the_truth_is_true(kind, pair):
     moved = creature(kind, vertices=1200, pose=pose_of(pair.target), seed=4).vertices
     error = np.linalg.norm(pair.truth.positions(pair.target) - moved, axis=1) / size
     assert error.mean() < 0.004 and error.max() < 0.03
-    # Neighbours stay neighbours: no vertex is projected onto another limb, or through a thin one.
+    # Neighbors stay neighbors: no vertex is projected onto another limb, or through a thin limb.
     edges = igl.edges(pair.source.faces)
     ends = pair.truth.positions(pair.target)[edges]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 0.2 * size
@@ -200,8 +200,8 @@ def test_the_two_meshes_have_nearly_the_same_spectrum(pair):
     ("arguments", "fault"),
     [
         ({"kind": "sphere"}, "'sphere' is unknown: choose one of quadruped"),
-        ({"vertices": 499}, "number of vertices of a creature is 499: give 500 or more"),
-        ({"seed": -1}, "seed of a creature is -1: give 0 or more"),
+        ({"vertices": 499}, "number of vertices of a creature is 499: choose 500 or more"),
+        ({"seed": -1}, "seed of a creature is -1: choose 0 or more"),
     ],
 )
 def test_bad_arguments(arguments, fault):

@@ -1,4 +1,4 @@
-"""Eigenbases against closed forms, an independent program, and meshes that make trouble."""
+"""Eigenbases: closed forms, an independent program, difficult meshes, and the approximate solver."""
 
 import warnings
 
@@ -36,8 +36,8 @@ def joined(*meshes: Mesh) -> Mesh:
     )
 
 
-def test_sphere_has_its_closed_form():
-    """l (l + 1) with multiplicity 2 l + 1, on the sphere of area 1 times 4 pi; a coarse mesh comes close."""
+def test_the_sphere_has_its_closed_form():
+    """Eigenvalues 4 pi l (l + 1) with multiplicity 2 l + 1 on the sphere of area 1, up to discretization."""
     mesh = make_mesh(*sphere_mesh(4))
     spectrum = compute_spectrum(mesh, 49)
     exact = 4 * np.pi * np.concatenate([np.full(2 * l + 1, l * (l + 1)) for l in range(7)])  # noqa: E741
@@ -48,15 +48,15 @@ def test_sphere_has_its_closed_form():
     assert orthonormality(spectrum) < 1e-10
 
 
-def test_square_has_its_closed_form():
-    """pi^2 (i^2 + j^2): a free boundary, an area of one already."""
+def test_the_square_has_its_closed_form():
+    """Eigenvalues pi^2 (i^2 + j^2) on the unit square with a free boundary."""
     spectrum = compute_spectrum(make_mesh(*grid_mesh(60, 60)), 20)
     i, j = np.mgrid[:8, :8]
     exact = np.sort((np.pi**2 * (i**2 + j**2)).ravel())[:20]
     np.testing.assert_allclose(spectrum.eigenvalues, exact, rtol=0.02, atol=1e-8)
 
 
-def test_equals_a_dense_generalised_solver():
+def test_the_exact_solver_equals_a_dense_one():
     mesh = make_mesh(*grid_mesh(30, 25))
     mesh = make_mesh(mesh.vertices + 0.004 * np.random.default_rng(0).normal(size=(750, 3)), mesh.faces)
     eigenvalues, eigenvectors, areas = eigenpairs(mesh, 40)
@@ -67,14 +67,14 @@ def test_equals_a_dense_generalised_solver():
     np.testing.assert_allclose(np.diag(overlap), 1, atol=1e-6)
 
 
-def test_unit_of_the_file_does_not_matter():
+def test_the_unit_of_the_file_has_no_effect():
     vertices, faces = sphere_mesh(3)
     small, large = (eigenpairs(make_mesh(vertices * scale, faces), 30) for scale in (1e-3, 1e4))
     np.testing.assert_allclose(small[0], large[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(small[2], large[2], rtol=1e-12)
 
 
-def test_repeats_bit_for_bit_with_canonical_signs():
+def test_results_are_reproducible_with_canonical_signs():
     mesh = make_mesh(*sphere_mesh(3))
     first, second = eigenpairs(mesh, 30), eigenpairs(mesh, 30)
     for a, b in zip(first, second, strict=True):
@@ -83,8 +83,8 @@ def test_repeats_bit_for_bit_with_canonical_signs():
     assert (first[1][largest, np.arange(30)] > 0).all()
 
 
-def test_components_keep_every_multiplicity():
-    """Two spheres: every eigenvalue twice, three zeros with the lone triangle's."""
+def test_components_keep_all_multiplicities():
+    """Two spheres and a triangle: every eigenvalue of the sphere occurs twice, and zero three times."""
     sphere = make_mesh(*sphere_mesh(3))
     triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
     mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
@@ -102,7 +102,7 @@ def test_components_keep_every_multiplicity():
     assert orthonormality(spectrum) < 1e-10
 
 
-def test_unused_vertices_are_masked():
+def test_unreferenced_vertices_are_masked():
     vertices, faces = sphere_mesh(2)
     plain = compute_spectrum(make_mesh(vertices, faces), 10)
     spectrum = compute_spectrum(make_mesh(np.insert(vertices, 7, 100.0, axis=0), faces + (faces >= 7)), 10)
@@ -138,13 +138,13 @@ def test_tiny_mesh():
 
 
 @pytest.mark.parametrize("k", [0, -1, 162, 10**9])
-def test_impossible_numbers_of_eigenvectors(k):
-    with pytest.raises(InputError, match="162 used vertices"):
+def test_impossible_numbers_of_eigenvectors_are_refused(k):
+    with pytest.raises(InputError, match="from 162 referenced vertices: choose a number from 1 to 161"):
         compute_spectrum(make_mesh(*sphere_mesh(2)), k)
 
 
-def test_two_threads_find_what_one_does():
-    """And one of them may be done with all before the other starts."""
+def test_two_threads_give_the_results_of_one():
+    """This holds even if one thread finishes before the other starts."""
     meshes = make_mesh(*sphere_mesh(3)), body_with_arms()
     for mesh, (values, vectors, _) in zip(
         meshes, side_by_side(lambda mesh: eigenpairs(mesh, 40), *meshes), strict=True
@@ -154,7 +154,7 @@ def test_two_threads_find_what_one_does():
         np.testing.assert_array_equal(vectors, alone[1])
 
 
-def test_nonmanifold_meshes_go_to_the_robust_laplacian():
+def test_nonmanifold_meshes_use_the_robust_laplacian():
     vertices, faces = grid_mesh(12, 12)
     vertices = vertices + 0.02 * np.random.default_rng(0).normal(size=vertices.shape)
     fin = make_mesh(np.concatenate([vertices, [[0.5, 0.5, 0.4]]]), np.concatenate([faces, [[65, 66, 144]]]))
@@ -170,7 +170,7 @@ def test_nonmanifold_meshes_go_to_the_robust_laplacian():
 
 def test_zero_area_faces():
     vertices, faces = grid_mesh(12, 12)
-    # A sliver along an edge of the border, its third corner on that edge.
+    # A triangle without area along a boundary edge, with its third corner on that edge.
     sliver = make_mesh(
         np.concatenate([vertices, [(vertices[0] + vertices[1]) / 2]]), np.concatenate([faces, [[0, 1, 144]]])
     )
@@ -179,7 +179,7 @@ def test_zero_area_faces():
         compute_spectrum(sliver, 20, laplacian="cotangent")
 
 
-def test_robust_laplacian_with_unused_vertices():
+def test_robust_laplacian_with_unreferenced_vertices():
     vertices, faces = sphere_mesh(2)
     plain = compute_spectrum(make_mesh(vertices, faces), 10, laplacian="robust")
     gap = make_mesh(np.insert(vertices, 3, 9.0, axis=0), faces + (faces >= 3))
@@ -212,7 +212,7 @@ def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
 
 @pytest.mark.parametrize("k", [1, 2, 5, 30, 50])
 def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
-    """Those of an icosahedral sphere come in up to five copies, of which one start knows one."""
+    """An icosahedral sphere has eigenvalues of multiplicity up to five; a single Krylov space has one copy."""
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
     stiffness, areas = assemble_laplacian(make_mesh(*sphere_mesh(3)))
     mass = sp.diags(areas / areas.sum()).tocsc()
@@ -227,7 +227,7 @@ def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
 
 @pytest.mark.parametrize("length", [0.01, 1, 1000])
 def test_shapes_far_from_weyls_law(length, monkeypatch):
-    """On a thin strip eigenvalues grow with the square of their number; the shift has to find its place."""
+    """On a thin strip, eigenvalues grow with the square of their index, and the shift must be corrected."""
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
     vertices, faces = grid_mesh(12, 60)
     vertices = (vertices + 0.003 * np.random.default_rng(0).normal(size=vertices.shape)) * [1, length, 1]
@@ -238,7 +238,7 @@ def test_shapes_far_from_weyls_law(length, monkeypatch):
     np.testing.assert_allclose(eigenvalues, np.maximum(exact[:40], 0), rtol=1e-8, atol=1e-7)
 
 
-def test_a_plain_body_needs_no_second_attempt(monkeypatch):
+def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
     stiffness, areas = assemble_laplacian(bumpy_mesh(4))
     eigenvalues, _, _ = eigenpairs(bumpy_mesh(4), 100)
@@ -250,7 +250,7 @@ def test_a_plain_body_needs_no_second_attempt(monkeypatch):
 
 @pytest.mark.parametrize("numbering", ["as subdivided", "at random"])
 def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
-    """Eigenvalues from above, within 0.6 %; orthonormal to rounding; the same again; nearly the same span."""
+    """Eigenvalues are up to 0.6 % too large; eigenvectors are orthonormal, reproducible, and span nearly the same."""
     mesh = bumpy_mesh(5)
     if numbering == "at random":
         order = np.random.default_rng(1).permutation(len(mesh.vertices))
@@ -262,21 +262,21 @@ def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
     assert excess.min() > 0 and excess.max() < 0.006
     weighted = exact[2][:, None] * approximate[1]
     np.testing.assert_allclose(approximate[1].T @ weighted, np.eye(k), atol=1e-10)
-    # The last of them mix with neighbours beyond the end.
+    # The last eigenvectors mix with those beyond the end.
     inside = weighted.T @ exact[1][:, : k - 5]
     assert np.sqrt(1 - np.sum(inside**2, axis=0)).max() < 0.05
     np.testing.assert_array_equal(approximate[1], eigenpairs(mesh, k, eigensolver="approximate")[1])
 
 
 @pytest.mark.parametrize("subdivisions", [4, 5])
-def test_larger_cells_are_smoothed_longer(subdivisions):
-    """With four times the vertices, at the same number of dimensions, errors stay what they are."""
+def test_larger_cells_are_smoothed_more(subdivisions):
+    """Four times the vertices in the same number of dimensions give errors of the same size."""
     mesh = bumpy_mesh(subdivisions)
     exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
     np.testing.assert_allclose(approximate, exact, rtol=0.006)
 
 
-def test_a_multiple_eigenvalue_of_a_subspace_is_found_whole():
+def test_all_copies_of_a_multiple_eigenvalue_are_approximated():
     exact, approximate = (
         eigenpairs(make_mesh(*sphere_mesh(5)), 49, eigensolver=s)[0] for s in ("exact", "approximate")
     )
@@ -284,7 +284,7 @@ def test_a_multiple_eigenvalue_of_a_subspace_is_found_whole():
 
 
 def graded_sphere(subdivisions):
-    """Triangles at one end a hundred times as long as at the other."""
+    """A sphere whose triangles are a hundred times as long at one end as at the other."""
     vertices, faces = sphere_mesh(subdivisions)
     vertices = vertices + np.array([0, 0, 0.9])
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
@@ -309,7 +309,7 @@ def stretched(factor):
     ids=["hubs", "graded", "stretched"],
 )
 def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
-    """Vertices with too many neighbours, triangles of very different sizes, long ones."""
+    """The meshes have vertices with too many neighbors, triangles of very different sizes, or long triangles."""
     mesh = make_mesh(*shape)
     with pytest.warns(RuntimeWarning, match="cannot be approximated"):
         found = eigenpairs(mesh, 20, eigensolver="approximate")
@@ -318,7 +318,7 @@ def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
 
 
 def refused(mesh, k):
-    """Whether the eigenbasis is not approximated but exact; where it is approximated, it must be near."""
+    """Whether the exact solver takes over; if it does not, the approximation must be accurate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
         approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
@@ -327,11 +327,11 @@ def refused(mesh, k):
     return bool(caught)
 
 
-# With cells of one edge around their seeds, and of three.
+# The radius of the cells is one edge, and three edges.
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])
 @pytest.mark.parametrize("factor", [1, 2, 4, 6, 20])
-def test_an_approximation_is_near_or_refused(size, k, factor, noise):
+def test_an_approximation_is_accurate_or_refused(size, k, factor, noise):
     vertices, faces = grid_mesh(size, size)
     vertices = vertices * [1, factor, 1]
     edge = 1 / (size - 1)
@@ -342,8 +342,8 @@ def test_an_approximation_is_near_or_refused(size, k, factor, noise):
 
 
 @pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
-def test_a_region_of_bad_triangles_is_not_overlooked(factor):
-    """A sheet of even triangles but for ten of its columns, which are longer by the factor."""
+def test_a_region_of_bad_triangles_is_detected(factor):
+    """A sheet of even triangles, except that ten columns are longer by the factor."""
     (width, height), part = (100, 100), 10
     vertices, faces = grid_mesh(width, height)
     column = np.arange(len(vertices)) % width
@@ -354,14 +354,14 @@ def test_a_region_of_bad_triangles_is_not_overlooked(factor):
 
 
 @pytest.mark.parametrize("k", [1, 2])
-def test_the_approximation_of_the_first(k):
+def test_approximation_of_one_or_two_eigenvalues(k):
     mesh = bumpy_mesh(4)
     approximate, exact = (eigenpairs(mesh, k, eigensolver=s)[0] for s in ("approximate", "exact"))
     np.testing.assert_allclose(approximate, exact, rtol=0.01)
 
 
 @pytest.mark.parametrize("vertices", [(700, 3), (40, 40)])
-def test_the_shift_is_the_one_factorized(vertices):
+def test_the_shift_belongs_to_the_factors(vertices):
     positions, faces = grid_mesh(*vertices)
     stiffness, areas = assemble_laplacian(make_mesh(positions * [1, 1000, 1], faces), laplacian="cotangent")
     mass = sp.diags(areas / areas.sum()).tocsc()
@@ -372,7 +372,7 @@ def test_the_shift_is_the_one_factorized(vertices):
     )
 
 
-def test_which_eigensolver_is_used(monkeypatch):
+def test_the_choice_of_the_eigensolver(monkeypatch):
     used = []
 
     def spy(name):
@@ -390,17 +390,17 @@ def test_which_eigensolver_is_used(monkeypatch):
     eigenpairs(mesh, 20)
     monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
     eigenpairs(mesh, 20, eigensolver="exact")
-    # Too small a mesh for so many: exact whatever was asked for.
+    # The mesh is too small to approximate so many eigenvectors.
     eigenpairs(mesh, 200, eigensolver="approximate")
     assert used == ["_lanczos", "_lanczos", "_lanczos"]
     eigenpairs(mesh, 20)
     assert used[3:] == ["_approximate", "_lanczos"]
-    # Here the type checker is the first to complain.
+    # In tests, the type checker raises first.
     with pytest.raises(Exception, match="fast"):
         eigenpairs(mesh, 20, eigensolver="fast")
 
 
-def test_equals_the_reference_program(shared):
+def test_eigenpairs_equal_those_of_the_authors_program(shared):
     reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
     mesh = read_mesh(shared / "data" / "faust_r" / "off" / "tr_reg_002.off")
     eigenvalues, eigenvectors, areas = eigenpairs(mesh, 128)
@@ -411,7 +411,7 @@ def test_equals_the_reference_program(shared):
     np.testing.assert_allclose(np.abs(overlap), 1, atol=1e-6)
 
 
-def test_the_first_eigenvalue_of_every_part_is_exactly_zero():
+def test_the_first_eigenvalue_of_every_component_is_exactly_zero():
     one, two = make_mesh(*sphere_mesh(1)), make_mesh(*grid_mesh(6, 7))
     assert eigenpairs(one, 3)[0][0] == eigenpairs(two, 1)[0][0] == 0
     eigenvalues = eigenpairs(joined(one, two), 6)[0]

@@ -376,8 +376,8 @@ class TestGeodesicError:
         [
             ([0, 1, 9], ([0], [0]), "pointwise map on mesh_y: vertex indices must lie between 0 and 8"),
             ([0, 1, -1], ([0], [0]), "pointwise map on mesh_y: .*number 2 is -1"),
-            ([0.0, 1.0], ([0], [0]), "pointwise map on mesh_y: .*whole numbers"),
-            ([], ([0], [0]), "pointwise map on mesh_y: .*whole numbers"),
+            ([0.0, 1.0], ([0], [0]), "pointwise map on mesh_y: .*a list of integers"),
+            ([], ([0], [0]), "pointwise map on mesh_y: .*a list of integers"),
             ([0, 1, 2], ([0], [9]), "ground truth on mesh_y: vertex indices must lie between 0 and 8"),
             ([0, 1, 2], ([3], [0]), "source vertices are numbered 3 to 3, but the pointwise map has 3"),
             ([0, 1, 2], ([-1], [0]), "source vertices are numbered -1"),

@@ -1,4 +1,4 @@
-"""Geodesic distances against closed forms, exact algorithms, and what a distance must obey."""
+"""Geodesic distances: closed forms, exact algorithms, the axioms of a metric, and difficult meshes."""
 
 import tracemalloc
 
@@ -25,7 +25,7 @@ def no_cache(monkeypatch):
 
 
 def shaken_square(side: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Irregular triangles of the unit square, in the plane, with straight rims; vertices (side^2, 2) and faces."""
+    """Irregular triangles of the unit square, with straight boundaries: vertices (side^2, 2) and faces."""
     vertices, _ = grid_mesh(side, side)
     square = vertices[:, :2]
     inner = ((square > 0) & (square < 1)).all(axis=1)
@@ -34,7 +34,7 @@ def shaken_square(side: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flat_sheet(side: int = 17, seed: int = 0) -> Mesh:
-    """A square sheet, tilted in space: its geodesics are straight."""
+    """A square sheet, tilted in space, whose geodesics are straight."""
     square, faces = shaken_square(side, seed)
     return make_mesh(np.pad(square, ((0, 0), (0, 1))) @ Rotation.random(random_state=seed).as_matrix(), faces)
 
@@ -49,7 +49,7 @@ def blob(subdivisions: int = 3, seed: int = 0) -> Mesh:
 
 
 def book(pages: int, n: int = 7) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """Flat pages that meet in one spine; also the page of each vertex and its place (x from the spine, y)."""
+    """Flat pages that meet in one spine, and the page and position (x from the spine, y) of each vertex."""
     square, faces = shaken_square(n, 1)
     on_spine = np.flatnonzero(square[:, 0] == 0)
     vertices, triangles, page_of, place = [], [], [], []
@@ -89,7 +89,7 @@ def exact_distances(mesh: Mesh, sources) -> np.ndarray:
 
 
 def with_points_as_vertices(mesh: Mesh, points: SurfacePoints) -> Mesh:
-    """The same surface with points, all on different faces, as its last vertices."""
+    """The same surface, with points on different faces added as the last vertices."""
     assert len(np.unique(points.faces)) == len(points)
     number = len(mesh.vertices) + np.arange(len(points))
     a, b, c = mesh.faces[points.faces].T
@@ -186,7 +186,7 @@ def test_a_curved_surface_agrees_with_exact_distances():
     assert near.sum() > 200 and error[near].max() < 1e-12
 
 
-def test_more_depth_is_never_longer():
+def test_more_depth_never_makes_distances_longer():
     mesh = blob(2)
     totals = []
     previous = np.full((len(mesh.vertices),) * 2, np.inf)
@@ -199,7 +199,7 @@ def test_more_depth_is_never_longer():
     assert (np.diff(totals) < 0).all()
 
 
-def test_the_graph_is_symmetric_and_its_lines_are_no_shorter_than_space():
+def test_the_graph_is_symmetric_and_not_shorter_than_straight_lines_in_space():
     mesh = blob()
     graph = geodesic_graph(mesh).tocoo()
     assert abs(graph - graph.T).max() == 0
@@ -207,7 +207,7 @@ def test_the_graph_is_symmetric_and_its_lines_are_no_shorter_than_space():
     assert (graph.data >= straight - 1e-12).all() and (graph.row != graph.col).all()
 
 
-def test_a_distance_is_a_metric():
+def test_distances_are_a_metric():
     mesh = blob(2)
     distances = geodesic_distances(mesh, np.arange(len(mesh.vertices)))
     np.testing.assert_allclose(distances, distances.T, atol=1e-12)
@@ -228,14 +228,14 @@ def test_moving_scaling_and_renumbering(method, scale):
     vertices[number] = scale * (mesh.vertices @ Rotation.random(random_state=1).as_matrix() + [1, 2, 3])
     faces = generator.permutation(number[mesh.faces])
     faces = np.array([np.roll(face, k) for k, face in enumerate(faces)])
-    faces[::3] = faces[::3, ::-1]  # orientation is nothing to a distance
+    faces[::3] = faces[::3, ::-1]  # distances do not depend on orientation
     moved = geodesic_distances(make_mesh(vertices, faces), number[sources], method=method)
     np.testing.assert_allclose(moved[:, number], scale * expected, rtol=1e-9, atol=1e-12 * scale)
 
 
 def test_three_and_more_sheets_at_an_edge():
     mesh, page, place = book(pages=4)
-    used = mesh.used_vertices
+    used = mesh.referenced_vertices
     assert len(mesh.nonmanifold_edges) == 6
     distances = geodesic_distances(mesh, np.flatnonzero(used))[:, used]
     page, place = page[used], place[used]
@@ -256,7 +256,7 @@ def test_sheets_that_touch_in_a_vertex_are_connected():
     np.testing.assert_allclose(geodesic_distances(mesh, [1]), [[1, 0, np.sqrt(2), 4, 5]])
 
 
-def test_components_unused_vertices_and_twins():
+def test_components_unreferenced_vertices_and_duplicates():
     square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     vertices = np.concatenate([square, [[5, 5, 5]], square])
@@ -272,8 +272,8 @@ def test_components_unused_vertices_and_twins():
     np.testing.assert_allclose(geodesic_distances(mesh, np.arange(9), method="exact"), expected)
 
 
-def test_edges_without_length_are_passed_and_faces_without_area_do_no_harm():
-    # A square whose diagonal was slit open and closed again with faces of no width at all.
+def test_edges_without_length_and_faces_without_area_have_no_effect():
+    # A square that was cut along its diagonal and closed again with faces without width.
     vertices = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]]
     mesh = make_mesh(vertices, [[0, 1, 2], [4, 5, 3], [0, 2, 5], [0, 5, 4]])
     assert mesh.degenerate_faces.sum() == 2
@@ -281,7 +281,7 @@ def test_edges_without_length_are_passed_and_faces_without_area_do_no_harm():
     np.testing.assert_allclose(distances, np.linalg.norm(mesh.vertices[:, None] - mesh.vertices, axis=2))
 
 
-def test_a_limit_cuts_off_and_changes_nothing_below():
+def test_a_limit_changes_nothing_below():
     mesh = blob()
     for method in ("strips", "exact"):
         everything = geodesic_distances(mesh, [0, 9], method=method)
@@ -302,26 +302,26 @@ def test_exact_method():
         rtol=1e-12,
     )
     strips = geodesic_distances(mesh, sources)
-    assert (strips > expected * (1 + 1e-6)).any()  # otherwise the two methods would be one
+    assert (strips > expected * (1 + 1e-6)).any()  # otherwise the two methods could be the same
 
 
-def test_exact_method_says_where_it_cannot_be_used():
+def test_the_exact_method_refuses_unsuitable_meshes():
     point = SurfacePoints(np.array([0]), np.array([[1.0, 0, 0]]))
     with pytest.raises(InputError, match="not to points on faces: use method='strips'"):
         geodesic_distances(CUBE, point, method="exact")
-    with pytest.raises(InputError, match="edges with more than two faces, of which it has 6: use"):
+    with pytest.raises(InputError, match=r"edges with more than two faces \(6\): use"):
         geodesic_distances(book(3)[0], [0], method="exact")
     bowtie = make_mesh(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-3, 0, 0], [0, 0, -4]], [[0, 1, 2], [0, 3, 4]], name="tie"
     )
-    with pytest.raises(InputError, match=r"tie: .*join separate fans of faces, of which it has 1"):
+    with pytest.raises(InputError, match=r"tie: .*join separate fans of faces \(1\): use"):
         geodesic_distances_between(bowtie, [0], [1], method="exact")
     sliver = make_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, -1e-9, 0]], [[0, 1, 2], [1, 0, 3]])
-    with pytest.raises(InputError, match="almost without height, of which it has 1"):
+    with pytest.raises(InputError, match=r"almost without height \(1\): use"):
         geodesic_distances(sliver, [0], method="exact")
 
 
-def test_between_picks_from_all_distances():
+def test_distances_between_pairs_equal_those_of_the_full_table():
     mesh, generator = blob(), np.random.default_rng(0)
     distances = geodesic_distances(mesh, np.arange(642))
     for few, many in ((642, 642), (5, 642), (642, 5)):
@@ -333,7 +333,7 @@ def test_between_picks_from_all_distances():
         )
 
 
-def test_between_stores_no_table_of_all_distances():
+def test_distances_between_pairs_do_not_store_the_full_table():
     mesh = blob(4)
     n = len(mesh.vertices)
     geodesic_graph(mesh)
@@ -344,7 +344,7 @@ def test_between_stores_no_table_of_all_distances():
     assert peak < n * n * 8 / 2
 
 
-def test_points_at_corners_are_vertices():
+def test_points_at_corners_act_as_vertices():
     mesh, generator = blob(2), np.random.default_rng(0)
     corner = generator.integers(0, 3, 50)
     points = random_points(mesh, 50)
@@ -362,7 +362,7 @@ def test_points_at_corners_are_vertices():
 def test_points_on_a_flat_sheet_are_euclidean():
     mesh = flat_sheet()
     points, others = random_points(mesh, 1500), random_points(mesh, 1500, seed=1)
-    # On vertices, on edges, on the same face, and twice the same point.
+    # Some points lie on vertices, on edges, or on the same face, and some pairs are equal.
     points.weights[:100], others.weights[:50] = [0, 1, 0], [0, 0, 1]
     points.weights[100:300], others.weights[200:400] = [0.3, 0, 0.7], [0.8, 0.2, 0]
     others.faces[300:600] = points.faces[300:600]
@@ -384,7 +384,7 @@ def test_points_on_a_flat_sheet_are_euclidean():
 def test_points_on_a_curved_surface_agree_with_exact_distances():
     mesh = blob()
     faces = np.random.default_rng(0).permutation(len(mesh.faces))[:40]
-    for k in range(0, 20, 2):  # half of the pairs lie on faces that touch, in a corner or a side
+    for k in range(0, 20, 2):  # half of the pairs lie on faces that share a corner or a side
         touching = np.isin(mesh.faces, mesh.faces[faces[k]]).sum(axis=1) == 1 + k // 2 % 2
         touching[faces] = False
         faces[k + 1] = np.flatnonzero(touching)[0]
@@ -417,7 +417,7 @@ def test_points_on_sheets_that_meet_in_an_edge():
     points, others = SurfacePoints(first, weights), SurfacePoints(second, weights)
 
     def unrolled(where):
-        """Distance from the spine, position along it, and the angle that tells the page."""
+        """The distance from the spine, the position along it, and the angle of the page."""
         x, y, z = where.T
         return np.hypot(x, y), z, np.round(np.arctan2(y, x), 6)
 
@@ -434,7 +434,7 @@ def test_points_on_sheets_that_meet_in_an_edge():
     np.testing.assert_allclose(distances[close], expected[close], rtol=1e-12)
 
 
-def test_what_else_is_asked_for_changes_nothing():
+def test_distances_do_not_depend_on_the_other_points():
     mesh = flat_sheet(8)
     points, others = random_points(mesh, 400), random_points(mesh, 400, seed=1)
     together = geodesic_distances_between(mesh, points, others)
@@ -444,7 +444,7 @@ def test_what_else_is_asked_for_changes_nothing():
         )
 
 
-def test_repeatable_and_from_the_cache(tmp_path, monkeypatch):
+def test_graphs_come_from_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
     mesh = blob(2)
     geodesic_graph.cache_clear()
@@ -452,7 +452,7 @@ def test_repeatable_and_from_the_cache(tmp_path, monkeypatch):
     assert geodesic_graph(mesh, depth=2).nnz < geodesic_graph(mesh).nnz
     assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 2
     geodesic_graph.cache_clear()
-    monkeypatch.setattr(geodesics, "_unfold", None)  # computing again would fail
+    monkeypatch.setattr(geodesics, "_unfold", None)  # another computation would fail
     np.testing.assert_array_equal(geodesic_distances(mesh, [0, 1]), first)
 
 
@@ -462,8 +462,8 @@ def test_repeatable_and_from_the_cache(tmp_path, monkeypatch):
         ([0, 642], r"vertex indices must lie between 0 and 641, but number 1 is 642: subtract 1"),
         ([0, 7, 10**18], r"number 2 is 1000000000000000000: correct it"),
         ([-1], r"number 0 is -1"),
-        ([0.0, 1.0], r"whole numbers in one row, but are float64 of shape \(2,\)"),
-        ([[0, 1]], r"whole numbers in one row, but are int64 of shape \(1, 2\)"),
+        ([0.0, 1.0], r"a list of integers, but are float64 of shape \(2,\)"),
+        ([[0, 1]], r"a list of integers, but are int64 of shape \(1, 2\)"),
         ([True], "bool"),
         (SurfacePoints(np.array([1280]), np.array([[1.0, 0, 0]])), "face indices must lie .* 0 is 1280"),
         (SurfacePoints(np.array([5, 6]), np.array([[1.0, 0, 0], [2, 0, -1]])), "number 1 has .*at least 0"),
@@ -472,7 +472,7 @@ def test_repeatable_and_from_the_cache(tmp_path, monkeypatch):
         (SurfacePoints(np.array([5]), np.array([[np.inf, 0.5, 0.5]])), "inf"),
     ],
 )
-def test_points_that_do_not_lie_on_the_mesh(sources, message):
+def test_points_outside_the_mesh_are_refused(sources, message):
     mesh = blob()
     with pytest.raises(InputError, match=message):
         geodesic_distances(mesh, sources)
@@ -480,12 +480,12 @@ def test_points_that_do_not_lie_on_the_mesh(sources, message):
         geodesic_distances_between(mesh, np.zeros(1, dtype=np.int64), sources)
 
 
-def test_partners_must_be_as_many():
+def test_every_point_needs_a_partner():
     with pytest.raises(InputError, match="there are 2 points and 3 partners"):
         geodesic_distances_between(CUBE, [0, 1], [0, 1, 2])
 
 
-def test_no_sources_no_distances():
+def test_no_sources_give_no_distances():
     nothing = np.empty(0, dtype=np.int64)
     for method in ("strips", "exact"):
         assert geodesic_distances(CUBE, nothing, method=method).shape == (0, 8)

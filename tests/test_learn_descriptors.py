@@ -33,6 +33,8 @@ from learning import train
 from jaxsmw import InputError, creature_pair, make_mesh
 from jaxsmw.geometry import farthest_point_samples
 
+pytestmark = pytest.mark.study
+
 SMALL = Sizes(waves=8, width=12, blocks=2, filters=4, outputs=6)
 SAMPLES, EIGENVECTORS = 90, 20
 

@@ -19,6 +19,8 @@ from learn_frame import LOSSES, Sampled, bank_of, like_meyer, load, save, summar
 
 from jaxsmw import Meyer, Spectrum
 
+pytestmark = pytest.mark.study
+
 N, K = 60, 12
 
 

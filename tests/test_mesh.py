@@ -157,7 +157,7 @@ def test_cleaning_drops_faces_and_keeps_vertices():
     faces = [[0, 1, 2], [2, 1, 0], [1, 1, 3], [0, 2, 3], [3, 0, 2], [0, 1, 2]]
     mesh = make_mesh([*SQUARE, [9, 9, 9]], faces, notes=["From afar."])
     assert mesh.faces.tolist() == SQUARE_FACES, "the first of equal faces stays, in place"
-    assert len(mesh.vertices) == 5 and mesh.used_vertices.tolist() == [True] * 4 + [False]
+    assert len(mesh.vertices) == 5 and mesh.referenced_vertices.tolist() == [True] * 4 + [False]
     assert mesh.notes == (
         "From afar.",
         "1 face with a repeated vertex dropped.",
@@ -180,9 +180,9 @@ def test_welding_closes_a_seam_without_renumbering():
     assert welded.vertices.tobytes() == seam.vertices.tobytes()
     assert np.array_equal(welded.vertices[welded.faces], seam.vertices[seam.faces])
     found = diagnose(welded)
-    assert (found.components, found.boundary_edges, found.unused_vertices) == (1, 0, 18)
+    assert (found.components, found.boundary_edges, found.unreferenced_vertices) == (1, 0, 18)
     # Faces use the lowest-numbered of the vertices at the same position.
-    for i in np.flatnonzero(welded.used_vertices):
+    for i in np.flatnonzero(welded.referenced_vertices):
         assert i == (seam.vertices == seam.vertices[i]).all(axis=1).argmax()
     assert any("Welding changed" in note for note in welded.notes)
     assert not any("--weld" in note for note in welded.notes)
@@ -218,7 +218,7 @@ def test_areas_and_normals_against_libigl(mesh):
     ).diagonal()
     assert np.allclose(mesh.vertex_areas, lumped, rtol=1e-13, atol=0)
     assert mesh.vertex_areas.sum() == pytest.approx(mesh.area, rel=1e-13)
-    used = mesh.used_vertices
+    used = mesh.referenced_vertices
     normals = igl.per_vertex_normals(mesh.vertices, mesh.faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA)
     assert np.allclose(mesh.vertex_normals[used], normals[used], atol=1e-13)
     assert (mesh.vertex_normals[~used] == 0).all() and (mesh.vertex_areas[~used] == 0).all()
@@ -253,7 +253,14 @@ def test_normals_are_zero_where_they_cancel():
 
 def test_properties_are_computed_once():
     mesh = bumpy_grid(4)
-    for name in ("face_areas", "area", "vertex_areas", "vertex_normals", "used_vertices", "degenerate_faces"):
+    for name in (
+        "face_areas",
+        "area",
+        "vertex_areas",
+        "vertex_normals",
+        "referenced_vertices",
+        "degenerate_faces",
+    ):
         assert getattr(mesh, name) is getattr(mesh, name)
     assert mesh.edges is mesh.edges and mesh.boundary_edges is mesh.boundary_edges
 
@@ -275,7 +282,7 @@ DIAGNOSES = {
     "a flipped face": ([[0, 1, 2], [0, 2, 3], [0, 4, 3]], dict(misoriented_edges=1, boundary_edges=5)),
     "two components": (
         [[0, 1, 2], [5, 6, 7]],
-        dict(components=2, boundary_edges=6, boundary_loops=2, unused_vertices=6),
+        dict(components=2, boundary_edges=6, boundary_loops=2, unreferenced_vertices=6),
     ),
     "a Moebius strip": (
         [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 1], [5, 0, 1]],
@@ -294,7 +301,7 @@ def test_peculiarities_are_counted(faces, expected):
     usual = dict(
         vertices=12, faces=len(faces), components=1, boundary_edges=0, boundary_loops=1, nonmanifold_edges=0,
         nonmanifold_vertices=0, misoriented_edges=0, degenerate_faces=0,
-        unused_vertices=12 - len(np.unique(faces)),
+        unreferenced_vertices=12 - len(np.unique(faces)),
     )  # fmt: skip
     assert found == usual | expected
 
@@ -955,7 +962,11 @@ def test_real_shapes_keep_vertices_and_faces(shared):
         assert np.array_equal(mesh.vertices, vertices)
         if not mesh.notes:
             assert np.array_equal(mesh.faces, faces)
-        assert diagnose(mesh).components == 1 and not mesh.degenerate_faces.any() and mesh.used_vertices.all()
+        assert (
+            diagnose(mesh).components == 1
+            and not mesh.degenerate_faces.any()
+            and mesh.referenced_vertices.all()
+        )
 
 
 @pytest.mark.parametrize(

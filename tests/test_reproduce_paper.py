@@ -19,6 +19,8 @@ from jaxsmw.evaluation.opponents.registry import METHODS
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 
+pytestmark = pytest.mark.study
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:

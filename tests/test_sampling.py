@@ -8,7 +8,7 @@ from synthetic import sphere_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.sampling import farthest_point_samples, maximal_independent_set, spread_samples
+from jaxsmw.geometry.sampling import farthest_point_samples, maximal_independent_set, poisson_disk_samples
 
 
 def bumpy():
@@ -57,7 +57,7 @@ def test_poisson_disk_samples_leave_neither_gaps_nor_clusters(number):
     vertices, faces = sphere_mesh(5)
     vertices = vertices + np.array([0, 0, 0.5])
     mesh = make_mesh(vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces)
-    samples = spread_samples(mesh, number)
+    samples = poisson_disk_samples(mesh, number)
     assert 0.75 * number < len(samples.vertices) < 1.3 * number
     distance = (0.7 * mesh.area / number) ** 0.5
     chosen = mesh.vertices[samples.vertices]
@@ -71,7 +71,7 @@ def test_poisson_disk_samples_leave_neither_gaps_nor_clusters(number):
 
 def test_more_samples_than_vertices_give_all_vertices():
     mesh = bumpy()
-    samples = spread_samples(mesh, 10**6)
+    samples = poisson_disk_samples(mesh, 10**6)
     np.testing.assert_array_equal(samples.vertices, np.arange(len(mesh.vertices)))
     np.testing.assert_array_equal(samples.nearest, np.arange(len(mesh.vertices)))
 
@@ -79,7 +79,7 @@ def test_more_samples_than_vertices_give_all_vertices():
 def test_unreferenced_vertices_are_never_samples():
     vertices, faces = sphere_mesh(3)
     mesh = make_mesh(np.insert(vertices, 5, 0.0, axis=0), faces + (faces >= 5))
-    samples = spread_samples(mesh, 60)
+    samples = poisson_disk_samples(mesh, 60)
     assert 5 not in samples.vertices and len(samples.nearest) == len(mesh.vertices)
 
 

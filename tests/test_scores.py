@@ -10,7 +10,7 @@ from synthetic import body_with_arms, bumpy_mesh
 from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.sampling import spread_edges
+from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.pair import Pair
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.scores import (
@@ -128,12 +128,12 @@ def test_swapped_arms_come_off_dense_meshes(mesh, monkeypatch):
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
-    spread_edges.cache_clear()
+    coarse_edges.cache_clear()
     monkeypatch.setattr(sampling, "_DENSE", 1000)
     monkeypatch.setattr(sampling, "_SPREAD", 500)
     off = discontinuous_parts(Pair(mesh, mesh), swapped)
     assert off[arms].mean() > 0.8 and off[~arms].mean() < 0.1
-    spread_edges.cache_clear()
+    coarse_edges.cache_clear()
 
 
 def test_of_a_perfect_map_no_error_is_expected(mesh, spectrum):

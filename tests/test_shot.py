@@ -9,7 +9,7 @@ from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import shot
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.sampling import Samples
+from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.geometry.shot import shot_descriptors
 
 
@@ -135,7 +135,7 @@ def test_samples_act_like_the_vertices_of_a_coarser_mesh(bumpy):
     n = len(coarse.vertices)
     np.testing.assert_allclose(fine.vertices[:n], coarse.vertices, atol=1e-12)
     _, nearest = KDTree(coarse.vertices).query(fine.vertices)
-    described = shot_descriptors(fine, samples=Samples(np.arange(n), nearest))
+    described = shot_descriptors(fine, samples=SurfaceSamples(np.arange(n), nearest))
     assert described.shape == (n, 352)
     difference, usual = (
         np.median(np.linalg.norm(a - described, axis=1))
@@ -146,5 +146,5 @@ def test_samples_act_like_the_vertices_of_a_coarser_mesh(bumpy):
 
 def test_all_vertices_as_samples_change_nothing(bumpy, descriptors):
     everything = np.arange(len(bumpy.vertices))
-    same = shot_descriptors(bumpy, samples=Samples(everything, everything))
+    same = shot_descriptors(bumpy, samples=SurfaceSamples(everything, everything))
     np.testing.assert_allclose(same, descriptors, atol=1e-9)

@@ -52,7 +52,14 @@ def write_match_report(
     settings = {**vars(options), "preset": preset_name(options)}
     del settings["run"]
     with stopwatch.step("report"):
-        written = write_report(directory, correspondence, errors=errors, settings=settings, up=up)
+        written = write_report(
+            directory,
+            correspondence,
+            errors=errors,
+            settings=settings,
+            seconds=stopwatch.steps(),
+            up=up,
+        )
     report_written(*written)
 
 

@@ -89,8 +89,13 @@ class Stopwatch:
         for name, more in seconds.items():
             self._seconds[name] = self._seconds.get(name, 0.0) + more
 
-    def summary(self) -> str:
-        """Returns the total time and the time of each step; `other` is the time outside of all steps."""
+    def steps(self) -> dict[str, float]:
+        """Returns the seconds of each step so far; `other` is the time outside of all steps."""
         total = time.perf_counter() - self._began
-        steps = {**self._seconds, "other": total - sum(self._seconds.values())}
-        return f"{total:.2f} s: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in steps.items())
+        return {**self._seconds, "other": total - sum(self._seconds.values())}
+
+    def summary(self) -> str:
+        """Returns the total time and the time of each step."""
+        steps = self.steps()
+        listed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in steps.items())
+        return f"{sum(steps.values()):.2f} s: {listed}"

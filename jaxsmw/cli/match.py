@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> None:
     if options.one_to_one:
         from jaxsmw.geometry.assignment import check_one_to_one
 
-        check_one_to_one(int(mesh_x.used_vertices.sum()), int(mesh_y.used_vertices.sum()))
+        check_one_to_one(int(mesh_x.referenced_vertices.sum()), int(mesh_y.referenced_vertices.sum()))
     correspondence = match_meshes(
         options, mesh_x, mesh_y, stopwatch, partial=options.partial, index_base=options.index_base
     )

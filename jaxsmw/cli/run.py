@@ -42,7 +42,7 @@ def _run(arguments: Sequence[str]) -> None:
     log_to_console(quiet=options.quiet)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
-        from jaxsmw.runtime.cache import keep_programs
+        from jaxsmw.runtime.cache import cache_compiled_programs
 
-        keep_programs()
+        cache_compiled_programs()
         options.run(options)

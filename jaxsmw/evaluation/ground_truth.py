@@ -95,7 +95,7 @@ def read_ground_truth(
     """
     files = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(path) for path in paths]
     truth = _read_all(files, mesh_x, mesh_y, index_base)
-    used = mesh_x.used_vertices[truth.source_vertices]
+    used = mesh_x.referenced_vertices[truth.source_vertices]
     if used.all():
         return truth
     if not used.any():

@@ -1,4 +1,4 @@
-"""A smooth subspace of far fewer dimensions than a surface has vertices."""
+"""A smooth subspace with far fewer dimensions than the surface has vertices."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
 
 class Coarsening(NamedTuple):
-    """A generalised eigenproblem seen in a subspace.
+    """A generalized eigenproblem projected to a subspace.
 
     **Attributes:**
 
-    - `prolongation`: P (n, c), from coefficients to values at vertices; its rows sum to one.
+    - `prolongation`: P (n, c), from coefficients to values at vertices. Its rows sum to one.
     - `stiffness`, `mass`: P^T W P and P^T A P, (c, c).
-    - `smooth`: from values (n, j) to what of them cells can show, and a little beyond.
+    - `smooth`: a low-pass filter for values (n, j). It keeps the frequencies that the cells can represent,
+      and slightly higher ones.
 
     Prolongation and smoothing are in single precision, whose errors are far below those of the subspace.
     """
@@ -35,26 +36,28 @@ class Coarsening(NamedTuple):
 
 
 def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> Coarsening:
-    """Smoothed aggregation: vertices in cells around evenly spread ones, the cells' indicators smoothed.
+    """Smoothed aggregation: cells of vertices around evenly spread seeds, with smoothed indicator functions.
 
     Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-    problems", Computing 1996, in a single step whatever the size of the cells: one and a half times
-    their reach in edges is the degree of the Chebyshev polynomial that smooths. (Their reach alone costs a
-    fifth less, and makes errors of eigenvalues ten times as large.)
+    problems", Computing 1996. Here a single step suffices for cells of any size, because the degree of the
+    smoothing Chebyshev polynomial is one and a half times the radius of the cells in edges. (The radius
+    itself as the degree costs a fifth less, but makes errors of eigenvalues ten times as large.)
 
     **Arguments:**
 
-    - `stiffness`: W (n, n), symmetric, of one connected component; its entries are the mesh's edges.
+    - `stiffness`: W (n, n), symmetric, of one connected component. Its entries are the edges of the mesh.
     - `mass`: A (n, n).
-    - `dimensions`: how many are wanted; the outcome is near it, and at most about n / 4.
+    - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 
-    **Raises:** `RuntimeError` if W has no positive diagonal, a vertex so many neighbours that the smoothed
-    indicators would overlap everywhere, or much of the area cells much larger than elsewhere.
+    **Returns:** The projected eigenproblem.
+
+    **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbors that
+    smoothed indicators would overlap everywhere, or if a large part of the area lies in large cells.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
-        raise RuntimeError(f"a vertex has {most - 1} neighbours")
-    # With seeds more than r edges apart a cell has on average about 1.25 (r + 1)² vertices.
+        raise RuntimeError(f"a vertex has {most - 1} neighbors")
+    # If seeds are more than r edges apart, a cell has about 1.25 (r + 1)² vertices on average.
     radius = max(1, round((n / (1.25 * dimensions)) ** 0.5) - 1)
     stiffness = stiffness.tocsr()
     edges = sp.csr_matrix(
@@ -64,7 +67,7 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     areas = cells.T @ mass.diagonal()
     share = areas[areas > _LARGE * areas.sum() / min(dimensions, len(areas))].sum() / areas.sum()
     if share > _MOST_IN_LARGE:
-        raise RuntimeError(f"{share:.0%} of its area is in triangles much larger than the others")
+        raise RuntimeError(f"{share:.0%} of the area is in triangles much larger than the others")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
     degree = (3 * (radius + 1) + 1) // 2
     prolongation = smoother(cells, degree)
@@ -78,12 +81,12 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
 
 _MOST_NEIGHBORS = 100
-# A cell is large from four times the area that each would have if all had the same.
+# A cell is large if its area is four times the mean or more. Large cells may cover this share of the area.
 _LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
-    """Which vertex is in which cell, (n, c): with the seed that is the fewest edges away."""
+    """The indicator functions (n, c) of the cells. Each vertex joins the seed the fewest edges away."""
     n = graph.shape[0]
     seeds = maximal_independent_set(graph, radius)
     _, _, nearest = dijkstra(graph, indices=seeds, unweighted=True, min_only=True, return_predecessors=True)
@@ -92,10 +95,11 @@ def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
 
 
 class _Smoother:
-    """Chebyshev polynomials of D^-1 W, D the diagonal of W, that leave constants and damp what is rough.
+    """Chebyshev polynomials of D^-1 W, with D the diagonal of W, as low-pass filters that keep constants.
 
-    Rough is what cells of a given size cannot show: eigenvalues of D^-1 W from about 1.5 times the largest
-    over that size. (Between 1 and 3 times the eigenvalues of a body come out about as well.)
+    High frequencies are those that cells of a given number of vertices cannot represent: eigenvalues of D^-1
+    W above 1.5 times the largest eigenvalue divided by that number. (Factors from 1 to 3 give about the same
+    accuracy on bodies.)
     """
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):
@@ -111,20 +115,20 @@ class _Smoother:
         self.operator = sp.diags(1 / diagonal) @ stiffness
 
     def single(self) -> _Smoother:
-        """The same in single precision."""
+        """This smoother in single precision."""
         other = copy(self)
         other.operator = self.operator.astype(np.float32)
         return other
 
     def __call__(self, vectors: Matrix, degree: int) -> Matrix:
-        """p(D^-1 W) times vectors, p of the degree, by the three-term recurrence."""
+        """Apply p(D^-1 W), with p of the given degree, to vectors, by the three-term recurrence."""
         slope = self.center / self.half
         ratio = 1 / slope
         step = (self.operator @ vectors) * (-1 / self.center)
         vectors = vectors + step
         for _ in range(degree - 1):
             previous, ratio = ratio, 1 / (2 * slope - ratio)
-            # In place, where they are dense: these are the largest arrays there are.
+            # Dense vectors are updated in place, because they are the largest arrays of all.
             step *= ratio * previous
             change = self.operator @ vectors
             change *= 2 * ratio / self.half

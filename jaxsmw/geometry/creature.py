@@ -1,9 +1,9 @@
-"""Procedural creatures: ready-made shapes with exact ground truth, grown from a seed.
+"""Procedural creatures: synthetic shapes with exact ground truth, generated from a seed.
 
-A creature is an implicit surface, a smooth union of tapered tubes around a skeleton, exactly mirror
-symmetric at rest. Marching cubes, decimation and relaxation on the surface make well-shaped triangles of it;
-its joints bend by smooth functions of the rest position alone. Two triangulations of one creature in two
-poses therefore sample two smooth surfaces, and the rest position says which of their points belong together.
+A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. In the rest pose it is
+exactly mirror symmetric. Marching cubes, decimation and relaxation on the surface give well-shaped
+triangles. Joints deform the surface by smooth functions of the rest position alone. So two triangulations of
+one creature in two poses sample two smooth surfaces, and points with the same rest position correspond.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from jaxsmw.geometry.mesh import Mesh
 _Vector = tuple[float, float, float]
 
 _MINIMUM_VERTICES = 500
-_REACH = 0.25  # the field is a distance up to here; farther out only its sign counts
-_STIFFNESS = 4.0  # how sharply the skin is divided between bones
+_REACH = 0.25  # the field is a distance up to this value; beyond, only the sign is meaningful
+_STIFFNESS = 4.0  # the sharpness of the division of the skin between bones
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class CreaturePair:
-    """One creature in two poses with two unrelated triangulations, and which points belong together.
+    """One creature in two poses with independent triangulations, and the corresponding points.
 
     **Attributes:**
 
-    - `source`: mesh with m vertices.
-    - `target`: mesh with n vertices.
-    - `truth`: for each source vertex the same point of the body on the target (m).
+    - `source`: the source mesh with m vertices.
+    - `target`: the target mesh with n vertices.
+    - `truth`: the point on the target (m) that corresponds to each source vertex.
     """
 
     source: Mesh
@@ -48,7 +48,7 @@ class CreaturePair:
 
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
-        """The truth as a pointwise map: the nearest of the corners of each point's triangle."""
+        """The ground truth as a pointwise map: the nearest corner of the triangle of each true point."""
         return self.truth.nearest_corners(self.target)
 
 
@@ -57,17 +57,17 @@ class CreaturePair:
 
 @dataclass(frozen=True)
 class _Tube:
-    """A chain of tapered capsules (hulls of two balls), or of plates: such capsules cut to a thickness."""
+    """A chain of tapered capsules (hulls of two balls), or of plates (capsules of limited thickness)."""
 
     centers: np.ndarray  # (p, 3)
     radii: np.ndarray  # (p,)
-    blend: float  # width over which it melts into the rest of the body
-    carved: bool  # taken away instead of added
-    normal: np.ndarray | None  # (3,), unit: of a plate
-    thickness: float  # half of a plate's
+    blend: float  # the width of the smooth transition to the rest of the body
+    carved: bool  # whether the tube is subtracted instead of added
+    normal: np.ndarray | None  # (3,), the unit normal of a plate; None for tubes
+    thickness: float  # half the thickness of a plate
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (p,) to the nearest link of the chain."""
+        """The signed distance (p,) to the nearest link of the chain."""
         result = np.full(len(points), np.inf)
         for i, axis in enumerate(np.diff(self.centers, axis=0)):
             relative = planar = points - self.centers[i]
@@ -77,7 +77,7 @@ class _Tube:
                 run = axis - (axis @ self.normal) * self.normal
             length = np.linalg.norm(run)
             taper = self.radii[i] - self.radii[i + 1]
-            sine = np.clip(taper / length, -0.95, 0.95)  # beyond 1, one ball holds the other
+            sine = np.clip(taper / length, -0.95, 0.95)  # at 1, one ball contains the other
             along = planar @ (run / length)
             across = np.sqrt(np.maximum(np.einsum("ij,ij->i", planar, planar) - along**2, 0))
             position = np.clip((along - across * sine / np.sqrt(1 - sine**2)) / length, 0, 1)
@@ -92,16 +92,16 @@ class _Tube:
 
 
 def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """The minimum, rounded by a parabola where the two differ by less than the width."""
+    """The minimum, rounded by a parabola where the values differ by less than the width."""
     overlap = np.maximum(1 - np.abs(a - b) / width, 0)
     return np.minimum(a, b) - overlap**2 * (width / 4)
 
 
 class _Body:
-    """One individual at rest: an implicit surface around a skeleton. x is its left, y up, z forward.
+    """One individual in the rest pose: an implicit surface around a skeleton. x is its left, y up, z forward.
 
-    What is added off the plane x = 0 is added on both sides, and joints there are called left_… and right_….
-    The random numbers warp all proportions smoothly, so that eyes stay in the head and toes on the feet.
+    Parts away from the plane x = 0 are added on both sides, and their joints are called left_… and right_….
+    Random numbers warp all proportions smoothly, so that eyes stay in the head and toes on the feet.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
@@ -116,12 +116,13 @@ class _Body:
         self._amplitudes = 0.03 * random.normal(size=(4, 4))
 
     def _individual(self, balls: str) -> np.ndarray:
-        """The balls "x y z radius, ..." in this individual's proportions (p, 4)."""
+        """The balls "x y z radius, ..." as an array (p, 4), in the proportions of this individual."""
         chain = np.array([ball.split() for ball in balls.split(",")], dtype=float)
         across, up, ahead = (
             chain[:, i, None] * self._frequencies[i] + (i > 0) * self._phases for i in range(3)
         )
-        waves = np.cos(across) * np.sin(up + ahead) @ self._amplitudes  # even in x: both sides alike
+        # An even function of x makes both sides equal.
+        waves = np.cos(across) * np.sin(up + ahead) @ self._amplitudes
         chain[:, [0, 3]] *= np.exp(waves[:, [0, 3]])
         chain[:, [1, 2]] += waves[:, [1, 2]]
         return chain * self._scale
@@ -136,13 +137,16 @@ class _Body:
         thickness: float = 0.0,
         joint: str = "",
     ) -> None:
-        """Add or carve a tube, or a plate, through the balls; what sticks out far names its `joint`."""
+        """Add or carve a tube, or a plate, through the balls.
+
+        Tubes that project far from the body name the `joint` that moves them.
+        """
         chain = self._individual(balls)
         if joint:
             for prefix, side in self._sides(chain):
                 owner = self.joints[prefix + joint if prefix + joint in self.joints else joint]
                 self._guides += [(owner, hull) for hull in _hulls(side)]
-        if len(chain) > 2:  # round the corners
+        if len(chain) > 2:  # interpolation rounds the corners
             knots = np.r_[0, np.linalg.norm(np.diff(chain[:, :3], axis=0), axis=1).cumsum()]
             fine = np.interp(np.linspace(0, len(chain) - 1, 3 * len(chain) - 2), np.arange(len(chain)), knots)
             chain = PchipInterpolator(knots, chain)(fine)
@@ -150,7 +154,7 @@ class _Body:
         self._tubes.append(_Tube(chain[:, :3], chain[:, 3], blend, carved, unit, thickness))
 
     def limb(self, joints: str, parent: str, balls: str, *, blend: float) -> None:
-        """Add a tube with a joint in each of its balls but the last."""
+        """Add a tube with a joint in each ball except the last."""
         for prefix, side in self._sides(self._individual(balls)):
             above = self.joints.get(prefix + parent, self.joints.get(parent, -1))
             for name, hull in zip(joints.split(), _hulls(side), strict=True):
@@ -167,7 +171,7 @@ class _Body:
         return [("", chain)]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """The field (p,) whose zero set is the skin: negative inside, a distance up to `_REACH`."""
+        """The field (p,) whose zero set is the skin: negative inside, and a distance up to `_REACH`."""
         folded = np.stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]])
         result = np.full(len(points), 2 * _REACH)
         for tube in self._tubes:
@@ -179,7 +183,7 @@ class _Body:
                 continue
             local = folded[:, near].T
             distance = tube.distance(local)
-            if low[0] < 0 and tube.centers[:, 0].any():  # its mirror image reaches over
+            if low[0] < 0 and tube.centers[:, 0].any():  # the mirror image crosses the plane x = 0
                 distance = _smooth_minimum(distance, tube.distance(local * _MIRROR), tube.blend)
             if tube.carved:
                 result[near] = -_smooth_minimum(-result[near], distance, tube.blend)
@@ -189,11 +193,11 @@ class _Body:
 
     @property
     def extent(self) -> float:
-        """Radius of a ball around the origin that holds the body."""
+        """The radius of a ball around the origin that contains the body."""
         return max(np.linalg.norm(t.centers, axis=1).max() + t.radii.max() for t in self._tubes)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One Newton step towards the skin, and the unit normals there."""
+        """Move points one Newton step toward the skin; return the new points and their unit normals."""
         width = 1e-6
         stencil = points + width * np.vstack([np.zeros(3), np.eye(3)])[:, None]
         value, *shifted = self.signed_distance(stencil.reshape(-1, 3)).reshape(4, -1)
@@ -203,10 +207,10 @@ class _Body:
         return points - np.clip(value / length, -0.03, 0.03)[:, None] * normals, normals
 
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
-        """Rotation vectors (j, 3) of the joints in radians: the pose, in this individual's manner.
+        """Rotation vectors (j, 3) of the joints in radians: a pose, with variations of this individual.
 
         `pose` lists joints with angles in degrees: nose down, nose to the left, left side up. A name without
-        its side means both sides, mirrored.
+        a side stands for both sides, mirrored.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -218,9 +222,10 @@ class _Body:
         return np.radians(angles + 2 * random.normal(size=angles.shape))
 
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Where the points go when the joints turn: every point turns by its own share of each joint's angle.
+        """The positions of points after the joints turn.
 
-        Shares of an angle, unlike averages of matrices, neither shrink a bent joint nor wring a twisted one.
+        Every point turns by its share of each joint's angle. Unlike averages of matrices, shares of an angle
+        neither shrink a bent joint nor collapse a twisted one.
         """
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:
@@ -230,7 +235,7 @@ class _Body:
             depth = np.linalg.norm(points - nearest[:, :3], axis=1) / nearest[:, 3]
             shares[:, joint] += np.exp(-_STIFFNESS * depth)
         shares /= shares.sum(axis=1, keepdims=True)
-        for joint in range(len(angles) - 1, 0, -1):  # a joint moves all that lies beyond it
+        for joint in range(len(angles) - 1, 0, -1):  # a joint moves everything beyond it
             shares[:, self.parents[joint]] += shares[:, joint]
         for joint in range(len(angles) - 1, -1, -1):
             turn = Rotation.from_rotvec(shares[:, joint, None] * angles[joint])
@@ -247,12 +252,12 @@ def _hulls(chain: np.ndarray) -> np.ndarray:
 
 
 def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes on a randomly turned and shifted grid that is refined near the skin only."""
+    """Marching cubes on a randomly rotated and shifted grid that is refined only near the skin."""
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     corners = np.array([(*corner, top) for top in (0, 1) for corner in square])
-    # A cell may hold some of the skin if the field at its center is less than 1.3 times its width: half its
-    # diagonal is 0.87, and the field can overrate distances.
+    # A cell may contain skin if the field at its center is less than 1.3 times its width. Half the diagonal
+    # is 0.87 times the width, and the field can overestimate distances.
     level = int(np.log2(_REACH / (1.3 * spacing)))
     extent = int(np.ceil(body.extent / spacing / 2**level)) + 1
     cells = np.stack(np.meshgrid(*[np.arange(-extent, extent)] * 3), axis=-1).reshape(-1, 3)
@@ -266,7 +271,7 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
     numbers, cubes = np.unique(numbers, return_inverse=True)
     nodes = np.stack(np.unravel_index(numbers, 3 * [2 * size]), axis=1) - size
     nodes = (nodes + shift) * spacing @ turn
-    # Since 2.6.3 libigl returns a third thing, too.
+    # Since version 2.6.3, libigl returns a third value, too.
     vertices, faces = igl.marching_cubes(body.signed_distance(nodes), nodes, cubes.reshape(-1, 8))[:2]
     return vertices, faces
 
@@ -276,7 +281,7 @@ def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     faces = faces.copy()
     for _ in range(20):
         edges, _, sides, corners = igl.edge_flaps(faces)
-        # An edge between tip[0] and tip[1] becomes one between apex[0] and apex[1].
+        # An edge between tip[0] and tip[1] is replaced by the edge between apex[0] and apex[1].
         apex, tip = (faces[sides, (corners + i) % 3].T for i in (0, 1))
         flipped = np.stack([np.stack([apex[s], tip[s], apex[1 - s]], axis=1) for s in (0, 1)])
         before, after = _unit_normals(vertices[faces[sides.T]]), _unit_normals(vertices[flipped])
@@ -304,19 +309,21 @@ def _unit_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Well-shaped triangles with `count` vertices on the body at rest."""
+    """Well-shaped triangles, with `count` vertices, of the body in the rest pose."""
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes puts 1.5 vertices on a grid square's area: aim for four times those wanted.
+    # Marching cubes give 1.5 vertices per area of a grid square: the goal is four times the wanted number.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
-        if igl.facet_components(faces)[0] == 1 and 2 * len(vertices) - len(faces) == 4:  # like a sphere
+        is_sphere = igl.facet_components(faces)[0] == 1 and 2 * len(vertices) - len(faces) == 4
+        if is_sphere:  # in topology
             break
-        spacing *= 0.8  # a grid can tear, or bridge, what is thinner than its cells
+        spacing *= 0.8  # a grid can break or bridge parts thinner than its cells
     else:
         raise InputError("The creature of this seed has parts that touch each other: choose another seed.")
-    # Collapse the shortest edges, in position and (a little) in normal: curved places stay denser.
+    # Decimation collapses the shortest edges, measured in position and (a little) in normal: curved regions
+    # stay denser.
     features = np.hstack([vertices, 0.07 * body.project(vertices)[1]])
     features, faces, _, _ = igl.decimate(
         np.asfortranarray(features), np.asfortranarray(faces, dtype=np.int32), 2 * count - 4
@@ -548,25 +555,27 @@ CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_,
 """The kinds of creature and their poses."""
 
 
-# ---------------------------------------------------------------------------------------------- for everybody
+# ------------------------------------------------------------------------------------------ public functions
 
 
 def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest", seed: int = 0) -> Mesh:
-    """A creature as a closed mesh without handles, its triangles well shaped and oriented outwards.
+    """Make a creature: a closed mesh without handles, with well-shaped triangles oriented outward.
 
-    The same kind, number of vertices and seed give the same triangles in every pose: vertex i stays the same
-    point of the body. At rest the body is mirror symmetric in x; no triangulation is.
+    The same kind, number of vertices and seed give the same triangles in every pose, so vertex i is always
+    the same point of the body. In the rest pose the body is mirror symmetric in x, but its triangulation is
+    not.
 
     **Arguments:**
 
     - `kind`, `pose`: one of `CREATURES` and one of its poses.
-    - `vertices`: how many, at least 500.
-    - `seed`: of the individual: its proportions, its manner of holding a pose and its triangulation.
+    - `vertices`: the number of vertices, at least 500.
+    - `seed`: the individual: its proportions, its variation of a pose, and its triangulation.
 
-    **Returns:** the mesh, exactly `vertices` vertices, about 1.5 units high; x is its left, y up, z forward.
+    **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. x is its left, y up, z
+    forward.
 
-    **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, and for a
-    seed whose individual grew into itself (rare: none among the first 250).
+    **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
+    whose body intersects itself (rare: none of the first 250 seeds).
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
@@ -577,21 +586,22 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
 
 def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 0) -> CreaturePair:
-    """One creature in two poses, nearly isometric and independently triangulated, with exact ground truth.
+    """Make one creature in two poses, nearly isometric, with exact ground truth.
 
-    The source is `creature` of the same arguments in the pose "stand"; the target is that individual in
-    another pose, with 1 to 5 % fewer vertices. The truth is exact up to discretisation: source vertices, at
-    rest, are projected onto the target triangles, at rest.
+    The two meshes are triangulated independently. The source is `creature` with the same arguments in the
+    pose "stand". The target is the same individual in another pose, with 1 to 5 % fewer vertices. The ground
+    truth is exact up to discretization: in the rest pose, source vertices are projected onto the triangles
+    of the target.
 
     **Arguments:**
 
     - `kind`: one of `CREATURES`.
-    - `vertices`: of the source, at least 500.
-    - `seed`: of the individual, the poses and the triangulations.
+    - `vertices`: the number of source vertices, at least 500.
+    - `seed`: determines the individual, the poses and the triangulations.
 
-    **Returns:** the `CreaturePair`.
+    **Returns:** The `CreaturePair`.
 
-    **Raises:** `InputError` as `creature`.
+    **Raises:** `InputError` as in `creature`.
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")
@@ -616,7 +626,7 @@ def _check(kind: str, vertices: int, seed: int) -> None:
         raise InputError(f"Creature {kind!r} is unknown: choose one of {', '.join(CREATURES)}.")
     for name, value, least in (("number of vertices", vertices, _MINIMUM_VERTICES), ("seed", seed, 0)):
         if value < least:
-            raise InputError(f"The {name} of a creature is {value}: give {least} or more.")
+            raise InputError(f"The {name} of a creature is {value}: choose {least} or more.")
 
 
 def _random(seed: int, purpose: str) -> np.random.Generator:

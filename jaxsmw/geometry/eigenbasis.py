@@ -1,4 +1,4 @@
-"""The first eigenpairs of a mesh's Laplace–Beltrami operator: from Mesh to Spectrum."""
+"""The first eigenpairs of the Laplace–Beltrami operator of a mesh."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
 
-# On a surface of area 1, where the first non-zero eigenvalue of a body lies between 1 and 30.
+# For a surface of area 1, whose first non-zero eigenvalue lies between 1 and 30 for a body.
 _SHIFT = -1e-2
-# What an eigenbasis must fulfil: residuals relative to the largest eigenvalue, and |Phi^T A Phi - I|.
+# Limits for an accurate eigenbasis: residuals relative to the largest eigenvalue, and |Phi^T A Phi - I|.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
-# Below this many vertices a dense solver is as fast, and never in doubt.
+# Up to this many vertices, a dense solver is as fast and always succeeds.
 _DENSE = 400
 
 
@@ -40,30 +40,30 @@ def compute_spectrum(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> Spectrum:
-    """The Spectrum of a mesh, scaled to area 1 so that the unit of the file does not matter.
+    """Compute the Spectrum of a mesh, scaled to area 1 so that the unit of the file has no effect.
 
-    Computed in float64 on the host, from fixed seeds, so that the same mesh gives the same Spectrum; each
-    eigenvector's largest entry is positive. Connected components are solved one by one and merged.
+    The computation is in float64 on the host, from fixed seeds, so the same mesh gives the same Spectrum. The
+    largest entry of each eigenvector is positive. Connected components are solved one by one and merged.
 
-    Exactly by shift-invert Lanczos: eigenvalues are counted, residuals and orthonormality checked; where it
-    does not settle, ARPACK takes over. Approximately by the Rayleigh–Ritz method in a smooth subspace of far
-    fewer dimensions (`jaxsmw.geometry.coarsening`): orthonormal to rounding all the same, in a time nearly
-    proportional to the number of vertices. That wants triangles of about one size and shape; where it shows
-    that they are not, the exact method takes over with a warning. Results are kept on disk
-    (`jaxsmw.runtime.cache`).
+    The exact solver is a shift-invert Lanczos method. It counts eigenvalues and checks residuals and
+    orthonormality; if it does not converge, ARPACK takes over. The approximate solver is the Rayleigh–Ritz
+    method in a smooth subspace of far fewer dimensions (`jaxsmw.geometry.coarsening`). Its eigenvectors are
+    orthonormal up to rounding, too, and its time is nearly proportional to the number of vertices. It
+    requires triangles of similar size and shape; if the triangles prove to be too different, the exact
+    solver takes over with a warning. Results are cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
-    - `mesh`: the surface, n vertices.
-    - `number_of_eigenvectors`: k, at least 1 and less than the number of used vertices.
-    - `laplacian`: which discretisation; see `assemble_laplacian`.
-    - `eigensolver`: `"exact"`, `"approximate"` (for components with too few vertices for it, 400 and 30 for
-      each eigenvector, it is exact), or `"auto"`, approximate from 50 000 vertices on.
+    - `mesh`: the surface with n vertices.
+    - `number_of_eigenvectors`: k, at least 1 and less than the number of referenced vertices.
+    - `laplacian`: the discretization; see `assemble_laplacian`.
+    - `eigensolver`: `"exact"`; `"approximate"`, which is exact for connected components with fewer than 400
+      vertices or fewer than 30 vertices per eigenvector; or `"auto"`, approximate from 50 000 vertices.
 
-    **Returns:** A `Spectrum` of JAX's default float type (float32 unless `jax_enable_x64` is set). Vertices
-    that no face uses are masked.
+    **Returns:** A `Spectrum` of JAX's default float type (float32 unless `jax_enable_x64` is set).
+    Unreferenced vertices are masked.
 
-    **Raises:** `InputError` if k does not fit the mesh or the eigenproblem cannot be solved accurately.
+    **Raises:** `InputError` if k does not fit the mesh, or the eigenproblem cannot be solved accurately.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return as_spectrum(mesh, *pairs)
@@ -75,13 +75,13 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """The `eigenpairs` of a mesh for JAX, in its default float type, with positions and normals."""
-    used = mesh.used_vertices
-    # From the centroid on, so that single precision is enough wherever the mesh lies.
+    """The `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type, with positions and normals."""
+    used = mesh.referenced_vertices
+    # Relative to the centroid, single precision suffices wherever the mesh lies.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     positions = np.where(used[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
-    # `jnp.asarray` would compile something for every size.
+    # Unlike `device_put`, `jnp.asarray` would compile a program for every size.
     arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))
     return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
 
@@ -93,22 +93,22 @@ def eigenpairs(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
-    """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors, vertex areas, for total area 1."""
+    """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors and vertex areas, for total area 1."""
     check_kind("mesh", mesh, Mesh)
-    used = np.flatnonzero(mesh.used_vertices)
+    used = np.flatnonzero(mesh.referenced_vertices)
     if not isinstance(number_of_eigenvectors, int | np.integer):
         raise InputError(
-            f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}; give an integer."
+            f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}: give an integer."
         )
     if not 1 <= number_of_eigenvectors < len(used):
         raise InputError(
-            f"{mesh.name}: {number_of_eigenvectors} eigenvectors were asked for, but a mesh with {len(used)} "
-            f"used vertices has between 1 and {len(used) - 1} to give; ask for as many, or use a finer mesh."
+            f"{mesh.name}: cannot compute {number_of_eigenvectors} eigenvectors from {len(used)} referenced "
+            f"vertices: choose a number from 1 to {len(used) - 1}, or use a finer mesh."
         )
     if eigensolver not in get_args(Eigensolver):
-        raise InputError(f"{eigensolver!r} is no eigensolver: choose {', '.join(get_args(Eigensolver))}.")
+        raise InputError(f"{eigensolver!r} is not an eigensolver: choose {', '.join(get_args(Eigensolver))}.")
     if laplacian not in get_args(Laplacian):
-        raise InputError(f"{laplacian!r} is no Laplacian: choose {', '.join(get_args(Laplacian))}.")
+        raise InputError(f"{laplacian!r} is not a Laplacian: choose {', '.join(get_args(Laplacian))}.")
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if eigensolver == "auto":
@@ -117,16 +117,16 @@ def eigenpairs(
     def compute() -> dict[str, np.ndarray]:
         stiffness, areas = assemble_laplacian(mesh, laplacian=laplacian)
         areas = areas / areas.sum()
-        if whole := len(used) == len(areas):
+        if all_referenced := len(used) == len(areas):
             local = stiffness, areas
         else:
             local = stiffness[used][:, used], areas[used]
         with one_blas_thread():
             values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
-        # Without further copies: of a large mesh they would fill the memory.
+        # In place, because further copies could fill the memory for a large mesh.
         for column in vectors.T:
             column *= np.sign(column[np.argmax(np.abs(column))])
-        if not whole:
+        if not all_referenced:
             eigenvectors = np.zeros((len(areas), number_of_eigenvectors))
             eigenvectors[used] = vectors
             vectors = eigenvectors
@@ -138,15 +138,15 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """What `"auto"` means for meshes that are to be compared: the same for all, by the largest."""
-    most = max(int(mesh.used_vertices.sum()) for mesh in meshes)
+    """Resolve `"auto"` for meshes that will be compared: all get the solver of the largest mesh."""
+    most = max(int(mesh.referenced_vertices.sum()) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 
 def _solve(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest eigenpairs over all connected components."""
+    """The k smallest eigenpairs of all connected components together."""
     number_of_components, component = connected_components(stiffness, directed=False)
     if number_of_components == 1:
         return _solve_component(stiffness, areas, k, eigensolver, name)
@@ -172,10 +172,10 @@ def _solve(
 def _solve_component(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest eigenpairs of one connected component, checked."""
+    """The k smallest eigenpairs of one connected component, after checks of their accuracy."""
     n = len(areas)
-    # Neighbours close to each other: for the cache, and because the ordering that keeps factors sparse is
-    # several times worse for some numberings, those of subdivided meshes among them.
+    # Renumbering puts neighbors close to each other, for the processor's cache. Besides, the ordering that
+    # keeps factors sparse is several times worse for some numberings, such as those of subdivided meshes.
     order = reverse_cuthill_mckee(stiffness, symmetric_mode=True)
     stiffness, areas = stiffness[order][:, order], areas[order]
     mass = sp.diags(areas).tocsc()
@@ -191,22 +191,22 @@ def _solve_component(
             residual, deviation = _check(stiffness, areas, eigenvalues, eigenvectors)
             accurate = solver is _approximate or residual <= _RESIDUAL_TOLERANCE
             if accurate and deviation <= _ORTHONORMALITY_TOLERANCE:
-                # Of a connected surface the first is zero, whatever rounding made of it.
+                # The first eigenvalue of a connected surface is zero, apart from rounding.
                 eigenvalues = np.maximum(eigenvalues, 0)
                 eigenvalues[0] = 0
                 return eigenvalues, eigenvectors[np.argsort(order)]
             failure = f"relative residual {residual:.1e}, deviation from orthonormality {deviation:.1e}"
         if solver is _approximate:
             warnings.warn(
-                f"{name}: its eigenvectors cannot be approximated ({failure}) and are computed exactly; "
-                "remesh it evenly if that takes too long.",
+                f"{name}: eigenvectors cannot be approximated ({failure}) and are computed exactly: remesh "
+                "the surface evenly if the exact computation takes too long.",
                 RuntimeWarning,
                 stacklevel=2,
             )
     raise InputError(
-        f"{name}: its first {k} eigenvectors could not be computed accurately ({failure}); the mesh is "
-        "probably badly shaped: try the robust Laplacian (laplacian='robust', on the command line "
-        "--laplacian robust), fewer eigenvectors or a remeshed surface."
+        f"{name}: the first {k} eigenvectors could not be computed accurately ({failure}), probably because "
+        "of badly shaped triangles: try the robust Laplacian (laplacian='robust', on the command line "
+        "--laplacian robust), fewer eigenvectors, or a remeshed surface."
     )
 
 
@@ -218,8 +218,8 @@ def _dense(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.nd
 
 
 def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> SuperLU:
-    """The factors of W - shift A."""
-    # Without symmetric mode this ordering would be slower by orders of magnitude.
+    """The LU factors of W - shift A."""
+    # Without symmetric mode, this ordering would be slower by orders of magnitude.
     return splu(
         (stiffness - shift * mass).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -229,14 +229,15 @@ def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> 
 
 
 def _number_below(factors: SuperLU) -> int:
-    """How many eigenvalues lie below the shift: as many as there are negative pivots (Sylvester's law)."""
+    """The number of eigenvalues below the shift, which is the number of negative pivots (Sylvester's law)."""
     return int((factors.U.diagonal() < 0).sum())
 
 
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
     """A shift amid the first k eigenvalues, and the factors of W - shift A.
 
-    Weyl's law says where k/2 of them are; where it is wrong, as on a thin tube, their number shows it.
+    Weyl's law predicts a shift above k/2 eigenvalues. Where the law fails, as on a thin tube, the number of
+    eigenvalues below the shift leads to a better one.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -250,7 +251,7 @@ def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) ->
 
 
 def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.ndarray) -> bool:
-    """Whether there are more eigenvalues below the last one found, of which there may be more copies."""
+    """Whether eigenvalues are missing below the last one. Further copies of the last one are not counted."""
     if len(eigenvalues) == 1:
         return False
     shift = float(eigenvalues[-1]) * (1 - 1e-6)
@@ -260,33 +261,36 @@ def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.
 def _lanczos(
     stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int, *, tolerance: float = 1e-10
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The block Lanczos method on (W - shift A)^-1 A until all k have settled, without restarts.
+    """The block Lanczos method for (W - shift A)^-1 A, without restarts, until all k eigenpairs converge.
 
-    With a shift amid them, wanted eigenvalues are at both ends of the inverse's spectrum, and two products
-    for each suffice; keeping every vector A-orthogonal to all before it costs less than ARPACK's restarts.
-    Of the copies of a multiple eigenvalue no more are reached than a block has vectors. So eigenvalues are
-    counted, and if some are missing it is done again with larger blocks. Settled is an eigenvector whose
-    relative residual of the inverse is below the tolerance.
+    With a shift amid the wanted eigenvalues, they lie at both ends of the spectrum of the inverse, and two
+    products per eigenpair suffice. Keeping every vector A-orthogonal to all earlier ones costs less than
+    ARPACK's restarts. A block of b vectors finds at most b copies of a multiple eigenvalue. So eigenvalues
+    are counted, and if some are missing, larger blocks are tried. An eigenpair has converged when its
+    residual for the inverse, relative to the eigenvalue, is below the tolerance.
 
-    **Raises:** `RuntimeError` if they do not settle.
+    **Raises:** `RuntimeError` if the method does not converge.
     """
     shift, inverse = _factorized_midway(stiffness, mass, k)
     for size in (_BLOCK, 2 * _BLOCK):
-        eigenvalues, eigenvectors = _settled(inverse, shift, mass, k, size, tolerance)
+        eigenvalues, eigenvectors = _converged(inverse, shift, mass, k, size, tolerance)
         if not _misses_some(stiffness, mass, eigenvalues):
             return eigenvalues, eigenvectors
     raise RuntimeError("not all copies of a multiple eigenvalue were found")
 
 
-# Vectors of a block: a few, since two threads that solve wait for each other, as SuperLU takes Python's lock
-# for its memory. More take more products until all have settled.
+# The number of vectors in a block. Several vectors per solve pay because SuperLU takes Python's lock for its
+# memory, so that two threads wait for each other. Larger blocks need more products to converge.
 _BLOCK = 4
 
 
-def _settled(
+def _converged(
     inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first k eigenpairs, as far as blocks of `size` vectors reach them."""
+    """The first k eigenpairs that blocks of `size` vectors find.
+
+    **Raises:** `RuntimeError` if they do not converge.
+    """
     n = mass.shape[0]
     diagonal = mass.diagonal() if mass.nnz == n else None
 
@@ -298,10 +302,10 @@ def _settled(
 
     most = min(n - 1, 10 * k + 100)
     vectors = np.empty((2 * k + 100 + size, n))
-    # The first eigenvector, which is known.
+    # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
-    # Smoothed, as no eigenvector is rough: rounding errors in the weight of something rough would show in
-    # derivatives of the eigenvectors.
+    # The initial block is smoothed, because eigenvectors are smooth: rounding errors in the weights of rough
+    # vectors would show in derivatives of the eigenvectors.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -315,7 +319,8 @@ def _settled(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # First what is large, that of the last blocks, then what is left: in one go it would swamp that.
+        # The overlaps with the last blocks are large, and are removed first: otherwise their rounding errors
+        # would hide the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
         overlaps[:, before:] += large
@@ -324,9 +329,9 @@ def _settled(
         if end < look:
             continue
         look = end + max(5, k // 20)
-        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's keeps Python's lock
+        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's `eigh` holds Python's lock
         eigenvalues = shift + 1 / inverted
-        # Below zero are images of what is beyond all wanted.
+        # Negative values belong to eigenvalues beyond all wanted ones.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -334,7 +339,7 @@ def _settled(
             eigenvectors[0] = vectors[0]
             np.matmul(combinations[:, wanted].T, vectors[1:end], out=eigenvectors[1:])
             return np.append(0.0, eigenvalues[wanted]), eigenvectors.T
-    raise RuntimeError("the Lanczos vectors have not settled")
+    raise RuntimeError("the Lanczos method has not converged")
 
 
 def _remove(
@@ -342,7 +347,7 @@ def _remove(
     vectors: Float64[np.ndarray, "b n"],
     weighted: Callable[[np.ndarray], np.ndarray],
 ) -> Float64[np.ndarray, "b j"]:
-    """Make vectors A-orthogonal to known ones, in place; how much of each they had."""
+    """Make vectors A-orthogonal to known vectors, in place, and return the overlaps that were removed."""
     overlaps = weighted(vectors) @ known.T
     vectors -= overlaps @ known
     return overlaps
@@ -351,19 +356,21 @@ def _remove(
 def _orthonormal(
     vectors: Float64[np.ndarray, "b n"], weighted: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[Float64[np.ndarray, "b n"], Float64[np.ndarray, "b b"]]:
-    """Vectors Q, A-orthonormal, and a triangular L, with L Q those given.
+    """Factor vectors V into L Q, with A-orthonormal vectors Q and a lower triangular matrix L.
 
-    **Raises:** `LinAlgError` if they depend on each other.
+    **Returns:** Q and L.
+
+    **Raises:** `LinAlgError` if the vectors are linearly dependent.
     """
     lower = np.eye(len(vectors))
-    for _ in range(2):  # the second time for the rounding errors of the first
+    for _ in range(2):  # the second pass removes the rounding errors of the first
         factor = np.linalg.cholesky(weighted(vectors) @ vectors.T)
         vectors, lower = np.linalg.inv(factor) @ vectors, lower @ factor
     return vectors, lower
 
 
 def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same by ARPACK, which restarts and takes all the digits it can have."""
+    """The k smallest eigenpairs by ARPACK, which restarts, to machine precision."""
     n = stiffness.shape[0]
     inverse = LinearOperator((n, n), matvec=_factorized(stiffness, mass, _SHIFT).solve, dtype=float)
     start = np.random.default_rng(0).standard_normal(n)
@@ -371,12 +378,12 @@ def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.n
 
 
 def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rayleigh–Ritz in a coarse subspace, and once more in the smoothed span of what that gives.
+    """The Rayleigh–Ritz method in a coarse subspace, and again in the smoothed span of its eigenvectors.
 
-    A few more than k are taken along, since the last of a subspace are its worst.
+    A few more than k eigenvectors are computed, because the last ones of a subspace are the least accurate.
 
-    **Raises:** `RuntimeError` where smoothing once more would still lower eigenvalues much: then the subspace
-    does not suit the mesh. (How many eigenvalues were missed is not counted: that takes the factors of W.)
+    **Raises:** `RuntimeError` if another smoothing would still lower eigenvalues much, since the subspace
+    then does not suit the mesh. (Missing eigenvalues are not counted, because that takes the factors of W.)
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -388,7 +395,7 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
         _, combinations = _arpack(coarse.stiffness, coarse.mass, taken)
     n, single = stiffness.shape[0], combinations.astype(np.float32)
     basis, eigenvectors = np.empty((n, taken)), np.empty((n, k))
-    grams = np.zeros((2, taken, taken))  # their upper triangles
+    grams = np.zeros((2, taken, taken))  # only the upper triangles are filled
     for columns in _slices(taken):
         basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
     for columns in _slices(taken):
@@ -397,24 +404,25 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
-    # The last are the worst on meshes that are bad throughout; of a bad region any may be.
+    # If all triangles are bad, the last eigenvectors are the least accurate; if a region is bad, any may be.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
     lowered = (eigenvalues[looked_at] * norms / energies - 1).max(initial=0)
     if lowered > _MOST_LOWERED:
-        raise RuntimeError(f"eigenvalues would be off by {lowered:.0%} and more")
+        raise RuntimeError(f"eigenvalues would be wrong by {lowered:.0%} or more")
     return eigenvalues, eigenvectors
 
 
-# Of the subspace, for each eigenvector.
+# The number of dimensions of the subspace per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
-# By how much smoothing once more may lower eigenvalues. Errors are up to three times that.
+# The limit for the relative decrease of eigenvalues by another smoothing. Errors are up to three times as
+# large.
 _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Columns in groups: of a large mesh there is not room for another copy of all."""
+    """Groups of columns, because the memory may not hold another copy of all columns of a large mesh."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
@@ -429,7 +437,7 @@ def _check(
         gram[columns] -= np.eye(gram.shape[1])
         residuals = stiffness @ eigenvectors[:, columns] - weighted * eigenvalues[columns]
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
-        # A NaN is larger than everything.
+        # `np.maximum` keeps NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # A lone zero eigenvalue gives no scale; one on the surface of area 1 does.
+    # A single eigenvalue, zero, gives no scale; 1 is a scale on a surface of area 1.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

@@ -1,11 +1,11 @@
-"""Geodesic distances on the piecewise flat surface, accurate at short range too.
+"""Geodesic distances on the piecewise flat surface, accurate for short distances, too.
 
-Evaluation measures how far a match lies from the truth, and good matches lie near it. There the heat method
-is off by several percent, and the exact propagation of windows takes tens of times longer than what is done
-here: Dijkstra's algorithm on the graph of edges and straight shortcuts. From every vertex the triangles
-around are unfolded into the plane, strip after strip, and each vertex that a straight line within a strip
-reaches becomes a neighbour, at exactly that line's length. Paths on this graph are paths on the surface, so
-distances are never too short; on bodies they are too long by 0.03 to 0.07 % on average.
+Evaluation measures the distance between a match and the true point, which is short for good matches. For
+short distances the heat method has errors of several percent. Exact window propagation takes tens of times
+longer than the method here: Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of
+triangles around each vertex are unfolded into the plane. Each vertex that a straight line within a strip
+reaches becomes a neighbor, at the exact length of the line. Paths in this graph are paths on the surface, so
+distances are never too short. On bodies they are too long by 0.03 to 0.07 % on average.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 
-# How many edges the straight lines of the graph cross.
+# The number of edges that a straight line of the graph may cross.
 _DEPTH = 10
 
-# Sides of triangles from which strips are unfolded at once, and distances stored at once: both small enough
-# for the processor's cache to help.
+# The number of sides from which strips are unfolded at once, and of distances stored at once: both small
+# enough for the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
-# Radii, in square roots of the area, within which partners are looked for before everywhere else is searched.
-# Each costs a small fraction of the next.
+# Radii, in square roots of the area, of the searches for partners before the search of the whole surface.
+# Each search costs a small fraction of the next.
 _RADII = (0.01, 0.05, 0.25)
 
-# A triangle lower than this fraction of its longest edge can keep libigl from ever coming to an end.
+# libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
 _EXACT_HEIGHT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points anywhere on a mesh.
+    """Points on the faces of a mesh.
 
     **Attributes:**
 
-    - `faces`: the face on which each point lies (p,), 0-based.
-    - `weights`: barycentric weights (p, 3) of the face's corners in their order, not negative, of sum 1.
+    - `faces`: the face of each point (p,), 0-based.
+    - `weights`: the barycentric weights (p, 3) of the corners of the face; not negative, with sum 1.
     """
 
     faces: Int64[np.ndarray, " p"]
@@ -62,31 +62,32 @@ class SurfacePoints:
         return SurfacePoints(self.faces[rows], self.weights[rows])
 
     def positions(self, mesh: Mesh) -> Float64[np.ndarray, "p 3"]:
-        """Where the points lie in space."""
+        """The positions of the points in space."""
         return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
 
     def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """Of the vertices of each point's face the nearest one."""
+        """The corner nearest to each point, among the corners of its face."""
         corners = mesh.faces[self.faces]
         distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
         return corners[np.arange(len(corners)), distances.argmin(axis=1)]
 
 
 class _Sides(NamedTuple):
-    """The sides of all triangles and of their mirror images: 6 f of them.
+    """The 6 f sides of all triangles and of their mirror images.
 
-    Side 3 t + k leads from corner k to corner k + 1 of triangle t; triangles f … 2 f - 1 are the mesh's faces
-    0 … f - 1 run through backwards. So a line that leaves one face for another enters it by a side that runs
-    opposite to the side it leaves by, no matter how the faces are oriented and how many meet at the edge.
+    Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the faces 0 … f
+    - 1 with reversed order of corners. So a line that crosses from one face into another always enters by a
+    side that runs opposite to the side by which it leaves. This holds for any orientation of the faces, and
+    for any number of faces at the edge.
     """
 
     tail: Int64[np.ndarray, " s"]
     head: Int64[np.ndarray, " s"]
     apex: Int64[np.ndarray, " s"]
     length: Float64[np.ndarray, " s"]
-    # Where the apex lies in the complex plane when the side leads from 0 to 1; never below the real axis.
+    # The position of the apex in the complex plane if the side leads from 0 to 1; never below the real axis.
     shape: Complex128[np.ndarray, " s"]
-    # Leaving by side i one enters by across[first[i]], …, across[first[i + 1] - 1].
+    # Lines that leave by side i enter by the sides across[first[i]], …, across[first[i + 1] - 1].
     first: Int64[np.ndarray, " s1"]
     across: Int64[np.ndarray, " c"]
 
@@ -98,7 +99,7 @@ def _sides(mesh: Mesh) -> _Sides:
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
-    # Through a side without length nothing passes, so its zeros do no harm.
+    # Nothing crosses a side of length zero, so its zeros have no effect.
     direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
     shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
@@ -115,16 +116,16 @@ def _sides(mesh: Mesh) -> _Sides:
 
 
 def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All i, start[i] + j with 0 <= j < count[i]."""
+    """All pairs i and start[i] + j with 0 <= j < count[i]."""
     row = np.repeat(np.arange(len(count)), count)
     return row, np.arange(len(row)) + np.repeat(start - (np.cumsum(count) - count), count)
 
 
 class _Beams(NamedTuple):
-    """Cones of straight lines from points, each through a strip of triangles unfolded into the plane.
+    """Cones of straight lines from points, each within a strip of triangles unfolded into the plane.
 
-    The plane is that of complex numbers, and the point is at 0. The side by which a beam leaves or enters a
-    triangle has its ends at `right` and `left`; the lines that have passed every side so far lie between the
+    The plane is the complex plane, and the point lies at 0. The side by which a beam enters or leaves a
+    triangle has its ends at `right` and `left`. The lines that pass through all sides so far lie between the
     directions `rightmost` and `leftmost`.
     """
 
@@ -140,12 +141,12 @@ class _Beams(NamedTuple):
 
 
 def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Whether b lies to the left of a, as seen from 0."""
+    """Whether b is to the left of a, seen from 0."""
     return a.real * b.imag - a.imag * b.real > 0
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Whether a line of each beam leads to a position in the triangle that it enters."""
+    """Whether a line of each beam reaches a position in the triangle that the beam enters."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -156,17 +157,17 @@ def _unfold(
     position: Complex128[np.ndarray, " b"],
     depth: int,
 ) -> Iterator[tuple[_Beams, Complex128[np.ndarray, " _"]]]:
-    """Follow all straight lines from points out of their triangles and on.
+    """Follow all straight lines from points through successive triangles.
 
     **Arguments:**
 
-    - `origin`: the number of the point of each first beam (b,).
-    - `side`: the side by which the beam leaves the point's triangle (b,).
-    - `position`: where the point lies when this side leads from 0 to 1 (b,).
-    - `depth`: how many sides to cross.
+    - `origin`: the number of the point of each initial beam (b,).
+    - `side`: the side by which the beam leaves the triangle of the point (b,).
+    - `position`: the position of the point if this side leads from 0 to 1 (b,).
+    - `depth`: the number of sides to cross.
 
-    **Returns:** Each time sides have been crossed, the beams that enter the next triangles, and where the
-    third corner of each of these lies.
+    **Returns:** An iterator with one item per crossing: the beams that enter the next triangles, and the
+    positions of the third corners of these triangles.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
@@ -176,8 +177,8 @@ def _unfold(
         beams = beams.at(beam)._replace(side=sides.across[entry])
         corner = beams.left + sides.shape[beams.side] * (beams.right - beams.left)
         yield beams, corner
-        # What passes to the right of the corner leaves by the side from the right end to the corner, what
-        # passes to its left by the side from the corner to the left end.
+        # Lines to the right of the corner leave by the side from the right end to the corner. Lines to its
+        # left leave by the side from the corner to the left end.
         triangle, k = np.divmod(beams.side, 3)
         visible = _visible(beams, corner)
         to_right = beams._replace(
@@ -194,7 +195,7 @@ def _unfold(
 
 
 class _Lines(NamedTuple):
-    """Straight lines on the surface, from node to node of a graph."""
+    """Straight lines on the surface, between nodes of a graph."""
 
     origins: Int[np.ndarray, " l"]
     ends: Int[np.ndarray, " l"]
@@ -202,7 +203,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """The lines to vertices that `_unfold` comes by."""
+    """The straight lines to the vertices that `_unfold` finds."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)
@@ -211,7 +212,7 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """The lengths of lines as a square matrix; of several lines between the same nodes the shortest."""
+    """The lengths of lines as a square matrix, with the shortest of several lines between the same nodes."""
     origins, ends, lengths = (np.concatenate(part) for part in zip(*lines, strict=True))
     key = origins.astype(np.int64) * size + ends
     order = np.lexsort([lengths, key])
@@ -223,18 +224,20 @@ def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
 
 @lru_cache(maxsize=4)
 def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
-    """The graph of a mesh's edges and of straight lines between vertices through strips of triangles.
+    """The graph of the edges of a mesh, and of straight lines between vertices through strips of triangles.
 
-    Kept on disk (`jaxsmw.runtime.cache`), and for the last few meshes in memory.
+    Graphs are cached on disk (`jaxsmw.runtime.cache`), and for the last four meshes in memory.
 
     **Arguments:**
 
-    - `mesh`: the surface, n vertices; boundaries, several components and non-manifold edges are welcome.
-    - `depth`: how many edges a straight line may cross, at least 1. On bodies shortest paths are too long by
-        0.1 to 0.2 % on average for 6, by 0.03 to 0.07 % for 10, which take 1.4 times as long to search.
+    - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
+        allowed.
+    - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, shortest paths are
+        too long by 0.1 to 0.2 % on average for a depth of 6, and by 0.03 to 0.07 % for 10. A search with
+        depth 10 takes 1.4 times as long as with 6.
 
-    **Returns:** Lengths (n, n) in the mesh's unit, symmetric. An explicit zero is a line between vertices at
-    the same position. All callers share the matrix: do not change it.
+    **Returns:** Lengths (n, n) in the unit of the mesh, symmetric. A stored zero is a line between two
+    vertices at the same position. All callers share the matrix and must not change it.
     """
     n, s = len(mesh.vertices), 3 * len(mesh.faces)
 
@@ -243,11 +246,11 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
         smaller, larger = mesh.edges.T
         edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
         lines = [_Lines(smaller, larger, edge_lengths)]
-        # Only the first half of the sides: from mirrored triangles start the same lines, mirrored.
+        # The first half of the sides suffices, because mirrored triangles give the same lines, mirrored.
         for start in range(0, s, _SIDES_AT_ONCE):
             side = np.arange(start, min(start + _SIDES_AT_ONCE, s))
             origins, ends, lengths = _lines(sides, sides.apex[side], side, sides.shape[side], depth)
-            once = origins < ends  # each line is found from both of its ends
+            once = origins < ends  # each line is found from both ends
             lines.append(_Lines(origins[once], ends[once], lengths[once]))
         half = _shortest(lines, n).tocoo()
         rows, columns = np.concatenate([[half.row, half.col], [half.col, half.row]], axis=1)
@@ -265,21 +268,22 @@ def geodesic_distances(
     method: GeodesicMethod = "strips",
     limit: float = np.inf,
 ) -> Float64[np.ndarray, "s n"]:
-    """Geodesic distances from points on a mesh to all its vertices.
+    """Compute geodesic distances from points on a mesh to all its vertices.
 
     **Arguments:**
 
-    - `mesh`: the surface, n vertices.
-    - `sources`: s vertex indices, or `SurfacePoints`. For very many, call this for some at a time: the result
-        is s x n. For distances between given pairs there is `geodesic_distances_between`.
+    - `mesh`: the surface with n vertices.
+    - `sources`: s vertex indices, or `SurfacePoints`. The result is s x n, so divide very many sources into
+        several calls. For distances between given pairs, use `geodesic_distances_between`.
     - `method`: `"strips"` searches `geodesic_graph`. `"exact"` propagates windows (Mitchell, Mount and
-        Papadimitriou 1987, in libigl): between vertices of manifold meshes only, and about 100 times slower.
-    - `limit`: distances above it, in the mesh's unit, are inf, and `"strips"` saves their time.
+        Papadimitriou 1987, in libigl). It works only between vertices of manifold meshes, and takes about 100
+        times as long.
+    - `limit`: distances above the limit, in the unit of the mesh, are inf. A limit saves time with
+      `"strips"`.
 
-    **Returns:** Distances (s, n) in the mesh's unit; inf where no path leads.
+    **Returns:** Distances (s, n) in the unit of the mesh; inf where there is no path.
 
-    **Raises:** `InputError` for sources that do not lie on the mesh, and where the exact method cannot be
-    used.
+    **Raises:** `InputError` for sources that are not on the mesh, or if the exact method cannot be used.
     """
     points = check_points(sources, mesh, "sources")
     if method == "exact":
@@ -300,27 +304,27 @@ def geodesic_distances_between(
     *,
     method: GeodesicMethod = "strips",
 ) -> Float64[np.ndarray, " p"]:
-    """The geodesic distance between each point and its partner.
+    """Compute the geodesic distance between each point and its partner.
 
-    The search widens in steps, from the side on which fewer points differ: partners close to each other, as
-    good matches and the truth are, take a fraction of the time of all distances, and p x n numbers are never
-    stored.
+    The search starts from the points or the partners, whichever has fewer different ones, and widens in
+    steps. For partners that are close together, like good matches and true points, it takes a fraction of
+    the time of all distances. It never stores p x n numbers.
 
     **Arguments:**
 
-    - `mesh`: the surface.
+    - `mesh`: the surface with n vertices.
     - `points`, `partners`: p vertex indices or `SurfacePoints` each.
     - `method`: as in `geodesic_distances`.
 
-    **Returns:** Distances (p,) in the mesh's unit; inf where no path leads.
+    **Returns:** Distances (p,) in the unit of the mesh; inf where there is no path.
 
-    **Raises:** `InputError` as `geodesic_distances`, or if there are not as many points as partners.
+    **Raises:** `InputError` as in `geodesic_distances`, or if the numbers of points and partners differ.
     """
     starts, ends = check_points(points, mesh, "points"), check_points(partners, mesh, "partners")
     if len(starts) != len(ends):
         raise InputError(
             f"every point needs a partner, but there are {len(starts)} points and {len(ends)} partners: "
-            "give as many of both."
+            "give equal numbers of both."
         )
     if _number_of_different(ends) < _number_of_different(starts):
         starts, ends = ends, starts
@@ -355,7 +359,7 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `_unfold` starts from: origin, side and position of the three beams out of each point's face."""
+    """The arguments of `_unfold` for points: origin, side and position of three beams out of each face."""
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]
@@ -364,7 +368,7 @@ def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray
 def _straight_distances(
     mesh: Mesh, points: SurfacePoints, partners: SurfacePoints
 ) -> Float64[np.ndarray, " p"]:
-    """The length of the straight line from each point to its partner, inf where there is none."""
+    """The length of the straight line from each point to its partner, or inf if there is no such line."""
     lengths = np.linalg.norm(points.positions(mesh) - partners.positions(mesh), axis=1)
     lengths[points.faces != partners.faces] = np.inf
     sides = _sides(mesh)
@@ -385,9 +389,11 @@ def _straight_distances(
 def _network(
     mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints, ends: Int64[np.ndarray, " q"] | SurfacePoints
 ) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
-    """The geodesic graph with ways in from points and ways out to ends, and which nodes these two are.
+    """Add surface points to the geodesic graph, as nodes with lines from points and to ends.
 
-    No way leads through an added node, so that a distance does not depend on what is asked for with it.
+    No path leads through an added node, so a distance does not depend on the other points.
+
+    **Returns:** The graph, the nodes of the points, and the nodes of the ends.
     """
     graph, size = geodesic_graph(mesh), len(mesh.vertices)
     if not isinstance(points, SurfacePoints) and not isinstance(ends, SurfacePoints):
@@ -395,7 +401,7 @@ def _network(
     coordinates, sides = graph.tocoo(), _sides(mesh)
     lines = [_Lines(coordinates.row, coordinates.col, coordinates.data)]
 
-    def ways(added: SurfacePoints) -> _Lines:
+    def lines_from(added: SurfacePoints) -> _Lines:
         corners = mesh.faces[added.faces]
         offsets = mesh.vertices[corners] - added.positions(mesh)[:, None]
         number = np.repeat(np.arange(len(added)), 3)
@@ -404,12 +410,12 @@ def _network(
         return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
 
     if isinstance(points, SurfacePoints):
-        number, vertices, lengths = ways(points)
+        number, vertices, lengths = lines_from(points)
         lines.append(_Lines(size + number, vertices, lengths))
         points = size + np.arange(len(points))
         size += len(points)
     if isinstance(ends, SurfacePoints):
-        number, vertices, lengths = ways(ends)
+        number, vertices, lengths = lines_from(ends)
         lines.append(_Lines(vertices, size + number, lengths))
         ends = size + np.arange(len(ends))
         size += len(ends)
@@ -417,10 +423,11 @@ def _network(
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
-    """A function from a source and targets to exact distances, for meshes with which libigl can cope.
+    """A function that computes exact distances from a source to targets.
 
-    With others it crashes (edges with three faces), stops half-way (vertices that join several fans) or never
-    ends (slivers, very small units).
+    **Raises:** `InputError` for meshes that libigl cannot handle. It crashes at edges with three faces, stops
+    early at vertices that join several fans, and never ends on slivers. (It never ends in very small units,
+    either, so the mesh is scaled first.)
     """
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -432,8 +439,8 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
     for fault, count in faults.items():
         if count:
             raise InputError(
-                f"{mesh.name}: exact geodesic distances cannot be computed on a mesh with {fault}, of "
-                f"which it has {count}: use method='strips'."
+                f"{mesh.name}: exact geodesic distances cannot be computed because the mesh has {fault} "
+                f"({count}): use method='strips'."
             )
     _, component = connected_components(geodesic_graph(mesh), directed=False)
     scale = np.sqrt(mesh.area)
@@ -458,38 +465,54 @@ def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarr
 def check_points(
     points: ArrayLike | SurfacePoints, mesh: Mesh, name: str
 ) -> Int64[np.ndarray, " p"] | SurfacePoints:
-    """The same points, known to lie on the mesh; `InputError` that calls them by a name where they do not."""
+    """Check that points lie on a mesh.
+
+    **Arguments:**
+
+    - `points`: vertex indices (p,) or `SurfacePoints`.
+    - `mesh`: the mesh.
+    - `name`: the name of the points in messages.
+
+    **Returns:** The points, with int64 indices.
+
+    **Raises:** `InputError` if a point is not on the mesh.
+    """
     if not isinstance(points, SurfacePoints):
         return check_indices(points, len(mesh.vertices), f"{name} on {mesh.name}: vertex")
     return check_surface_points(points, mesh, name)
 
 
 def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
+    """`check_points` for `SurfacePoints`."""
     faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
-    with np.errstate(invalid="ignore"):  # NaN is bad, as it compares false
+    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)
     if not good.all():
         at = int(good.argmin())
         raise InputError(
             f"{name} on {mesh.name}: number {at} has the barycentric weights {points.weights[at].tolist()}, "
-            "which must be at least 0 and sum to 1: divide them by their sum."
+            "which must be at least 0 and sum to 1: divide the weights by their sum."
         )
     return SurfacePoints(faces, points.weights)
 
 
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
+    """Check that values are indices (p,) from 0 to `count` - 1.
+
+    **Raises:** `InputError`, with the name of the indices, if not.
+    """
     if np.ma.is_masked(values):
-        raise InputError(f"{name} indices are masked in part: fill these in, or drop them.")
+        raise InputError(f"{name} indices are masked in part: fill in the masked ones, or drop them.")
     indices = np.asarray(values)
     if indices.ndim != 1 or indices.dtype.kind not in "iu":
         raise InputError(
-            f"{name} indices must be whole numbers in one row, but are {indices.dtype.name} of shape "
-            f"{indices.shape}: give one for each point."
+            f"{name} indices must be a list of integers, but are {indices.dtype.name} of shape "
+            f"{indices.shape}: give one index for each point."
         )
     outside = (indices < 0) | (indices >= count)
     if outside.any():
         at = int(outside.argmax())
-        cure = "subtract 1, for they seem to count from 1" if indices.max() == count else "correct it"
+        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
         raise InputError(
             f"{name} indices must lie between 0 and {count - 1}, but number {at} is {indices[at]}: {cure}."
         )

@@ -41,7 +41,7 @@ def assemble_laplacian(
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
         # robust_laplacian requires that every vertex has a face.
-        used = np.flatnonzero(mesh.used_vertices)
+        used = np.flatnonzero(mesh.referenced_vertices)
         compact = np.full(len(mesh.vertices), -1)
         compact[used] = np.arange(len(used))
         local_stiffness, mass = robust_laplacian.mesh_laplacian(
@@ -53,7 +53,7 @@ def assemble_laplacian(
         return (scatter @ local_stiffness @ scatter.T).tocsc(), scatter @ mass.diagonal()
     stiffness = -igl.cotmatrix(mesh.vertices, mesh.faces).tocsc()
     areas = mesh.vertex_areas
-    if not np.isfinite(stiffness.data).all() or (areas[mesh.used_vertices] <= 0).any():
+    if not np.isfinite(stiffness.data).all() or (areas[mesh.referenced_vertices] <= 0).any():
         raise InputError(
             f"{mesh.name}: the cotangent Laplacian is undefined on zero-area faces: use the robust Laplacian "
             "(laplacian='robust', on the command line --laplacian robust)."

@@ -12,8 +12,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, Shaped
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
@@ -40,7 +39,7 @@ class Mesh:
     """A triangle mesh whose vertices keep their numbers from the file.
 
     Vertex i of the mesh is always vertex i of the user's file. Cleaning drops faces only. A vertex without
-    faces keeps its place and its number; `used_vertices` is False there.
+    faces keeps its place and its number; `referenced_vertices` is False there.
 
     `read_mesh` and `make_mesh` check everything and return a `Mesh`. The class itself checks nothing.
 
@@ -101,11 +100,11 @@ class Mesh:
     @cached_property
     def is_inside_out(self) -> bool:
         """Whether the normals point inward: the faces then enclose a negative volume with the centroid."""
-        corners = self.vertices[self.faces] - self.vertices[self.used_vertices].mean(axis=0)
+        corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
     @cached_property
-    def used_vertices(self) -> Bool[np.ndarray, " n"]:
+    def referenced_vertices(self) -> Bool[np.ndarray, " n"]:
         """True for vertices with at least one face, False for unreferenced vertices."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
@@ -141,7 +140,7 @@ class Mesh:
     def nonmanifold_vertices(self) -> Bool[np.ndarray, " n"]:
         """True for vertices whose faces form several fans that share no edge."""
         one_fan = igl.is_vertex_manifold(self.faces)
-        pinched = self.used_vertices.copy()
+        pinched = self.referenced_vertices.copy()
         pinched[: len(one_fan)] &= ~one_fan
         return pinched
 
@@ -173,7 +172,7 @@ class Diagnosis:
 
     - `vertices`, `faces`: their numbers.
     - `components`: the number of connected components, without unreferenced vertices.
-    - `unused_vertices`: the number of unreferenced vertices, which no face references.
+    - `unreferenced_vertices`: the number of unreferenced vertices, which no face references.
     - `boundary_edges`, `boundary_loops`: the numbers of edges with one face, and of the connected chains that
       these edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
@@ -186,7 +185,7 @@ class Diagnosis:
     vertices: int
     faces: int
     components: int
-    unused_vertices: int
+    unreferenced_vertices: int
     boundary_edges: int
     boundary_loops: int
     nonmanifold_edges: int
@@ -201,10 +200,10 @@ class Diagnosis:
             f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
             f"{count_of(self.components, 'connected component')}, {shape}."
         ]
-        if self.unused_vertices:
+        if self.unreferenced_vertices:
             found.append(
-                f"{count_of(self.unused_vertices, 'unreferenced vertex')} (in no face): never chosen as a "
-                "match."
+                f"{count_of(self.unreferenced_vertices, 'unreferenced vertex')} (in no face): never chosen "
+                "as a match."
             )
         if self.boundary_edges:
             found.append(
@@ -248,13 +247,13 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     A `Diagnosis`.
     """
-    unused = int((~mesh.used_vertices).sum())
-    boundary_chain = connected_pieces(mesh.boundary_edges, len(mesh.vertices))[1]
+    unused = int((~mesh.referenced_vertices).sum())
+    boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
-        components=connected_pieces(mesh.edges, len(mesh.vertices))[0] - unused,
-        unused_vertices=unused,
+        components=connected_components(mesh.edges, len(mesh.vertices))[0] - unused,
+        unreferenced_vertices=unused,
         boundary_edges=len(mesh.boundary_edges),
         boundary_loops=len(np.unique(boundary_chain[mesh.boundary_edges])),
         nonmanifold_edges=len(mesh.nonmanifold_edges),
@@ -264,25 +263,16 @@ def diagnose(mesh: Mesh) -> Diagnosis:
     )
 
 
-def connected_pieces(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
+def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
     """The connected components of a graph with n vertices.
 
     **Returns:** The number of components, and the component of each vertex (n,).
     """
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    return connected_components(graph, directed=False)
+    return csgraph.connected_components(graph, directed=False)
 
 
-def units_of_length(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[float, float]:
-    """The units in which lengths on two shapes are comparable: the square root of each shape's area.
-
-    For a partial pair, both units are the square root of the larger area.
-    """
-    areas = mesh_x.area, mesh_y.area
-    return (max(areas) ** 0.5,) * 2 if partial else (areas[0] ** 0.5, areas[1] ** 0.5)
-
-
-def extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
+def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
     """Copy to each unreferenced vertex the match of the nearest referenced vertex.
 
     **Arguments:**
@@ -292,7 +282,7 @@ def extend_to_unused(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shap
 
     **Returns:** The rows (m, ...), unchanged at referenced vertices.
     """
-    used = mesh_x.used_vertices
+    used = mesh_x.referenced_vertices
     if used.all():
         return matches
     _, nearest = KDTree(mesh_x.vertices[used]).query(mesh_x.vertices[~used])
@@ -385,7 +375,7 @@ def make_mesh(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
-    unused = int((~mesh.used_vertices).sum())
+    unused = int((~mesh.referenced_vertices).sum())
     if unused:
         notes.append(f"{count_of(unused, 'unreferenced vertex')} (in no face) of {len(position)}.")
     return replace(mesh, notes=tuple(notes))
@@ -412,7 +402,7 @@ def _check_resolution(mesh: Mesh) -> None:
     """Refuse positions that floating-point numbers cannot tell from those of their neighbors."""
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
     median = np.median(lengths[lengths > 0])
-    used = np.flatnonzero(mesh.used_vertices)
+    used = np.flatnonzero(mesh.referenced_vertices)
     middle = np.median(mesh.vertices[used], axis=0)
     for vertices, center, limit, place in (
         (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),

@@ -29,7 +29,7 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
     **Raises:** `InputError` if the mesh has fewer referenced vertices.
     """
-    used = np.flatnonzero(mesh.used_vertices)
+    used = np.flatnonzero(mesh.referenced_vertices)
     if not 1 <= number_of_samples <= len(used):
         raise InputError(
             f"{mesh.name}: cannot choose {number_of_samples} samples from {len(used)} referenced vertices: "
@@ -46,7 +46,7 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
     return used[chosen]
 
 
-class Samples(NamedTuple):
+class SurfaceSamples(NamedTuple):
     """Samples that represent a surface.
 
     **Attributes:**
@@ -59,7 +59,7 @@ class Samples(NamedTuple):
     nearest: Int64[np.ndarray, " n"]
 
 
-def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
+def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
     This is Poisson-disk sampling: no two samples are closer in space than a distance derived from the area,
@@ -74,7 +74,7 @@ def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
 
     **Returns:** The samples, and the nearest sample of each vertex.
     """
-    candidates = np.flatnonzero(mesh.used_vertices)
+    candidates = np.flatnonzero(mesh.referenced_vertices)
     # A maximal set of samples at this distance has about 0.7 area / distance² members on a surface.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # The candidates are thinned to one vertex, the lowest-numbered, per box of a grid around the centroid.
@@ -87,11 +87,11 @@ def spread_samples(mesh: Mesh, number_of_samples: int) -> Samples:
     near = sp.csr_matrix((np.ones(pairs.nnz, bool), (pairs.row, pairs.col)), pairs.shape)
     vertices = candidates[maximal_independent_set(near, 1)]
     _, nearest = KDTree(positions[vertices]).query(positions)
-    return Samples(vertices, nearest)
+    return SurfaceSamples(vertices, nearest)
 
 
 @lru_cache(maxsize=2)
-def spread_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
+def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
     """The edges of a coarse graph of the surface.
 
     These are the edges of the mesh or, if it has more than 15 000 vertices, the edges between 5000 evenly
@@ -102,7 +102,7 @@ def spread_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     n = len(mesh.vertices)
     if n <= _DENSE:
         return mesh.edges, np.arange(n)
-    samples = spread_samples(mesh, _SPREAD)
+    samples = poisson_disk_samples(mesh, _SPREAD)
     pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
 

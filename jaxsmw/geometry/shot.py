@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import Samples
+from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
 _AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` relies on the twos
@@ -25,7 +25,7 @@ _PAIRS_PER_BLOCK = 30_000
 
 
 def shot_descriptors(
-    mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: Samples | None = None
+    mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: SurfaceSamples | None = None
 ) -> Float32[np.ndarray, "n 352"]:
     """Compute signatures of histograms of orientations (SHOT), one per vertex.
 
@@ -59,7 +59,7 @@ def shot_descriptors(
 
     def compute() -> dict[str, np.ndarray]:
         if samples is None:
-            vertices = rows = np.flatnonzero(mesh.used_vertices)
+            vertices = rows = np.flatnonzero(mesh.referenced_vertices)
             normals, number = mesh.vertex_normals[vertices], len(mesh.vertices)
         else:
             vertices, number = samples.vertices, len(samples.vertices)
@@ -163,7 +163,7 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """One right-handed frame per center: rows x, y, z, with x along the largest scatter, z along the least."""
+    """One right-handed frame per center: rows x, y, z; x along the largest scatter, z along the least."""
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
         for column in range(row, 3):

@@ -13,7 +13,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import extend_to_unused
+from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.initial_maps.functional import functional_features
 from jaxsmw.initial_maps.landmarks import landmark_features
 from jaxsmw.initial_maps.nearest import nearest_map
@@ -48,16 +48,16 @@ def initial_map(
         init = check_surface_points(init, pair.mesh_y, "initial map").nearest_corners(pair.mesh_y)
     if isinstance(init, str):
         sampled = sample_pair(pair, spectrum_x, spectrum_y)
-        return extend_to_unused(pair.mesh_x, nearest_map(sampled, *_features(sampled, init)))
+        return extend_to_unreferenced(pair.mesh_x, nearest_map(sampled, *_features(sampled, init)))
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
     if given.ndim == 1:
-        return extend_to_unused(pair.mesh_x, _checked_map(pair, init))
+        return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
     sampled = sample_pair(pair, spectrum_x, spectrum_y)
     found = nearest_map(sampled, *_finite(sampled, "landmark", landmark_features(sampled, given)))
     found[given[:, 0]] = given[:, 1]
-    return extend_to_unused(pair.mesh_x, found)
+    return extend_to_unreferenced(pair.mesh_x, found)
 
 
 _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
@@ -93,7 +93,7 @@ def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     given = check_indices(init, len(mesh_y.vertices), f"initial map on {mesh_y.name}: vertex")
     if len(given) != (m := len(mesh_x.vertices)):
         raise InputError(f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices.")
-    unused = ~mesh_y.used_vertices[given] & mesh_x.used_vertices
+    unused = ~mesh_y.referenced_vertices[given] & mesh_x.referenced_vertices
     if unused.any():
         raise InputError(
             f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that no face uses, "

@@ -43,8 +43,8 @@ def landmark_features(
     for side, vertices, unit, described in zipped:
         mesh = side.mesh
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))
-        if outside.any() or not mesh.used_vertices[vertices].all():
-            wrong = vertices[outside] if outside.any() else vertices[~mesh.used_vertices[vertices]]
+        if outside.any() or not mesh.referenced_vertices[vertices].all():
+            wrong = vertices[outside] if outside.any() else vertices[~mesh.referenced_vertices[vertices]]
             raise InputError(
                 f"landmark {wrong[0]} is not a vertex of the surface of {mesh.name}, whose vertices are 0 to "
                 f"{len(mesh.vertices) - 1}."

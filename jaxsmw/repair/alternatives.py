@@ -16,8 +16,8 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
-from jaxsmw.geometry.mesh import extend_to_unused
-from jaxsmw.geometry.sampling import farthest_point_samples, spread_samples
+from jaxsmw.geometry.mesh import extend_to_unreferenced
+from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.initial_maps.landmarks import distance_features
 from jaxsmw.initial_maps.nearest import nearest_among_compared, nearest_map, to_all_vertices
@@ -68,7 +68,7 @@ def alternative_initial_maps(
         )
         k = settings.alternative_eigenvectors
         truncated = spectrum_x.truncate(k), spectrum_y.truncate(k)
-        yield extend_to_unused(
+        yield extend_to_unreferenced(
             pair.mesh_x, _in_both_directions(sampled, features_x, features_y, weight, *truncated)
         )
     if not pair.partial and spectrum_x.descriptors is not None:
@@ -133,7 +133,7 @@ def _by_extremities(
     outcomes.sort(key=lambda outcome: outcome[0])
     same = partial(same_map, pair, settings=settings.scores)
     for everywhere in islice(distinct((found for _, found in outcomes), same), settings.extremity_maps):
-        yield extend_to_unused(pair.mesh_x, everywhere)
+        yield extend_to_unreferenced(pair.mesh_x, everywhere)
 
 
 class _CoarseRefinement:
@@ -143,14 +143,14 @@ class _CoarseRefinement:
     """
 
     def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
-        fewest = min(int(mesh.used_vertices.sum()) for mesh in sampled.pair.meshes)
+        fewest = min(int(mesh.referenced_vertices.sum()) for mesh in sampled.pair.meshes)
         self.stage = Stage(
             FeatureRegression(levels=settings.extremity_levels),
             number_of_descriptors=settings.extremity_descriptors,
             number_of_samples=settings.extremity_samples,
         ).fitted(fewest)
         count = self.stage.number_of_samples or fewest
-        queries = spread_samples(sampled.x.mesh, count)
+        queries = poisson_disk_samples(sampled.x.mesh, count)
         self.sampled = sampled
         self.rows = sampled.x.rows(queries.vertices)
         samples = sampled.x.samples

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.mesh import connected_pieces
+from jaxsmw.geometry.mesh import connected_components
 from jaxsmw.pair import Pair
 from jaxsmw.repair.scores import discontinuous_parts, edge_lengths, orientation_reversal
 from jaxsmw.repair.settings import ExpectedErrorSettings
@@ -51,7 +51,7 @@ def expected_error(
     misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x)
     # The larger a limb, the farther it can be from its place.
     inside = misplaced[mesh_x.edges].all(axis=1)
-    number, component = connected_pieces(mesh_x.edges[inside], m)
+    number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]
     expected = np.maximum(eigenvectors @ heat, 0) + settings.misplaced_weight * misplaced * sizes
     return expected * unit_y / pair.mesh_y.area**0.5

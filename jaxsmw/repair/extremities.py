@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import spread_edges, spread_samples
+from jaxsmw.geometry.sampling import coarse_edges, poisson_disk_samples
 from jaxsmw.repair.settings import ExtremitySettings
 
 # The distance between connected components: larger than any distance within one, and equal on both bodies.
@@ -44,14 +44,14 @@ def extremities(
     The function is that of Hilaga et al., "Topology matching for fully automatic similarity estimation of 3D
     shapes", SIGGRAPH 2001. Distances run along edges, and are a few per cent too long everywhere.
     """
-    edges, nearest = spread_edges(mesh)
+    edges, nearest = coarse_edges(mesh)
     nodes, tails_and_heads = np.unique(edges, return_inverse=True)
     tails, heads = tails_and_heads.reshape(edges.shape).T
     lengths = np.linalg.norm(np.diff(mesh.vertices[edges], axis=1)[:, 0], axis=1) / mesh.area**0.5
     graph = sp.csr_array((lengths, (tails, heads)), (len(nodes), len(nodes)))
     search = partial(dijkstra, graph, directed=False)
 
-    samples = np.intersect1d(nodes, nearest[spread_samples(mesh, settings.samples).vertices])
+    samples = np.intersect1d(nodes, nearest[poisson_disk_samples(mesh, settings.samples).vertices])
     distances = search(indices=np.searchsorted(nodes, samples))
     remoteness = np.sqrt(np.mean(np.where(np.isfinite(distances), distances, 0) ** 2, axis=0))
     highest = np.ones(len(nodes), bool)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.mesh import connected_pieces
-from jaxsmw.geometry.sampling import spread_edges
+from jaxsmw.geometry.mesh import connected_components
+from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.pair import Pair
 from jaxsmw.repair.settings import ScoreSettings
 
@@ -92,10 +92,10 @@ def discontinuous_parts(
     component but the largest is marked: limbs that are swapped as a whole, for example.
     """
     mesh = pair.mesh_x
-    edges, nearest = spread_edges(mesh)
+    edges, nearest = coarse_edges(mesh)
     before, after = edge_lengths(pair, edges, pointwise_map)
     kept = edges[after < np.maximum(settings.discontinuity_distance, settings.discontinuity_ratio * before)]
-    _, component = connected_pieces(kept, len(mesh.vertices))
+    _, component = connected_components(kept, len(mesh.vertices))
     component = component[nearest]
     return component != np.argmax(np.bincount(component, mesh.vertex_areas))
 

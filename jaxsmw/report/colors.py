@@ -1,14 +1,25 @@
-"""Colours that carry meaning: a place on a body, an error. Mixed in OKLab, where equal steps look equal."""
+"""Colours for positions on a body, errors and signed values.
+
+Colours are mixed in OKLab, in which equal distances look equally large.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Float64
 
+from jaxsmw.evaluation.metrics import THRESHOLDS
 from jaxsmw.geometry.mesh import Mesh
 
-# Björn Ottosson, "A perceptual color space for image processing", 2020: from OKLab to the cube roots of the
-# cone responses, and from cone responses to linear sRGB.
+ERROR_LIMIT = max(THRESHOLDS)
+"""The error at which the colour scale ends, as a fraction of the square root of the target's area.
+
+The value is the largest threshold of the evaluation: a match that is farther off counts as wrong. The scale
+is the same for all maps and reports, so that their colours can be compared.
+"""
+
+# Björn Ottosson, "A perceptual color space for image processing", 2020: the first matrix takes OKLab to the
+# cube roots of the cone responses, the second takes cone responses to linear sRGB.
 _LAB_TO_ROOTS = np.array(
     [
         [1, 0.3963377774, 0.2158037573],
@@ -24,8 +35,8 @@ _CONES_TO_RGB = np.array(
     ]
 )
 
-# From none (paper white) to large (dark plum) in OKLab: lightness falls all the way, so that the order is
-# plain to colour-blind eyes and on a black-and-white print.
+# From no error (paper white) to large errors (dark plum), in OKLab. Lightness falls all the way, so that the
+# order is clear to colour-blind eyes and on a black-and-white print.
 _ERROR_SCALE = np.array(
     [
         [0.95, 0.00, 0.015],
@@ -36,8 +47,9 @@ _ERROR_SCALE = np.array(
     ]
 )
 
-# From the largest negative (blue) over none to the largest positive (red), as light at both ends, so that
-# neither sign stands out; the middle is paper white, or night on a dark ground.
+# From the most negative value (blue) through zero to the most positive value (red), in OKLab. Both ends have
+# the same lightness, so that neither sign stands out. Zero is paper white, or dark on a dark background
+# (True).
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -60,43 +72,44 @@ _SIGNED_SCALE = {
 }
 
 PLAIN = np.array([0.76, 0.77, 0.79])
-"""What a surface without a message wears, and a vertex whose error nobody knows."""
+"""The grey of a surface without colours, and of vertices with an unknown error."""
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Light intensities to screen colours in [0, 1], clipped to what a screen can show (IEC 61966-2-1)."""
+    """Converts light intensities to screen colours in [0, 1], clipped to the sRGB gamut (IEC 61966-2-1)."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Screen colours in [0, 1] to light intensities, which can be added and averaged."""
+    """Converts screen colours in [0, 1] to light intensities, which can be added and averaged."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """A smooth colour for every vertex that tells where on the body it is.
+    """A smooth colour for every vertex that shows where on the body the vertex is.
 
-    The body's right and left differ in hue (green against red), the two ends of its height or length, of
-    which the longer counts, in the other opponent pair (blue against yellow), and the direction that is left
-    in lightness, which shading disturbs. So the limbs of people and of animals get hues of their own, and a
-    map that swaps left and right shows at a glance. Each coordinate is half the position between the extremes
-    and half its rank among the vertices: the rank keeps a slender body's trunk from being all grey.
+    Right and left differ in hue (green and red). Height or length, whichever is larger, runs from yellow to
+    blue. The remaining direction changes the lightness, which shading disturbs. So the limbs of people and
+    animals have hues of their own, and a map that swaps left and right is obvious.
+
+    Each coordinate is half the position between the extremes and half the rank among the vertices. The rank
+    keeps the trunk of a slender body from being uniformly grey.
 
     **Arguments:**
 
-    - `mesh`: standing upright (`jaxsmw.report.rendering.stand`): x is lateral, y up, z forward.
+    - `mesh`: standing (`jaxsmw.report.standing.stand`): x is lateral, y points up, z forward.
 
     **Returns:** sRGB colours (n, 3) in [0, 1].
     """
-    used = mesh.vertices[mesh.used_vertices]
+    used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Ranks of what is equal up to rounding must be equal too, or a flat mesh would show the noise.
+    # Coordinates that differ by rounding errors only get the same rank, or a flat mesh would show the noise.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
         values = np.round(mesh.vertices[:, axis] / grid)
-        sorted_values = np.sort(values[mesh.used_vertices])
+        sorted_values = np.sort(values[mesh.referenced_vertices])
         below = np.searchsorted(sorted_values, values, "left") + np.searchsorted(
             sorted_values, values, "right"
         )
@@ -109,12 +122,12 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     )
 
 
-def error_colors(errors: Float[np.ndarray, " m"], limit: float) -> Float64[np.ndarray, "m 3"]:
-    """The colour of each error on a scale from 0 to `limit`; what lies beyond takes the last colour.
+def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) -> Float64[np.ndarray, "m 3"]:
+    """The colours of errors on a scale from 0 to `limit`; larger errors have the last colour.
 
     **Arguments:**
 
-    - `errors`: non-negative; NaN where the error is not known, which is drawn as plain surface.
+    - `errors`: non-negative; NaN where the error is unknown, which is shown as plain surface.
     - `limit`: the end of the scale, positive, in the unit of the errors.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
@@ -127,13 +140,13 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float) -> Float64[np.nd
 def signed_colors(
     values: Float[np.ndarray, " m"], limit: float, *, on_dark: bool = False
 ) -> Float64[np.ndarray, "m 3"]:
-    """The colour of each value on a scale from `-limit` (blue) to `limit` (red), ends for what lies beyond.
+    """The colours of values on a scale from `-limit` (blue) to `limit` (red); values beyond are clipped.
 
     **Arguments:**
 
-    - `values`: of a function, an entry of a matrix.
+    - `values`: of a function or a matrix.
     - `limit`: positive.
-    - `on_dark`: zero is dark instead of white, to be shown on a dark ground.
+    - `on_dark`: zero is dark instead of white, for a dark background.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """
@@ -141,7 +154,7 @@ def signed_colors(
 
 
 def _on_scale(values: np.ndarray, low: float, high: float, scale: np.ndarray) -> np.ndarray:
-    """Colours between those of a scale, the first of which is for `low` and the last for `high`."""
+    """Interpolates a scale whose first colour is for `low` and whose last colour is for `high`."""
     stops = np.linspace(low, high, len(scale))
     return _oklab_to_srgb(np.stack([np.interp(values, stops, channel) for channel in scale.T], axis=1))
 

@@ -1,4 +1,4 @@
-"""Figures for papers and talks, drawn by matplotlib without a display. Needs the extra `jaxsmw[report]`."""
+"""Figures for papers and talks, drawn by matplotlib without a display (needs the extra `jaxsmw[report]`)."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.report.colors import PLAIN, error_colors, position_colors
-from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
-from jaxsmw.report.rendering import Axis, camera_axes, choose_azimuth, render, stand, stand_pair
+from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
+from jaxsmw.report.inputs import check_error_limit, check_errors, check_functional_map, check_map, describe
+from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
+from jaxsmw.report.standing import stand, stand_pair
 from jaxsmw.runtime.files import atomic_write, check_writable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Pixels per inch: bodies are drawn pixel by pixel and shown at exactly this resolution.
+# Pixels per inch. Bodies are rendered at exactly this resolution.
 _DPI = 200
 # The largest height and width of a body, in pixels.
 _BODY_SIZE = (800, 800)
 _LONGEST_NAME = 36
-# The height of a line of a legend, in inches.
-_LEGEND_LINE = 0.24
+# The height of one line of a legend, in inches. The width at the right edge for the error scale, in pixels.
+_LEGEND_LINE, _SCALE_WIDTH = 0.24, 190
 _INK, _FAINT = "#1d2430", "#79818c"
-# Okabe and Ito's colours, told apart by colour-blind eyes; lines differ in style as well, for print.
+# Okabe and Ito's colours, which colour-blind eyes can tell apart. Lines also differ in style, for print.
 _LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -43,11 +45,11 @@ def draw_correspondence(
     pointwise_map: Int[np.ndarray | Array, " m"],
     *,
     errors: Mapping[str, Float[np.ndarray | Array, " m"]] = MappingProxyType({}),
-    error_limit: float | None = None,
+    error_limit: float = ERROR_LIMIT,
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Colour transfer: Y is coloured by position, and every vertex of X takes the colour of its match.
+    """Colour transfer: the colours of Y show positions, and every vertex of X has the colour of its match.
 
     Both bodies are shown at the same scale and from the same side. A good map gives X the smooth colours of
     Y, limb by limb.
@@ -55,17 +57,18 @@ def draw_correspondence(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
-    - `pointwise_map`: for every vertex of X a vertex of Y.
-    - `errors`: by name, for every vertex of X the error of its match, as a fraction of sqrt(area of Y); NaN
-      where it is not known. Each adds a panel that shows them on X.
-    - `error_limit`: where the scale of errors ends; by default at the largest 98th percentile.
-    - `up`: the axis of the files that points up; see `jaxsmw.report.rendering.stand` for the default.
-    - `azimuth`: where the viewer stands, in degrees from the front of the body towards its left; by default
-      where both bodies show well.
+    - `pointwise_map`: a vertex of Y for every vertex of X.
+    - `errors`: by name, the error of the match of every vertex of X, as a fraction of sqrt(area of Y); NaN
+      where the error is unknown. Each entry adds a panel with these errors in colours on X.
+    - `error_limit`: the end of the colour scale of errors. Figures can be compared if they share the limit.
+    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+    - `azimuth`: the viewer's place in degrees, from the front of the body towards its left; by default
+      a place from which both bodies show well.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if the map or the errors do not fit the meshes, or matplotlib is missing.
+    **Raises:** `InputError` if the map or the errors do not fit the meshes, the limit is not positive, or
+    matplotlib is missing.
     """
     indices = check_map(mesh_x, mesh_y, pointwise_map)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
@@ -73,11 +76,12 @@ def draw_correspondence(
     panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
     if not errors:
         return _draw_panels(panels, azimuth)
-    checked, limit = check_errors(mesh_x, errors, error_limit)
+    check_error_limit(error_limit)
+    checked = check_errors(mesh_x, errors)
     for name, values in checked.items():
-        panels.append(_Panel(f"{name} on the source", shown_x, error_colors(values, limit)))
-    figure = _draw_panels(panels, azimuth, right_margin=150)
-    _draw_error_scale(figure, limit, any(np.any(values > limit) for values in checked.values()))
+        panels.append(_Panel(f"{name} on the source", shown_x, error_colors(values, error_limit)))
+    figure = _draw_panels(panels, azimuth, right_margin=_SCALE_WIDTH)
+    _draw_error_scale(figure, error_limit, any(np.isnan(values).any() for values in checked.values()))
     return figure
 
 
@@ -92,8 +96,8 @@ def draw_mesh(
 
     **Arguments:**
 
-    - `mesh`: n vertices.
-    - `colors`: one sRGB colour in [0, 1] per vertex; by default a plain grey.
+    - `mesh`: a surface with n vertices.
+    - `colors`: one sRGB colour in [0, 1] per vertex; plain grey by default.
     - `up`, `azimuth`: as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -114,12 +118,12 @@ def draw_mesh(
 def draw_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"], *, convention: Convention = "pullback"
 ) -> Figure:
-    """The matrix C, red above and blue below zero.
+    """The functional map C as a picture: positive entries are red, negative entries blue.
 
     **Arguments:**
 
     - `functional_map`: C; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward.
-    - `convention`: which of the two, so that the axes are labelled right.
+    - `convention`: the convention of C, for the labels of the axes.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -130,7 +134,9 @@ def draw_functional_map(
     axes = figure.add_subplot()
     limit = np.abs(matrix).max() or 1.0
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-    rows, columns = ("X", "Y") if convention == "pullback" else ("Y", "X")
+    rows, columns = ("X (source)", "Y (target)")
+    if convention == "pushforward":
+        rows, columns = columns, rows
     axes.set_ylabel(f"eigenfunction of {rows}")
     axes.set_xlabel(f"eigenfunction of {columns}")
     axes.xaxis.set_label_position("top")
@@ -147,13 +153,13 @@ def draw_filters(
     responses: Float[np.ndarray | Array, "filters p"],
     eigenvalues: Float[np.ndarray | Array, " k"],
 ) -> Figure:
-    """Filter responses g_l(lambda), their frame function G (the sum of squares), and where eigenvalues lie.
+    """Filter responses g_l(lambda), their frame function G (the sum of their squares), and eigenvalues.
 
     **Arguments:**
 
-    - `eigenvalue_grid`: where the responses are given, ascending.
-    - `responses`: scaling function first, then wavelets from the coarsest to the finest.
-    - `eigenvalues`: of a shape, marked on the axis.
+    - `eigenvalue_grid`: the p values of lambda at which the responses are given, ascending.
+    - `responses`: the scaling function first, then wavelets from the coarsest to the finest.
+    - `eigenvalues`: the eigenvalues of a shape, which are marked on the axis.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -162,8 +168,8 @@ def draw_filters(
     grid, curves = np.asarray(eigenvalue_grid, dtype=float), np.asarray(responses, dtype=float)
     if grid.ndim != 1 or curves.ndim != 2 or curves.shape[1:] != grid.shape:
         raise InputError(
-            f"filter responses come as (filters, p) for a grid of p values, but have shape {curves.shape} "
-            f"for a grid of shape {grid.shape}."
+            f"filter responses have shape {curves.shape}, but must have shape (filters, p) for a grid of p "
+            f"values; the grid has shape {grid.shape}."
         )
     figure = _new_figure(6.4, 3.4, plot=True)
     import matplotlib
@@ -194,7 +200,7 @@ def draw_filters(
     )
     axes.set_xlim(grid[0], grid[-1])
     axes.set_ylim(bottom=min(0.0, curves.min()))
-    axes.set_xlabel("λ")
+    axes.set_xlabel("eigenvalue λ")
     axes.set_ylabel("response")
     figure.legend(loc="outside right center", frameon=False, fontsize=8, labelcolor=_INK)
     _style(axes, grid=True)
@@ -206,16 +212,17 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """Correspondence quality: the share of correspondences whose geodesic error is at most a threshold.
+    """Correspondence quality: the share of matches whose geodesic error is at most a threshold.
 
     **Arguments:**
 
-    - `curves`: by the method's name, thresholds (fractions of sqrt(area), ascending) and shares in [0, 1].
-    - `mean_errors`: by the same names, shown in the legend; not every curve needs one.
+    - `curves`: by the name of a map, thresholds (fractions of sqrt(area), ascending) and shares in [0, 1].
+    - `mean_errors`: mean errors by the same names, for the legend. Curves without a mean error are allowed.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if there is no curve, the parts do not fit, or matplotlib is missing.
+    **Raises:** `InputError` if there is no curve, the arguments do not fit together, or matplotlib is
+    missing.
     """
     if not curves:
         raise InputError("there is no quality curve to draw; give at least one.")
@@ -240,8 +247,8 @@ def draw_quality_curves(
         labels.append(f"{name}: {mean_errors[name]:.4f}" if name in mean_errors else name)
     axes.set_xlim(min(t[0] for t, _ in curves.values()), max(t[-1] for t, _ in curves.values()))
     axes.set_ylim(0, 101)
-    axes.set_xlabel("geodesic error / √area")
-    axes.set_ylabel("correspondences within the error (%)")
+    axes.set_xlabel("geodesic error (fraction of √area)")
+    axes.set_ylabel("matches with at most this error (%)")
     legend = figure.legend(
         lines,
         labels,
@@ -269,17 +276,17 @@ def draw_functions(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Functions on bodies: a row for each body and a column for each function, red above and blue below zero.
+    """Functions on bodies: one row per body and one column per function. Red is positive, blue negative.
 
-    The colours of a column mean the same on all bodies; they are full where the absolute value exceeds that
-    of 99.5 % of the vertices.
+    All bodies of a column share one colour scale. The scale ends at the absolute value that 99.5 % of the
+    vertices do not exceed.
 
     **Arguments:**
 
-    - `meshes`: the bodies, n vertices each.
-    - `functions`: for each body the same functions, one value per vertex.
-    - `titles`: of the functions.
-    - `marked`: one vertex of each body, around which there is a ring.
+    - `meshes`: the bodies, with n vertices each.
+    - `functions`: the same functions for each body, one value per vertex.
+    - `titles`: the titles of the functions.
+    - `marked`: one vertex of each body, which gets a ring.
     - `up`, `azimuth`: as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -289,13 +296,13 @@ def draw_functions(
     for mesh, values in zip(meshes, functions, strict=True):
         if np.shape(values) != (len(titles), len(mesh.vertices)):
             raise InputError(
-                f"{mesh.name}: {len(titles)} functions on {len(mesh.vertices)} vertices are "
-                f"{(len(titles), len(mesh.vertices))} numbers, but these have shape {np.shape(values)}."
+                f"{mesh.name}: the functions have shape {np.shape(values)}, but {len(titles)} titles and "
+                f"{len(mesh.vertices)} vertices need shape {(len(titles), len(mesh.vertices))}."
             )
     standing = [stand(mesh, up) for mesh in meshes]
     angle = choose_azimuth(standing) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
-    reach = [np.abs(mesh.vertices[mesh.used_vertices] @ axes.T).max(axis=0) for mesh in standing]
+    reach = [np.abs(mesh.vertices[mesh.referenced_vertices] @ axes.T).max(axis=0) for mesh in standing]
     scale = np.min(np.divide((280, 420), 2 * np.max(reach, axis=0)))
     cell_width = int(np.ceil(2 * scale * max(x for x, _ in reach)))
     heights = [int(np.ceil(2 * scale * y)) for _, y in reach]
@@ -335,17 +342,17 @@ def draw_forest(
     xlabel: str,
     linear_up_to: float = 1.0,
 ) -> Figure:
-    """A forest plot: estimates with their intervals, side by side for groups of cases, around a line at zero.
+    """A forest plot: estimates with intervals around a line at zero, one panel per group of cases.
 
-    The scale is linear around zero and logarithmic beyond, because some differ by a little, some by a lot.
+    The scale is linear around zero and logarithmic beyond, so that small and large differences can be read.
 
     **Arguments:**
 
-    - `panels`: by the title of a panel and the name of a series, estimate, lower and upper end of each row;
-      NaN where there is none. All panels have the same series.
-    - `rows`: their names, from top to bottom.
-    - `xlabel`: what the estimates are.
-    - `linear_up_to`: the absolute value where the scale becomes logarithmic.
+    - `panels`: by the title of a panel and the name of a series, the estimate and the lower and upper end of
+      the interval of each row; NaN for a missing estimate. All panels have the same series.
+    - `rows`: the names of the rows, from top to bottom.
+    - `xlabel`: the quantity that is estimated.
+    - `linear_up_to`: the absolute value at which the scale becomes logarithmic.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -355,8 +362,8 @@ def draw_forest(
         for name, intervals in series.items():
             if np.shape(intervals) != (len(rows), 3):
                 raise InputError(
-                    f"{title}, {name}: {len(rows)} rows need {(len(rows), 3)} numbers, but there are "
-                    f"{np.shape(intervals)}."
+                    f"{title}, {name}: {len(rows)} rows need an array of shape {(len(rows), 3)}, but it has "
+                    f"shape {np.shape(intervals)}."
                 )
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     pitch = 0.075 * len(names) + 0.1
@@ -415,23 +422,26 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """Tables of positive numbers as colours on one logarithmic scale, each number written in its cell.
+    """Tables of positive numbers as colours on one logarithmic scale, with each number in its cell.
 
     **Arguments:**
 
     - `panels`: the tables by title.
-    - `rows`, `columns`: what they are, and their values.
-    - `label`: what the numbers are.
+    - `rows`, `columns`: the name of the parameter that varies over the rows or columns, and its values.
+    - `label`: the quantity that the numbers measure.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if a table does not fit the rows and columns or holds a number that is not
-    positive, or matplotlib is missing.
+    **Raises:** `InputError` if a table does not fit the rows and columns or has an entry that is not
+    positive, or if matplotlib is missing.
     """
     shape = len(rows[1]), len(columns[1])
     for title, table in panels.items():
         if np.shape(table) != shape or not (np.isfinite(table).all() and np.min(table) > 0):
-            raise InputError(f"{title}: needs {shape} positive numbers, but has shape {np.shape(table)}.")
+            raise InputError(
+                f"{title}: the table must have shape {shape} and positive entries, but its shape is "
+                f"{np.shape(table)} and its smallest entry {np.min(table)}."
+            )
     size = 1.2 + (0.6 + 0.42 * shape[1]) * len(panels), max(2.6, 1.1 + 0.3 * shape[0])
     figure = _new_figure(*size, plot=True)
     from matplotlib.colors import LogNorm
@@ -465,9 +475,9 @@ def draw_heat_maps(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Write a figure as PNG, PDF or SVG, whichever the file's suffix says; never half a file.
+    """Writes a figure as PNG, PDF or SVG, as the file's suffix says; never leaves half a file.
 
-    **Raises:** `InputError` if the suffix is another one or the file cannot be written.
+    **Raises:** `InputError` for any other suffix, or if the file cannot be written.
     """
     check_figure_path(path)
     suffix = Path(path).suffix.lower()
@@ -478,7 +488,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Tell now what would make every drawing fail later.
+    """Checks before the work whether figures can be drawn after it.
 
     **Raises:** `InputError` if matplotlib is missing.
     """
@@ -491,22 +501,23 @@ def check_drawable() -> None:
 
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
-    """Tell now what would make `save_figure` fail later.
+    """Checks before the work whether `save_figure` can write a file after it.
 
-    **Raises:** `InputError` if the suffix is none of PNG, PDF and SVG or the file cannot be written.
+    **Raises:** `InputError` if the suffix is not that of PNG, PDF or SVG, the file cannot be written, or
+    matplotlib is missing.
     """
     if Path(path).suffix.lower() not in _METADATA:
-        raise InputError(f"{path}: a figure is written as .png, .pdf or .svg; choose one of these endings.")
+        raise InputError(f"{path}: figures are written as .png, .pdf or .svg; choose one of these suffixes.")
     check_drawable()
     check_writable(path)
 
 
-# Files say nothing of when they were made: the same figure is the same file.
+# No dates in the files: the same figure gives the same file.
 _METADATA: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 class _Panel(NamedTuple):
-    """One body in a figure: what it is, standing, and its colours."""
+    """One body in a figure: its role in the pair, the standing mesh, and the colours of its vertices."""
 
     role: str
     mesh: Mesh
@@ -514,10 +525,15 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """The bodies side by side at one scale, each under its role and name, pixel for pixel."""
+    """Draws the bodies side by side at one scale, each below its role and name.
+
+    Bodies are shown pixel for pixel as `render` draws them.
+    """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
-    reach = [np.abs(panel.mesh.vertices[panel.mesh.used_vertices] @ axes.T).max(axis=0) for panel in panels]
+    reach = [
+        np.abs(panel.mesh.vertices[panel.mesh.referenced_vertices] @ axes.T).max(axis=0) for panel in panels
+    ]
     scale = np.min(np.divide(_BODY_SIZE, 2 * np.max(reach, axis=0)))
     captioned = bool(panels[0].role)
     gap, header, narrowest = (40, 135, _LONGEST_NAME * 12) if captioned else (40, 0, 0)
@@ -558,24 +574,29 @@ def _shorten(name: str) -> str:
     return name if len(name) <= _LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
 
 
-def _draw_error_scale(figure: Figure, limit: float, exceeded: bool) -> None:
-    """The colour bar of the errors, at the right edge."""
+def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
+    """Draws the colour bar of the errors at the right edge, and the colour of unknown errors if needed."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.patches import Patch
 
     colors = ListedColormap(error_colors(np.linspace(0, 1, 256), 1.0))
     width = _DPI * figure.get_figwidth()
-    axes = figure.add_axes((1 - 150 / width, 0.2, 22 / width, 0.5), label="error scale")
-    scale = figure.colorbar(
-        ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max" if exceeded else "neither"
-    )
-    scale.set_label("error / √area", fontsize=7.5, color=_FAINT)
+    axes = figure.add_axes((1 - _SCALE_WIDTH / width, 0.2, 22 / width, 0.5), label="error scale")
+    ticks = np.linspace(0, limit, 6)
+    scale = figure.colorbar(ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max", ticks=ticks)
+    scale.ax.set_yticklabels([*(f"{tick:g}" for tick in ticks[:-1]), f"{limit:g} and\nabove"])
+    scale.set_label("error (fraction of √area)", fontsize=7.5, color=_FAINT)
     scale.outline.set_visible(False)
     _style(axes)
+    if has_unknown:
+        unknown = Patch(facecolor=PLAIN.tolist(), label="unknown")
+        place = (1 - (_SCALE_WIDTH + 10) / width, 0.16)
+        figure.legend(handles=[unknown], loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=8)
 
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
-    """An empty white figure of so many inches with a canvas in memory; for a plot its parts make room."""
+    """An empty white figure with a canvas in memory, its size in inches; plots are laid out automatically."""
     check_drawable()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

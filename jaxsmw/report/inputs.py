@@ -1,4 +1,4 @@
-"""What the pictures are given, checked once for all of them."""
+"""Checks of the maps, errors and matrices that figures and pages show."""
 
 from __future__ import annotations
 
@@ -11,17 +11,13 @@ from jaxtyping import Array, Float, Float64, Int, Int64
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 
-# The error scale ends at the 98th percentile, but never below this fraction of sqrt(area): a map without
-# errors shall not look full of them.
-_PERCENTILE, _SMALLEST_LIMIT = 98, 1e-3
-
 
 def check_map(
     mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int[np.ndarray | Array, " m"]
 ) -> Int64[np.ndarray, " m"]:
-    """The pointwise map from X to Y as NumPy indices.
+    """Returns the pointwise map from X to Y as NumPy indices.
 
-    **Raises:** `InputError` unless it has one vertex of Y for every vertex of X.
+    **Raises:** `InputError` unless the map has one vertex of Y for every vertex of X.
     """
     indices = np.asarray(pointwise_map)
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
@@ -39,12 +35,11 @@ def check_map(
 
 
 def check_errors(
-    mesh_x: Mesh, errors: Mapping[str, Float[np.ndarray | Array, " m"]], limit: float | None
-) -> tuple[dict[str, Float64[np.ndarray, " m"]], float]:
-    """The errors as NumPy numbers by name, and where the colour scale of all ends.
+    mesh_x: Mesh, errors: Mapping[str, Float[np.ndarray | Array, " m"]]
+) -> dict[str, Float64[np.ndarray, " m"]]:
+    """Returns the errors by name, as NumPy arrays.
 
-    **Raises:** `InputError` unless there is one error for every vertex of X, non-negative or NaN (not known),
-    and the limit, where given, is positive.
+    **Raises:** `InputError` unless there is one error for every vertex of X, non-negative or NaN (unknown).
     """
     m, checked = len(mesh_x.vertices), {}
     for name, of_vertices in errors.items():
@@ -52,24 +47,27 @@ def check_errors(
         if values.shape != (m,) or np.any(values < 0):
             raise InputError(
                 f"{name}: there must be {m} non-negative numbers, one for each vertex of {mesh_x.name} (NaN "
-                f"where it is not known), but they have shape {values.shape} and {np.sum(values < 0)} are "
-                "negative."
+                f"where the error is unknown), but the array has shape {values.shape} and "
+                f"{np.sum(values < 0)} negative entries."
             )
-    if limit is None:
-        finite = [values[np.isfinite(values)] for values in checked.values()]
-        ends = [float(np.percentile(values, _PERCENTILE)) for values in finite if len(values)]
-        limit = max(_SMALLEST_LIMIT, *ends, 0)
+    return checked
+
+
+def check_error_limit(limit: float) -> None:
+    """Checks the end of the colour scale of errors.
+
+    **Raises:** `InputError` unless the limit is positive and finite.
+    """
     if not 0 < limit < np.inf:
         raise InputError(f"the error scale must end at a positive number, not at {limit}.")
-    return checked, limit
 
 
 def check_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"],
 ) -> Float64[np.ndarray, "k_out k_in"]:
-    """C in NumPy float64.
+    """Returns the functional map C in NumPy float64.
 
-    **Raises:** `InputError` if it is not a finite matrix.
+    **Raises:** `InputError` if C is not a finite matrix.
     """
     matrix = np.asarray(functional_map, dtype=float)
     if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
@@ -80,7 +78,7 @@ def check_functional_map(
 
 
 def describe(mesh: Mesh) -> tuple[str, str]:
-    """What the caption of a body says: the file's name without its directory, and the size."""
-    # A file's name need not be text; what is not becomes a question mark.
+    """The caption of a body: the name of the file without its directory, and the number of vertices."""
+    # File names may hold bytes that are not text; they become question marks.
     name = Path(mesh.name).name.encode("utf-8", "replace").decode()
     return name, f"{len(mesh.vertices)} vertices"

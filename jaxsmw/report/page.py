@@ -1,8 +1,7 @@
-"""Correspondences as one interactive web page: a single file that needs nothing else, not even a network."""
+"""Correspondences as an interactive web page: one file that needs nothing else, not even a network."""
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import html
 import json
@@ -15,39 +14,67 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.pair import common_range
-from jaxsmw.report.colors import PLAIN, error_colors, position_colors, signed_colors
-from jaxsmw.report.inputs import check_errors, check_functional_map, check_map, describe
-from jaxsmw.report.rendering import ELEVATION, Axis, choose_azimuth, stand_pair
+from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, position_colors
+from jaxsmw.report.inputs import check_error_limit, check_errors, check_map, describe
+from jaxsmw.report.page_data import (
+    COLOR_SCALES,
+    encode,
+    encode_basis,
+    encode_bytes,
+    encode_colors,
+    encode_functional_map,
+    encode_mesh,
+    spectra_on_page,
+)
+from jaxsmw.report.rendering import ELEVATION, choose_azimuth
+from jaxsmw.report.standing import stand_pair
 from jaxsmw.runtime.files import atomic_write
 
-# Of both shapes together a page holds so many values of eigenvectors, a byte each and a third more in
-# base64: as many eigenvectors as the paper has up to 60 000 vertices, and beyond 300 000 none.
-_EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
-# On a narrow screen bodies wider than this, for their height, are shown larger one above the other.
+# Bodies that are wider than this multiple of their height are shown one above the other on narrow screens.
 _WIDE = 0.65
+
+_EXPLANATIONS = {
+    "transfer": (
+        "Equal colours mark matched points: every point of the source has the colour of its match on the "
+        "target. If the map is good, corresponding parts of the two bodies have the same colours."
+    ),
+    "wavelets": (
+        "A wavelet is a ripple around one point of a surface. Point at a body: if the map is good, the "
+        "ripple around that point and the ripple around its match look alike. Red is positive, blue negative."
+    ),
+    "eigenfunctions": (
+        "Eigenfunctions are the vibration patterns of a surface, like the tones of a drum. These two "
+        "patterns belong to the chosen entry of the functional map. Red is positive, blue negative."
+    ),
+    "plain": "The two bodies without colours.",
+}
+_DISTANCES = (
+    "Light means close, dark means far. Distances are fractions of √area, the square root of the target's "
+    "surface area: on an adult person 0.1 is about 13 cm."
+)
 
 
 @dataclass(frozen=True, eq=False)
 class ShownMap:
-    """One of the maps that a page shows, and what is known of it.
+    """A map on a page, with everything the page says about it.
 
     **Attributes:**
 
-    - `pointwise_map`: for every vertex of X a vertex of Y, (m,).
-    - `errors`: by name, for every vertex of X the error of its match (m,), as a fraction of sqrt(area of Y);
-      NaN where it is not known. Each adds a colouring.
-    - `functional_map`: C, to be shown as a picture; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the
+    - `pointwise_map`: a vertex of Y for every vertex of X, (m,).
+    - `errors`: by name, the error of the match of every vertex of X (m,), as a fraction of sqrt(area of Y);
+      NaN where the error is unknown. Each entry adds a colouring.
+    - `functional_map`: C, shown as a picture; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the
       pushforward.
-    - `convention`: which of the two.
-    - `statistics`: what to state of this map beside the others, a label and a value each.
+    - `convention`: the convention of C.
+    - `statistics`: labels and values for a table in which maps are compared.
     """
 
     pointwise_map: Int[np.ndarray | Array, " m"]
@@ -67,200 +94,176 @@ def write_page(
     spectra: tuple[Spectrum, Spectrum] | None = None,
     refiner: WaveletPreservation = WaveletPreservation(),  # noqa: B008 (immutable)
     statistics: Mapping[str, str] = MappingProxyType({}),
-    error_limit: float | None = None,
+    error_meanings: Mapping[str, str] = MappingProxyType({}),
+    error_limit: float = ERROR_LIMIT,
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
 ) -> None:
-    """Write a page with both bodies to turn in 3D, coloured by a map, each point's match under the pointer.
+    """Writes a page with both bodies in 3D, coloured by a map, and the match of the point under the pointer.
 
-    Of several maps one is shown at a time. With spectra it also shows the wavelets of a refiner's bank,
+    The page shows one of the maps at a time. With spectra the page also shows the wavelets of a refiner's
+    bank,
 
         psi_{l,y}(x) = sum_i g_l(lambda_i) phi_i(y) phi_i(x),
 
-    on X around the vertex y under the pointer, and on Y around its match: a map that preserves wavelets makes
-    both look alike. The cosine of the angle between the one on X and the other carried over by the map says
-    how much.
+    on X around the vertex y under the pointer, and on Y around the match of y. A map that preserves wavelets
+    makes both look alike. Their similarity is the cosine of the angle between the wavelet on X and the
+    wavelet on Y, carried to X by the map.
 
     **Arguments:**
 
-    - `path`: the HTML file. It holds everything it needs and opens from disk in any browser with WebGL: about
-      0.6 MB for the viewer, 50 bytes per vertex, a few per vertex and map, and with spectra 133 bytes per
-      vertex, of all at most 8 MB.
+    - `path`: the HTML file. The file opens from disk in any browser with WebGL. Its size is about 0.6 MB for
+      the viewer, 50 bytes per vertex, a few bytes per vertex and map, and with spectra 133 bytes per vertex,
+      at most 8 MB.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
-    - `maps`: from X to Y, by name; the first is the one shown at first.
+    - `maps`: maps from X to Y by name; the page opens with the first.
     - `title`: the heading.
-    - `spectra`: of X and Y. The page shows the eigenvectors it has room for, `eigenvectors_on_page`,
-      rounded to a byte for each number, so that wavelets are right within about a hundredth.
-    - `refiner`: whose wavelets.
-    - `statistics`: what to state below the bodies, a label and a value each.
-    - `error_limit`: where the scale of errors ends; by default at the largest 98th percentile of the map
-      where that is least.
+    - `spectra`: the spectra of X and Y. The page holds up to `jaxsmw.report.page_data.eigenvectors_on_page`
+      eigenvectors, rounded to one byte per number, so that wavelets are right within about a hundredth.
+    - `refiner`: the refiner whose wavelets are shown.
+    - `statistics`: labels and values to show below the bodies.
+    - `error_meanings`: by name of an error, a sentence that explains it.
+    - `error_limit`: the end of the colour scale of errors. Pages can be compared if they share the limit.
     - `figures`: captions and PNG files to show at the end.
-    - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
-    **Raises:** `InputError` if there is no map, the maps, errors or spectra do not fit the meshes, or the
-    file cannot be written.
+    **Raises:** `InputError` if there is no map, the maps, errors or spectra do not fit the meshes, the limit
+    is not positive, or the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one.")
-    indices = {name: check_map(mesh_x, mesh_y, shown.pointwise_map) for name, shown in maps.items()}
-    found = {name: check_errors(mesh_x, shown.errors, error_limit) for name, shown in maps.items()}
-    errors = {name: of_map for name, (of_map, _) in found.items()}
-    # As for the best of the maps: on the scale of a bad one all others would look the same.
-    limit = min((end for of_map, end in found.values() if of_map), default=1.0)
-    error_names = list(dict.fromkeys(of for of_map in errors.values() for of in of_map))
-    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
-    reach = np.max([np.ptp(mesh.vertices[mesh.used_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0)
-    data: dict[str, Any] = {
-        "x": _encode_mesh(shown_x),
-        "y": _encode_mesh(shown_y),
-        "maps": [
-            {
-                "name": name,
-                "map": _encode(indices[name], "<u4"),
-                "errors": {of: _encode(values, "<f4") for of, values in errors[name].items()},
-                "functional": _encode_functional_map(shown),
-            }
-            for name, shown in maps.items()
-        ],
-        "colors": _encode_colors(position_colors(shown_y)),
+    check_error_limit(error_limit)
+    encoded = [_encode_map(name, shown, mesh_x, mesh_y) for name, shown in maps.items()]
+    error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
+    data = _encode_shapes(*stand_pair(mesh_x, mesh_y, up)) | {
+        "maps": encoded,
         "plain": np.round(255 * PLAIN).astype(int).tolist(),
-        "scales": {name: _encode_colors(colors) for name, colors in _SCALES.items()},
-        "limit": limit,
+        "scales": {name: encode_colors(colors) for name, colors in COLOR_SCALES.items()},
+        "limit": error_limit,
         "error_names": error_names,
-        "azimuth": choose_azimuth([shown_x, shown_y]),
-        "elevation": ELEVATION,
-        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
     }
-    filters = 0
-    if spectra is not None and (cut := _cut(mesh_x, mesh_y, *spectra)):
-        wavelets = refiner.problem(*cut)
-        filters = len(wavelets.responses_x)
-        for side, spectrum, responses in zip(
-            "xy", cut, (wavelets.responses_x, wavelets.responses_y), strict=True
-        ):
-            data[side] |= {
-                "eigenvectors": _encode_rounded(np.asarray(spectrum.eigenvectors).T),
-                "responses": _encode(np.asarray(responses), "<f4"),
-            }
-
-    assets = files("jaxsmw.report") / "assets"
-    script = (assets / "viewer.js").read_text("utf-8")
-    beyond = any(np.any(values > limit) for of_map in errors.values() for values in of_map.values())
-    colorings = {"transfer": "Colour transfer"} | {f"error-{i}": of for i, of in enumerate(error_names)}
-    colorings |= {"wavelets": "Wavelets"} if filters else {}
-    parts = {
+    filters = _add_wavelets(data, mesh_x, mesh_y, spectra, refiner)
+    modes = _modes(maps, error_names, has_spectra=filters > 0)
+    fragments = {
         "title": html.escape(title),
         "source": html.escape(" · ".join(describe(mesh_x))),
         "target": html.escape(" · ".join(describe(mesh_y))),
         "last_vertex": str(len(mesh_x.vertices) - 1),
         "last_filter": str(max(filters - 1, 0)),
         "map_choices": _choices("map", "Map", dict(enumerate(maps))) if len(maps) > 1 else "",
-        "coloring_choices": _choices("coloring", "Colours", colorings | {"plain": "Plain"}),
-        **{f"{name}_gradient": _gradient(colors) for name, colors in _SCALES.items()},
-        "error_end": f"{'≥ ' if beyond else ''}{limit:.3g} √area",
+        "mode_choices": _choices("mode", "Show", modes),
+        "explanations": _explanations(modes, error_meanings),
+        "error_end": f"{error_limit:g} and above",
         "comparison": _comparison(maps),
         "statistics": _statistics(statistics),
         "figures": _figures(figures),
-        # "<" could end the script element or open a comment in it.
-        "data": json.dumps(data).replace("<", "\\u003c"),
-        "script": script,
-        "script_hash": f"sha256-{_encode_bytes(hashlib.sha256(script.encode()).digest())}",
     }
-    # All at once, so that no part is searched for the marks of another.
-    page = re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / "page.html").read_text("utf-8"))
+    page = _fill_template(data, fragments)
     with atomic_write(path) as temporary:
         temporary.write_bytes(page.encode("utf-8", "replace"))
 
 
-def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
-    """How many eigenvectors of two meshes a page has room for: 100, less for large ones, 0 for very large."""
-    room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
-    return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
-
-
-def _cut(
-    mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
-) -> tuple[Spectrum, Spectrum] | None:
-    """What the page shows of spectra; None if it has no room for them."""
-    for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
-        if len(spectrum.eigenvectors) != len(mesh.vertices):
-            raise InputError(
-                f"the spectrum of {mesh.name} is one of {len(spectrum.eigenvectors)} vertices, but it has "
-                f"{len(mesh.vertices)}."
-            )
-    if not (room := eigenvectors_on_page(mesh_x, mesh_y)):
-        return None
-    cut = spectrum_x.truncate(room), spectrum_y.truncate(room)
-    # Of a part and the whole fewer eigenvectors of the part reach as far.
-    return cut if len(spectrum_x.eigenvalues) == len(spectrum_y.eigenvalues) else common_range(*cut)
-
-
-# Colours at even steps between the ends of a scale; the middle one of a signed scale is that of zero.
-_SCALES = {
-    "error": error_colors(np.linspace(0, 1, 256), 1.0),
-    "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
-    "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
-}
-
-
-def _gradient(colors: np.ndarray) -> str:
-    stops = np.round(255 * colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]).astype(int)
-    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops)
-
-
-def _encode_bytes(data: bytes) -> str:
-    return base64.b64encode(data).decode()
-
-
-def _encode(array: np.ndarray, dtype: str) -> str:
-    return _encode_bytes(array.astype(dtype).tobytes())
-
-
-def _encode_mesh(mesh: Mesh) -> dict[str, Any]:
-    return {"vertices": _encode(mesh.vertices, "<f4"), "faces": _encode(mesh.faces, "<u4")}
-
-
-def _encode_colors(colors: np.ndarray) -> str:
-    return _encode(np.round(255 * colors), "u1")
-
-
-def _encode_rounded(rows: np.ndarray) -> dict[str, str]:
-    """A byte for each number, and for each row a unit: a code c says sign(c) c² units.
-
-    So levels are the finer the smaller a number is. The eigenvectors of limbs are large on these and small
-    elsewhere; even levels would give wavelets elsewhere false spots there. Rounded like this they are off by
-    half a hundredth of the colour scale (root mean square, on people and animals), as with even levels of 10
-    bits.
-    """
-    units = np.maximum(np.abs(rows).max(axis=1), np.finfo(np.float32).tiny) / 127**2
-    codes = np.sign(rows) * np.round(np.sqrt(np.abs(rows) / units[:, None]))
-    return {"codes": _encode(codes, "i1"), "units": _encode(units, "<f4")}
-
-
-def _encode_functional_map(shown: ShownMap) -> dict[str, Any] | None:
-    if shown.functional_map is None:
-        return None
-    matrix = check_functional_map(shown.functional_map)
+def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
+    """The data of two standing meshes, and of the camera."""
+    reach = np.max(
+        [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
+    )
     return {
-        "values": _encode(matrix, "<f4"),
-        "columns": matrix.shape[1],
-        "pushforward": shown.convention == "pushforward",
+        "x": encode_mesh(shown_x),
+        "y": encode_mesh(shown_y),
+        "colors": encode_colors(position_colors(shown_y)),
+        "azimuth": choose_azimuth([shown_x, shown_y]),
+        "elevation": ELEVATION,
+        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
     }
 
 
+def _encode_map(name: str, shown: ShownMap, mesh_x: Mesh, mesh_y: Mesh) -> dict[str, Any]:
+    """The data of one map."""
+    return {
+        "name": name,
+        "map": encode(check_map(mesh_x, mesh_y, shown.pointwise_map), "<u4"),
+        "errors": {of: encode(values, "<f4") for of, values in check_errors(mesh_x, shown.errors).items()},
+        "functional": encode_functional_map(shown.functional_map, shown.convention),
+    }
+
+
+def _add_wavelets(
+    data: dict[str, Any],
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    spectra: tuple[Spectrum, Spectrum] | None,
+    refiner: WaveletPreservation,
+) -> int:
+    """Adds eigenvectors and filters to the data of both shapes; returns the number of filters, 0 for none."""
+    cut = None if spectra is None else spectra_on_page(mesh_x, mesh_y, *spectra)
+    if cut is None:
+        return 0
+    wavelets = refiner.problem(*cut)
+    data["x"] |= encode_basis(cut[0], wavelets.responses_x)
+    data["y"] |= encode_basis(cut[1], wavelets.responses_y)
+    return len(wavelets.responses_x)
+
+
+def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
+    """The labels of everything that the colours of the bodies can show, by the viewer's names."""
+    modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
+    if has_spectra:
+        modes["wavelets"] = "Wavelets"
+        if any(shown.functional_map is not None for shown in maps.values()):
+            modes["eigenfunctions"] = "Eigenfunctions"
+    return modes | {"plain": "Plain"}
+
+
+def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
+    """The page: the template with data, fragments of HTML, and the viewer's script."""
+    assets = files("jaxsmw.report") / "assets"
+    script = (assets / "viewer.js").read_text("utf-8")
+    parts = {
+        **fragments,
+        **{f"{name}_gradient": _gradient(colors) for name, colors in COLOR_SCALES.items()},
+        "plain_color": _gradient(PLAIN[None]),
+        # A "<" could end the script element or open a comment in it.
+        "data": json.dumps(data).replace("<", "\\u003c"),
+        "script": script,
+        "script_hash": f"sha256-{encode_bytes(hashlib.sha256(script.encode()).digest())}",
+    }
+    # All placeholders at once, so that no inserted part is searched for placeholders.
+    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / "page.html").read_text("utf-8"))
+
+
+def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
+    """The colours of a CSS gradient: up to nine of a scale."""
+    chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
+    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
+
+
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """Radio buttons by value, the first of them chosen."""
+    """Radio buttons for labels by value; the first is chosen."""
     inputs = "".join(
-        f'<label><input type="radio" name="{name}" value="{value}"{"" if position else " checked"}>'
-        f"<span>{html.escape(text)}</span></label>"
+        f'<label><input type="radio" name="{name}" autocomplete="off" value="{value}"'
+        f"{'' if position else ' checked'}><span>{html.escape(text)}</span></label>"
         for position, (value, text) in enumerate(choices.items())
     )
-    return f'<fieldset class="choice"><legend>{label}</legend>{inputs}</fieldset>'
+    return (
+        f'<div class="choices" role="radiogroup" aria-labelledby="{name}-label">'
+        f'<span id="{name}-label">{label}</span><div class="choice">{inputs}</div></div>'
+    )
+
+
+def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -> str:
+    """One paragraph per mode; the viewer shows the paragraph of the current mode."""
+    paragraphs = []
+    for mode, label in modes.items():
+        text = _EXPLANATIONS.get(mode)
+        if text is None:
+            text = f"{error_meanings.get(label, f'{label} of every match.')} {_DISTANCES}"
+        paragraphs.append(f'<p data-for="{mode}">{html.escape(text)}</p>')
+    return "".join(paragraphs)
 
 
 def _comparison(maps: Mapping[str, ShownMap]) -> str:
-    """A table of what is stated of each map; a row for each."""
+    """A table with one row per map and one column per label of their statistics."""
     labels = dict.fromkeys(label for shown in maps.values() for label in shown.statistics)
     if not labels:
         return ""
@@ -278,6 +281,7 @@ def _comparison(maps: Mapping[str, ShownMap]) -> str:
 
 
 def _statistics(statistics: Mapping[str, str]) -> str:
+    """Labels and values, one card each."""
     if not statistics:
         return ""
     rows = "".join(
@@ -288,10 +292,11 @@ def _statistics(statistics: Mapping[str, str]) -> str:
 
 
 def _figures(figures: Sequence[tuple[str, bytes]]) -> str:
+    """PNG pictures with their captions."""
     if not figures:
         return ""
     shown = "".join(
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{_encode_bytes(png)}">'
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{encode_bytes(png)}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for caption, png in figures
     )

@@ -1,105 +1,41 @@
-"""Shaded pictures of meshes in plain NumPy: where the viewer stands, what covers a pixel, how it is lit."""
+"""Shaded pictures of meshes in plain NumPy: the camera, the visible surface and its light."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import get_args
 
-import igl
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.ndimage import uniform_filter
 
-from jaxsmw.choices import Axis
-from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
 
-# Proper rotations that turn the named axis up. Y-up and z-up files then face the same way: forward is +z in
-# the one convention and -y in the other, and x runs across the body in both.
-_STAND = {
-    "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
-    "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
-    "-y": ((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
-    "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
-}
-
-# Where the viewer would rather stand: in front, a little to the side. In radians from +z towards +x.
+# The preferred place of the viewer: in front, a little to the side. In radians from +z towards +x.
 _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
-"""How far the viewer looks down on the body, in radians."""
+"""The angle at which the viewer looks down on the body, in radians."""
 
 # Directions to the lights in the camera's frame (right, up, towards the viewer) and their strengths.
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# Samples per pixel and direction; candidate samples tested at a time.
+# Samples per pixel in each direction, and the number of samples that are tested at a time.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
 
-def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
-    """The mesh as it is shown: upright, its bounding box around the origin, its area 1.
-
-    Faces are turned where needed so that neighbours agree on which side is out; vertices keep their numbers.
-
-    **Arguments:**
-
-    - `mesh`: a surface of positive area.
-    - `up`: the axis of the file that points up. By default the y axis when the body is slender along it (its
-      spread along z is below 0.45 of that along y), as are people in y-up files; otherwise the z axis.
-
-    **Returns:** A `Mesh` in which x is right to left across the body, y up and z forward, as far as the file
-    kept to one of the two usual conventions.
-
-    **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
-    """
-    if not mesh.area > 0:
-        raise InputError(
-            f"{mesh.name}: there is nothing to draw because its faces have no area; give a surface."
-        )
-    if up is None:
-        center = mesh.vertex_areas @ mesh.vertices / mesh.area
-        spread = np.sqrt(mesh.vertex_areas @ (mesh.vertices - center) ** 2)
-        up = "z" if spread[2] > 0.45 * spread[1] else "y"
-    elif up not in _STAND:
-        raise InputError(f"up={up!r} is not an axis; choose one of {', '.join(get_args(Axis))}.")
-    vertices = mesh.vertices @ np.array(_STAND[up], dtype=float).T / np.sqrt(mesh.area)
-    used = vertices[mesh.used_vertices]
-    faces, _ = igl.bfs_orient(mesh.faces)
-    return replace(
-        mesh,
-        vertices=vertices - (used.min(axis=0) + used.max(axis=0)) / 2,
-        faces=faces.astype(np.int64),
-    )
-
-
-def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
-    """Both meshes standing (`stand`), Y with area 1, and X too unless one is a part of the other.
-
-    An area between 1/16 and 0.6 of the other (or the reverse) is taken for that of a part, which stays in
-    proportion to the whole. Nearer to equal it is the same body in another unit; below, units must differ.
-    """
-    standing_x, standing_y = stand(mesh_x, up), stand(mesh_y, up)
-    ratio = mesh_x.area / mesh_y.area
-    if 1 / 16 < min(ratio, 1 / ratio) < 0.6:
-        standing_x = replace(standing_x, vertices=np.sqrt(ratio) * standing_x.vertices)
-    return standing_x, standing_y
-
-
 def choose_azimuth(meshes: Sequence[Mesh]) -> float:
-    """One direction to look from that shows all meshes well.
+    """One direction of view that shows all meshes well.
 
-    The viewer looks along the direction in which the bodies are thin (people are seen from the front, animals
-    from the side), but would rather stand in front and a little to the side: with M the horizontal covariance
-    of trace 1, summed over the meshes, and r that preference, the least eigenvector of M - 0.8 r r^T.
+    The best direction is the one in which the bodies are thin: people are seen from the front, animals from
+    the side. A view from the front and a little to the side is preferred. With M the sum over the meshes of
+    the horizontal covariance, scaled to trace 1, and r the preferred direction, the direction of view is the
+    least eigenvector of M - 0.8 n r r^T for n meshes.
 
     **Arguments:**
 
-    - `meshes`: standing (`stand`).
+    - `meshes`: standing (`jaxsmw.report.standing.stand`).
 
     **Returns:** The viewer's azimuth in radians, from forward (+z) towards +x.
     """
@@ -126,22 +62,22 @@ def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
 def render(
     mesh: Mesh, colors: Float64[np.ndarray, "n 3"], *, azimuth: float, scale: float, width: int, height: int
 ) -> UInt8[np.ndarray, "height width 4"]:
-    """A mesh with coloured vertices as a picture, smoothly shaded, on a transparent background.
+    """A picture of a mesh with coloured vertices, smoothly shaded, on a transparent background.
 
-    Orthographic, the origin in the middle of the picture; a depth buffer with 2 x 2 samples per pixel, so
-    that neither cracks nor wrongly sorted triangles can occur. Lit from the upper left and, weaker, from the
-    right, both sides of a face alike; what lies behind a nearer part of the body is a little darker near its
-    outline.
+    The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
+    samples per pixel rules out cracks and wrongly sorted triangles. Light comes from the upper left and,
+    weaker, from the right, and lights both sides of a face alike. Surfaces behind a nearer part of the body
+    are slightly darker near its outline.
 
     **Arguments:**
 
-    - `mesh`: standing (`stand`).
+    - `mesh`: standing (`jaxsmw.report.standing.stand`).
     - `colors`: one sRGB colour in [0, 1] per vertex, interpolated over the faces.
-    - `azimuth`: of the viewer, in radians; see `choose_azimuth`.
+    - `azimuth`: the viewer's azimuth in radians; see `choose_azimuth`.
     - `scale`: pixels per unit of length.
-    - `width`, `height`: of the picture, in pixels.
+    - `width`, `height`: the size of the picture in pixels.
 
-    **Returns:** RGBA pixels, straight alpha, the top row first.
+    **Returns:** RGBA pixels with straight alpha, the top row first.
     """
     axes = camera_axes(azimuth)
     positions, normals = mesh.vertices @ axes.T, mesh.vertex_normals @ axes.T
@@ -158,7 +94,8 @@ def render(
     normal = np.einsum("pc,pcd->pd", weights, normals[corners])
     sides = positions[corners[:, 1:]] - positions[corners[:, :1]]
     flat = np.cross(sides[:, 0], sides[:, 1])
-    # Where neighbouring normals cancel the face's own has to do; a face seen from behind shows that side.
+    # Where neighbouring normals cancel out, use the face's own normal. A face seen from behind shows its
+    # back.
     normal = np.where(np.any(normal, axis=1, keepdims=True), normal, flat) * np.where(flat[:, 2:] < 0, -1, 1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -185,9 +122,9 @@ def _rasterize(
     columns: int,
     rows: int,
 ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """The frontmost face at each sample (-1: none), the barycentric weights there and the depth.
+    """The frontmost face at each sample (-1 for none), the barycentric weights there, and the depth.
 
-    Every face is tested against the samples in its bounding box, a chunk of faces at a time.
+    Each face is tested against all samples in its bounding box, a chunk of faces at a time.
     """
     front = np.full(rows * columns, -1)
     weights = np.zeros((rows * columns, 3))
@@ -229,8 +166,11 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """Light left where something near is in front: unsharp masking of the depth (Luft et al. 2006)."""
-    # A blurred depth needs one sample per pixel only.
+    """The share of light that reaches points behind nearer surfaces.
+
+    The share follows from unsharp masking of the depth (Luft et al. 2006).
+    """
+    # One sample per pixel is enough, because the depth gets blurred.
     image = depth[::_SUPERSAMPLING, ::_SUPERSAMPLING]
     share = np.isfinite(image).astype(float)
     blurred = np.where(share > 0, image, 0)

@@ -1,4 +1,4 @@
-"""Everything about one match in one directory."""
+"""All pictures and numbers about a match or about several maps of a pair."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 
+from jaxsmw.choices import Axis
 from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -34,10 +35,11 @@ from jaxsmw.report.figures import (
     save_figure,
 )
 from jaxsmw.report.inputs import check_map
-from jaxsmw.report.page import ShownMap, eigenvectors_on_page, write_page
-from jaxsmw.report.rendering import Axis
+from jaxsmw.report.page import ShownMap, write_page
+from jaxsmw.report.page_data import eigenvectors_on_page
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
 
 if TYPE_CHECKING:
@@ -52,10 +54,19 @@ REPORT_FILES = (
     "quality.png",
     "summary.json",
 )
-"""What `write_report` may write."""
+"""The files that `write_report` may write."""
 
-
-_QUALITY_CAPTION = "The share of vertices within a geodesic error."
+_QUALITY_CAPTION = "The share of matches whose geodesic error is at most a threshold: the higher, the better."
+_FILTERS_CAPTION = (
+    "The filters that make wavelets of each scale, over the eigenvalues of the source (area 1)."
+)
+_ERROR_MEANINGS = {
+    "Error": "The distance along the surface between every match and the right place on the target.",
+    "Expected error": (
+        "An estimate of the distance between every match and the right place on the target, made without "
+        "knowing the right place."
+    ),
+}
 
 
 def write_report(
@@ -64,23 +75,25 @@ def write_report(
     *,
     errors: Mapping[str, GeodesicError] | None = None,
     settings: Mapping[str, Any] | None = None,
+    seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
 ) -> list[Path]:
-    """Write the pictures of a match, an interactive page and a summary to a directory.
+    """Writes the pictures of a match, an interactive page and a summary to a directory.
 
-    The error that is to be expected (`Correspondence.expected_error`) is among them, and if given the true
-    one.
+    The report includes the expected error (`Correspondence.expected_error`) and, if given, measured errors.
 
     **Arguments:**
 
-    - `directory`: made if it is not there; it gets `report.html` (both bodies to turn, with the map and the
-      one it started from, wavelets and figures), `correspondence.png`, `functional_map.png`, `filters.png`
-      (if a stage has any), `quality.png` (with errors only) and `summary.json`.
+    - `directory`: created if missing. It gets `report.html` (an interactive page with both bodies, the map
+      and the initial map), `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has
+      filters), `quality.png` (if there are errors) and `summary.json`.
     - `correspondence`: the match.
-    - `errors`: geodesic errors by name, `initial` that of `correspondence.initial_map`, the last of them that
-      of `correspondence.pointwise_map`.
-    - `settings`: what else to note in the summary.
-    - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+    - `errors`: geodesic errors by the name of a map. `initial` belongs to `correspondence.initial_map`, the
+      last entry to `correspondence.pointwise_map`.
+    - `settings`: further entries for the summary.
+    - `seconds`: the wall time of every step of the run so far, in seconds, by name; by default the steps of
+      `match`. The report adds its own steps and states the sum as the total, so steps must not overlap.
+    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
     **Returns:** The files that were written.
 
@@ -88,78 +101,105 @@ def write_report(
     """
     directory = make_directory(directory)
     errors = errors or {}
-    final = list(errors.values())[-1] if errors else None
-    expected = correspondence.expected_error()
-    m = len(correspondence.pointwise_map)
-    per_vertex = {} if final is None else {"Error": _per_vertex(final, m)}
-    per_vertex["Expected error"] = expected
-    convention: Convention = getattr(correspondence.stages[-1].refiner, "convention", "pullback")
-
-    figures = {
-        "correspondence": draw_correspondence(
-            correspondence.mesh_x,
-            correspondence.mesh_y,
-            correspondence.pointwise_map,
-            errors=per_vertex,
-            up=up,
-        ),
-        "functional_map": draw_functional_map(correspondence.functional_map, convention=convention),
-    }
-    captions = {}
-    refiner = WaveletPreservation()
-    for stage in correspondence.stages:
-        if isinstance(stage.refiner, WaveletPreservation):
-            refiner = stage.refiner
-            eigenvalues = np.asarray(correspondence.spectrum_x.eigenvalues)[: stage.number_of_eigenvectors]
-            figures["filters"] = draw_bank(stage.refiner.bank, eigenvalues)
-            captions["filters"] = "The filters over the eigenvalues of the source (area 1)."
-    if errors:
-        figures["quality"] = draw_errors(errors)
-        captions["quality"] = _QUALITY_CAPTION
-    for name, figure in figures.items():
-        save_figure(directory / f"{name}.png", figure)
-
-    spectra = correspondence.spectrum_x, correspondence.spectrum_y
-    start = ShownMap(
-        correspondence.initial_map,
-        {"Error": _per_vertex(errors["initial"], m)} if "initial" in errors else {},
-        _encoded(correspondence.initial_map, *spectra, convention),
-        convention,
-        _main_figures(errors.get("initial")),
-    )
-    outcome = ShownMap(
-        correspondence.pointwise_map,
-        per_vertex,
-        correspondence.functional_map,
-        convention,
-        _main_figures(final),
-    )
+    steps = dict(correspondence.seconds if seconds is None else seconds)
+    with timed("expected error", steps):
+        expected = correspondence.expected_error()
+    shown = _shown_maps(correspondence, errors, expected)
+    with timed("pictures", steps):
+        captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
+    wavelets = _last_wavelets(correspondence)
+    # The page's table of maps already has the errors of the initial and the refined map.
     others = {name: error for name, error in list(errors.items())[:-1] if name != "initial"}
     write_page(
         directory / "report.html",
         correspondence.mesh_x,
         correspondence.mesh_y,
-        {"refined": outcome, "initial": start},
+        shown,
         title=_title(correspondence.mesh_x, correspondence.mesh_y),
-        spectra=spectra,
-        refiner=refiner,
-        statistics=summarize(correspondence, others, expected),
+        spectra=(correspondence.spectrum_x, correspondence.spectrum_y),
+        refiner=WaveletPreservation() if wavelets is None else wavelets[0],
+        statistics=summarize(correspondence, others, expected, steps),
+        error_meanings=_ERROR_MEANINGS,
         figures=[(caption, (directory / f"{name}.png").read_bytes()) for name, caption in captions.items()],
         up=up,
     )
-    facts = summarize(correspondence, errors, expected)
     summary = {
         "settings": dict(settings or {}),
-        "result": facts,
-        "flaw": correspondence.distortion,
+        "result": summarize(correspondence, errors, expected, steps),
+        "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
+        "seconds": {**steps, "total": sum(steps.values())},
         "provenance": provenance(),
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
     names = ("report.html", *(f"{name}.png" for name in figures), "summary.json")
     return [directory / name for name in names]
+
+
+def _shown_maps(
+    correspondence: Correspondence,
+    errors: Mapping[str, GeodesicError],
+    expected_error: Float[np.ndarray, " m"],
+) -> dict[str, ShownMap]:
+    """The refined and the initial map, as the page shows them."""
+    m = len(correspondence.pointwise_map)
+    spectra = correspondence.spectrum_x, correspondence.spectrum_y
+    convention = correspondence.stages[-1].refiner.convention
+    final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
+    refined = ShownMap(
+        correspondence.pointwise_map,
+        _named_errors(final, m) | {"Expected error": expected_error},
+        correspondence.functional_map,
+        convention,
+        _main_figures(final),
+    )
+    before = ShownMap(
+        correspondence.initial_map,
+        _named_errors(initial, m),
+        _encoded(correspondence.initial_map, *spectra, convention),
+        convention,
+        _main_figures(initial),
+    )
+    return {"refined": refined, "initial": before}
+
+
+def _save_figures(
+    directory: Path,
+    correspondence: Correspondence,
+    per_vertex: Mapping[str, Float[np.ndarray | Array, " m"]],
+    errors: Mapping[str, GeodesicError],
+    up: Axis | None,
+) -> dict[str, str]:
+    """Writes all figures; returns the captions of the figures that the page shows as well, by name."""
+    mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
+    convention = correspondence.stages[-1].refiner.convention
+    figures = {
+        "correspondence": draw_correspondence(
+            mesh_x, mesh_y, correspondence.pointwise_map, errors=per_vertex, up=up
+        ),
+        "functional_map": draw_functional_map(correspondence.functional_map, convention=convention),
+    }
+    captions = {}
+    if (wavelets := _last_wavelets(correspondence)) is not None:
+        refiner, k = wavelets
+        figures["filters"] = draw_bank(refiner.bank, np.asarray(correspondence.spectrum_x.eigenvalues)[:k])
+        captions["filters"] = _FILTERS_CAPTION
+    if errors:
+        figures["quality"] = draw_errors(errors)
+        captions["quality"] = _QUALITY_CAPTION
+    for name, figure in figures.items():
+        save_figure(directory / f"{name}.png", figure)
+    return captions
+
+
+def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
+    """The last refiner that preserves wavelets, and its number of eigenvectors; None without such a stage."""
+    for stage in reversed(correspondence.stages):
+        if isinstance(stage.refiner, WaveletPreservation):
+            return stage.refiner, stage.number_of_eigenvectors
+    return None
 
 
 def write_comparison(
@@ -172,22 +212,22 @@ def write_comparison(
     partial: bool = False,
     up: Axis | None = None,
 ) -> None:
-    """Write an interactive page with several maps of one pair, one shown at a time.
+    """Writes an interactive page with several maps of one pair, one shown at a time.
 
-    It shows their functional maps and the wavelets of the paper's bank as well, unless the eigenvectors of
-    the meshes cannot be computed, of which it warns.
+    The page also shows the functional maps and the wavelets of the paper's bank, unless the eigenvectors of
+    the meshes cannot be computed; then there is a warning.
 
     **Arguments:**
 
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_maps`: T: X -> Y (m,) by name, in this order.
-    - `errors`: their geodesic errors by the same names; the page shows them in colours, states the main
-      figures of all maps side by side, and has their correspondence quality curves.
-    - `partial`: whether one mesh shows a part of the other; see `jaxsmw.match`.
-    - `up`: the axis of the meshes that points up; see `jaxsmw.report.rendering.stand` for the default.
+    - `pointwise_maps`: T: X -> Y (m,) by name, in the order in which the page lists them.
+    - `errors`: geodesic errors by the same names. The page shows them in colours, compares the main figures
+      of all maps in a table, and shows their correspondence quality curves.
+    - `partial`: whether one shape is a partial view of the other; see `jaxsmw.match`.
+    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
-    **Raises:** `InputError` if the maps do not fit the meshes, or the file cannot be written; with errors if
+    **Raises:** `InputError` if the maps do not fit the meshes, the file cannot be written, or, with errors,
     matplotlib is missing.
     """
     errors = errors or {}
@@ -201,7 +241,7 @@ def write_comparison(
     shown = {
         name: ShownMap(
             pointwise_map,
-            {"Error": _per_vertex(errors[name], len(pointwise_map))} if name in errors else {},
+            _named_errors(errors.get(name), len(pointwise_map)),
             _encoded(pointwise_map, *spectra) if spectra else None,
             statistics=_main_figures(errors.get(name)),
         )
@@ -214,13 +254,15 @@ def write_comparison(
         shown,
         title=_title(mesh_x, mesh_y),
         spectra=spectra,
+        error_meanings=_ERROR_MEANINGS,
         figures=figures,
         up=up,
     )
 
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
-    fewest = min(int(mesh.used_vertices.sum()) for mesh in (mesh_x, mesh_y))
+    """The spectra that a page of these meshes shows; None, with a warning, if they cannot be computed."""
+    fewest = min(int(mesh.referenced_vertices.sum()) for mesh in (mesh_x, mesh_y))
     number = min(eigenvectors_on_page(mesh_x, mesh_y), fewest // 2)
     if not number:
         return None
@@ -228,7 +270,7 @@ def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectru
     try:
         return paired_spectra(Pair(mesh_x, mesh_y, partial), number)
     except InputError as error:
-        warnings.warn(f"the page does without wavelets: {error}", stacklevel=3)
+        warnings.warn(f"the page has no wavelets: {error}", stacklevel=3)
         return None
 
 
@@ -251,13 +293,13 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _main_figures(error: GeodesicError | None) -> dict[str, str]:
-    """What stands in a row of a table of maps."""
+    """The labels and values of a map in the table of maps."""
     if error is None:
         return {}
-    shares = {f"within {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
+    shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
     area = f"{error.area_under_curve():.3f}"
     mean, median = f"{error.mean:.4f}", f"{error.median:.4f}"
-    return {"mean error (√area)": mean, "median (√area)": median, **shares, "area under curve": area}
+    return {"mean error (√area)": mean, "median error (√area)": median, **shares, "area under curve": area}
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
@@ -283,8 +325,17 @@ def summarize(
     correspondence: Correspondence,
     errors: Mapping[str, GeodesicError],
     expected_error: Float[np.ndarray, " m"],
+    seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """The facts of a match, labelled and ready to print."""
+    """The facts about a match by label, ready to print.
+
+    **Arguments:**
+
+    - `correspondence`: the match.
+    - `errors`: geodesic errors by the name of a map.
+    - `expected_error`: the expected error of every match (m,).
+    - `seconds`: the wall time of every step of the run so far, by name; by default the steps of `match`.
+    """
     facts = {
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
         "functional map": "{} x {}".format(*correspondence.functional_map.shape),
@@ -292,23 +343,30 @@ def summarize(
     }
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
-        facts[f"within 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
+        facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
-        doubt = (
+        suspicion = (
             f"; above {RepairSettings().suspicious} limbs may be swapped" if correspondence.suspicious else ""
         )
-        facts["flaw (1 is none)"] = f"{correspondence.distortion:.2f}{doubt}"
+        facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
-    return facts | {f"time, {stage}": f"{time:.2f} s" for stage, time in correspondence.seconds.items()}
+    steps = correspondence.seconds if seconds is None else seconds
+    times = {**steps, "total": sum(steps.values())}
+    return facts | {f"time, {step}": f"{time:.2f} s" for step, time in times.items()}
 
 
 def provenance() -> dict[str, str]:
-    """What a figure depends on besides its input: versions and machine."""
+    """The versions, the machine and the device on which results depend besides their input."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
+def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
+    """The errors of the m source vertices under their name on the page; empty without errors."""
+    return {} if error is None else {"Error": _per_vertex(error, m)}
+
+
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """The errors spread over the source's vertices, NaN where none is known, the mean where several are."""
+    """The error of each of the m source vertices: NaN if unknown, and the mean if there are several."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

@@ -1,4 +1,4 @@
-"""Two meshes that wear one picture, for any viewer of OBJ files."""
+"""Two meshes with one texture, for any viewer of OBJ files."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.files import atomic_write
 
 TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
-"""What `write_textured_pair` writes."""
+"""The files that `write_textured_pair` writes."""
 
 _MATERIAL = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.png\n"
-# Pixels of the picture's side, and squares along it.
+# The side of the picture in pixels, and the number of squares along it.
 _PIXELS, _SQUARES = 1024, 32
 
 
 def write_textured_pair(
     directory: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints
 ) -> None:
-    """Write `source.obj` and `target.obj` with the same checkered picture on both (`TEXTURE_FILES`).
+    """Writes `source.obj` and `target.obj` with the same checkered picture as texture (`TEXTURE_FILES`).
 
-    The target wears it as projected along the shortest of its principal axes: without seams, front and back
-    alike. The source's texture coordinates are those of the points that its vertices are mapped to.
+    The picture is projected onto the target along the shortest of its principal axes, without seams, so that
+    front and back look alike. The texture coordinates of a source vertex are those of its match.
 
     **Arguments:**
 
-    - `directory`: an existing one; files of these names in it are replaced, each whole or not at all.
+    - `directory`: an existing directory. Files with these names are replaced, each completely or not at all.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: for every vertex of X a point of Y, for example `Correspondence.surface_points()`.
+    - `points`: a point of Y for every vertex of X, for example `Correspondence.surface_points()`.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -50,17 +50,17 @@ def write_textured_pair(
 
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
-    """Coordinates along the two longest principal axes, those of the surface from 0 to at most 1."""
-    used = mesh.vertices[mesh.used_vertices]
+    """Coordinates along the two longest principal axes; those of the surface are from 0 to at most 1."""
+    used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # Whatever signs they came with.
+    # The signs of singular vectors are arbitrary; make the largest coordinate of each axis positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)
     return (flat - low) / np.ptp(used @ longest.T, axis=0).max()
 
 
 def _checkered() -> Float64[np.ndarray, "h w 3"]:
-    """Squares, light and dark by turns, whose colour tells where in the picture they are."""
+    """A checkerboard of light and dark squares, whose hue shows the position in the picture."""
     row, column = np.mgrid[:_PIXELS, :_PIXELS] * _SQUARES // _PIXELS
     across, up = column / (_SQUARES - 1), row / (_SQUARES - 1)
     colors = np.stack([0.25 + 0.75 * across, 0.25 + 0.75 * up, 1 - 0.75 * across], axis=2)
@@ -68,6 +68,7 @@ def _checkered() -> Float64[np.ndarray, "h w 3"]:
 
 
 def _obj(mesh: Mesh, coordinates: Float64[np.ndarray, "n 2"]) -> str:
+    """The text of an OBJ file with texture coordinates."""
     lines = ["mtllib texture.mtl", "usemtl texture"]
     lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"vt {u:.9f} {v:.9f}" for u, v in coordinates.tolist()]

@@ -90,7 +90,7 @@ def recomputing() -> Iterator[None]:
         _recomputing.reset(token)
 
 
-def keep_programs() -> None:
+def cache_compiled_programs() -> None:
     """Let JAX cache compiled programs beside our results, up to 0.25 GiB, for the next process.
 
     This function sets JAX's environment variables, unless the user has set one of them. It must run before

@@ -1,9 +1,12 @@
-// Bundles viewer.js with the parts of three.js it uses into the package's assets: npm ci && npm run build
+// Bundles viewer.js and the parts of three.js that it uses into the package's assets: npm ci && npm run build
 
+import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
 import { build } from "esbuild";
 
 const assets = new URL("../../jaxsmw/report/assets/", import.meta.url);
+const source = readFileSync("viewer.js");
+const digest = createHash("sha256").update(source).digest("hex");
 const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8");
 
 await build({
@@ -15,7 +18,7 @@ await build({
   target: "es2022",
   charset: "ascii",
   legalComments: "none",
-  // Every page carries a copy of three.js, and so its licence.
-  banner: { js: `/* Contains three.js:\n\n${license.trim()}\n*/` },
+  // Every page carries a copy of three.js and therefore its licence. A test compares the digest with the source.
+  banner: { js: `/* Built from viewer.js with SHA-256 ${digest}.\nContains three.js:\n\n${license.trim()}\n*/` },
 });
 writeFileSync(new URL("THREE-LICENSE", assets), license);

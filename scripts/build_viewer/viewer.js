@@ -1,6 +1,6 @@
-// The interactive page: two bodies to turn, the map between their vertices under the pointer, wavelets around
-// it, and the functional map.
-// Bundled with three.js into jaxsmw/report/assets/viewer.js by build.mjs; the page around it is page.html.
+// The interactive page: two bodies in 3D, the match of the vertex under the pointer, wavelets around both, and the
+// functional map. build.mjs bundles this file with three.js into jaxsmw/report/assets/viewer.js, which page.html
+// embeds.
 
 import {
   AmbientLight,
@@ -29,19 +29,20 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const FIELD_OF_VIEW = 25;
-// The caption lies over the top of the canvas; so much of the upper half is left for the body.
+// The caption covers the top of the canvas. The body may use this share of the upper half.
 const BELOW_CAPTION = 0.85;
 const KEY_TURN = Math.PI / 18;
 const KEY_ZOOM = 1.15;
-const CLICK_TOLERANCE = 5; // pixels that the pointer may move between press and release
-const NAMED_VERTICES = 12; // of those mapped to one target vertex
-const WITHIN_SCALE = 0.98; // of the values of functions; the rest takes the last colours
+const CLICK_TOLERANCE = 5; // the most pixels that the pointer moves between press and release of a click
+const NAMED_VERTICES = 12; // the most source vertices that are listed for one target vertex
+const WITHIN_SCALE = 0.98; // the share of values inside the colour scale of a function; the rest is clipped
+const FIRST_ENTRY = [1, 1]; // the entry that the mode "eigenfunctions" opens with; eigenfunction 0 is constant
 
 const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
 const decode = (text, Type) => new Type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
 
-// Screen colours in bytes to the light intensities that three.js interpolates and shades.
+// The light intensity of each byte of a screen colour. three.js interpolates and shades light intensities.
 const LINEAR = Float32Array.from({ length: 256 }, (_, byte) => new Color().setRGB(byte / 255, 0, 0, SRGBColorSpace).r);
 
 const maps = data.maps.map(({ name, map, errors, functional }) => ({
@@ -54,8 +55,8 @@ const scales = Object.fromEntries(
   Object.entries(data.scales).map(([name, colors]) => [name, decode(colors, Uint8Array)]),
 );
 
-// Of each shape: k eigenvectors of n numbers one after the other, and responses of one filter after the other.
-// Null where the page has none.
+// For each shape, k eigenvectors of n numbers, one eigenvector after the other, and the responses of the filters at
+// the k eigenvalues, one filter after the other. Null if the page has no eigenvectors.
 const bases = data.x.eigenvectors && { x: readBasis(data.x), y: readBasis(data.y) };
 function readBasis({ eigenvectors, responses }) {
   const units = decode(eigenvectors.units, Float32Array);
@@ -66,7 +67,7 @@ function readBasis({ eigenvectors, responses }) {
 }
 const filters = bases ? bases.x.responses.length / bases.x.k : 0;
 
-// White with a black rim, to be seen on every colour; faint where the body is in front.
+// Marks are white with a black rim, visible on every colour, and faint where the body hides them.
 const CORE = new SphereGeometry(1, 20, 14);
 const RIM = new SphereGeometry(1.5, 20, 14);
 const MARK_LOOKS = [
@@ -75,7 +76,7 @@ const MARK_LOOKS = [
   [CORE, new MeshBasicMaterial({ color: 0xffffff, transparent: true, opacity: 0.4, depthTest: false })],
 ];
 
-/** One body in its canvas: the surface, its light, camera and marks. */
+/** One body in its canvas: the surface, the lights, the camera and the marks. */
 class Body {
   #areas = null;
 
@@ -106,7 +107,7 @@ class Body {
     this.marks = [];
   }
 
-  /** Lamps that move with the viewer: what one turns towards oneself is always well lit. */
+  /** Adds lamps that move with the viewer, so that the visible side is always well lit. */
   #light() {
     const lamp = (strength, ...position) => {
       const light = new DirectionalLight(0xffffff, strength);
@@ -123,7 +124,7 @@ class Body {
     return new Vector3().fromArray(this.positions, 3 * index);
   }
 
-  /** Give every vertex its colour, three bytes each. */
+  /** Colours the vertices, with three bytes each. */
   paint(colors) {
     this.colors = colors;
     const attribute = this.surface.geometry.attributes.color;
@@ -131,7 +132,7 @@ class Body {
     attribute.needsUpdate = true;
   }
 
-  /** Barycentric areas of the vertices. */
+  /** The barycentric areas of the vertices. */
   get areas() {
     if (this.#areas) return this.#areas;
     this.#areas = new Float32Array(this.positions.length / 3);
@@ -144,7 +145,7 @@ class Body {
     return this.#areas;
   }
 
-  /** Mark vertices, in place of those marked before. */
+  /** Marks these vertices and removes all other marks. */
   mark(indices) {
     this.marked = indices;
     for (const mark of this.marks) {
@@ -152,12 +153,12 @@ class Body {
       mark.dispose();
     }
     this.marks = MARK_LOOKS.map((look) => new InstancedMesh(...look, indices.length));
-    // Where the marks are changes later than three.js looks.
+    // Marks move after three.js has decided which objects are in view.
     for (const mark of this.marks) mark.frustumCulled = false;
     if (indices.length) this.scene.add(...this.marks);
   }
 
-  /** Marks keep their size on the screen however near the viewer is. */
+  /** Places the marks so that they keep their size on the screen at every distance. */
   #placeMarks() {
     const pixel = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / this.canvas.clientHeight;
     const pixels = this.marked.length > 1 ? 4.5 : 6;
@@ -165,7 +166,7 @@ class Body {
       const center = this.vertex(index);
       const towards = this.camera.position.clone().sub(center);
       const radius = pixels * pixel * towards.length();
-      // Clear of the surface, along the line of sight, so that it does not cut into the mark.
+      // Move the mark towards the viewer, so that the surface does not cut into it.
       center.addScaledVector(towards.normalize(), 2 * radius);
       const matrix = new Matrix4().makeScale(radius, radius, radius).setPosition(center);
       for (const mark of this.marks) mark.setMatrixAt(i, matrix);
@@ -173,7 +174,7 @@ class Body {
     for (const mark of this.marks) mark.instanceMatrix.needsUpdate = true;
   }
 
-  /** The distance from which the whole body is seen from the direction of `offset`. */
+  /** The distance from which the whole body is visible, seen from the direction of `offset`. */
   distanceToFit(offset) {
     const camera = this.camera.clone(false);
     camera.position.copy(offset);
@@ -205,7 +206,7 @@ class Body {
     return corners[distances.indexOf(Math.min(...distances))];
   }
 
-  /** Where a vertex is in the window, in CSS pixels. */
+  /** The position of a vertex in the window, in CSS pixels. */
   project(index) {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
@@ -231,12 +232,12 @@ let bodies;
 try {
   bodies = { x: new Body(byId("canvas-x"), data.x), y: new Body(byId("canvas-y"), data.y) };
 } catch (error) {
-  byId("readout").textContent = "The bodies cannot be shown: this browser offers no WebGL.";
+  byId("readout").textContent = "This browser cannot show the bodies because it does not support WebGL. Please try another browser.";
   throw error;
 }
 const everyBody = Object.values(bodies);
 
-// Draw when something changed, at most once a frame.
+// Draws after a change, at most once per frame.
 let frame = 0;
 function draw() {
   frame ||= requestAnimationFrame(() => {
@@ -245,22 +246,23 @@ function draw() {
   });
 }
 
-// ---- What is shown
+// ---- State
 
 const sides = ["x", "y"];
 const state = {
   map: 0,
-  coloring: "transfer",
+  mode: "transfer", // what the bodies show while no entry of the functional map is chosen
   filter: 0,
-  picked: null, // { side, vertex }, under the pointer or kept
+  picked: null, // { side, vertex }, under the pointer or kept by a click
   pinned: false,
-  entry: null, // [row, column] of the functional map, kept
-  hoveredEntry: null,
+  entry: null, // [row, column] of the functional map, kept by a click
+  hoveredEntry: null, // [row, column] under the pointer
 };
-let functions = { x: null, y: null }; // those in colours on the bodies, if any
+let lastEntry = FIRST_ENTRY;
+let functions = { x: null, y: null }; // the functions whose values the bodies show
 let preimages = readPreimages(maps[0]);
 
-/** The source vertices of each target vertex j: `sources` from starts[j] to starts[j + 1]. */
+/** Lists the source vertices that are mapped to target vertex j: `sources` from starts[j] to starts[j + 1]. */
 function readPreimages({ pointwise }) {
   const starts = new Uint32Array(bodies.y.positions.length / 3 + 1);
   for (const j of pointwise) starts[j + 1]++;
@@ -271,7 +273,7 @@ function readPreimages({ pointwise }) {
   return { starts, sources };
 }
 
-/** The vertices of both shapes that belong to what is picked. */
+/** The picked vertex and the vertices of the other shape that are matched with it. */
 function matched() {
   if (!state.picked) return { x: [], y: [] };
   const { side, vertex } = state.picked;
@@ -287,7 +289,7 @@ function eigenfunction(side, index) {
   return values.slice(index * n, (index + 1) * n);
 }
 
-/** sum_i g(lambda_i) phi_i(vertex) phi_i, of the chosen filter. */
+/** The wavelet around a vertex, sum_i g(lambda_i) phi_i(vertex) phi_i, for the chosen filter g. */
 function wavelet(side, vertex) {
   const { k, n, values, responses } = bases[side];
   const result = new Float32Array(n);
@@ -298,8 +300,8 @@ function wavelet(side, vertex) {
   return result;
 }
 
-/** The cosine of the angle between a function on the source and one on the target, carried over by the map. */
-function alikeness(x, y) {
+/** The cosine of the angle between a function on the source and a function on the target, carried to the source. */
+function similarity(x, y) {
   let both = 0, squareX = 0, squareY = 0;
   bodies.x.areas.forEach((area, i) => {
     const carried = y[maps[state.map].pointwise[i]];
@@ -310,13 +312,13 @@ function alikeness(x, y) {
   return both / Math.sqrt(squareX * squareY || 1);
 }
 
-/** The entry of the functional map that is shown, as eigenfunctions of the source and of the target. */
+/** The chosen entry of the functional map and its eigenfunctions x of the source and y of the target, or null. */
 function shownEntry() {
   const entry = state.hoveredEntry ?? state.entry;
   const { functional } = maps[state.map];
   if (!entry || !functional) return null;
   const [row, column] = entry;
-  // Another map's may be larger.
+  // The entry may come from another map with a larger matrix.
   if (column >= functional.columns || row * functional.columns >= functional.values.length) return null;
   const [x, y] = functional.pushforward ? [column, row] : [row, column];
   const known = bases && x < bases.x.k && y < bases.y.k;
@@ -336,50 +338,70 @@ function colored(values, scale, index) {
   return colors;
 }
 
+/** The name of the error that a mode shows; undefined for other modes. */
+const errorName = (mode) => data.error_names[Number(mode.split("-")[1])];
+
 const onErrorScale = (value) => Math.round(255 * Math.min(value / data.limit, 1)) || 0;
 const onSignedScale = (limit) => (value) => 127 + Math.round(127 * Math.max(-1, Math.min(1, value / limit)));
 
-/** Colour both bodies by what is chosen. */
+/** What the bodies show: eigenfunctions while an entry of the functional map is chosen, else the chosen mode. */
+const shownMode = () => (shownEntry()?.known ? "eigenfunctions" : state.mode);
+
+/** Makes buttons, explanation and legends agree with what the bodies show. */
+function announce(mode, scale) {
+  for (const input of document.querySelectorAll("input[name=mode]")) input.checked = input.value === mode;
+  for (const text of document.querySelectorAll("[data-for]")) text.classList.toggle("current", text.dataset.for === mode);
+  document.body.dataset.shown = mode;
+  document.body.dataset.scale = scale;
+  document.body.dataset.mode = state.mode;
+}
+
+/** Colours both bodies as the mode says. */
 function paint() {
   const { pointwise, errors } = maps[state.map];
-  const entry = shownEntry();
-  let shown = state.coloring.split("-")[0];
-  functions = { x: null, y: null };
-  if (entry?.known) {
-    functions = { x: eigenfunction("x", entry.x), y: eigenfunction("y", entry.y) };
-    shown = "signed";
-  } else if (shown === "wavelets") {
-    const { x, y } = matched();
-    if (x.length) functions.x = wavelet("x", x[0]);
-    if (y.length) functions.y = wavelet("y", y[0]);
-    shown = state.picked ? "signed" : "plain";
-  }
-
+  const mode = shownMode();
   const colors = { x: null, y: null };
-  if (shown === "transfer") {
+  let scale = "none";
+  functions = { x: null, y: null };
+  if (mode === "transfer") {
     colors.y = colorsY;
     colors.x = new Uint8Array(3 * pointwise.length);
     pointwise.forEach((j, i) => colors.x.set(colorsY.subarray(3 * j, 3 * j + 3), 3 * i));
-  } else if (shown === "error") {
-    const name = data.error_names[Number(state.coloring.split("-")[1])];
-    colors.x = colored(errors[name], scales.error, onErrorScale);
-  } else if (shown === "signed") {
-    const sizes = Float32Array.from([...(functions.x ?? []), ...(functions.y ?? [])], Math.abs).sort();
-    const limit = sizes[Math.round(WITHIN_SCALE * (sizes.length - 1))] || 1;
-    for (const side of sides) {
-      if (functions[side]) colors[side] = colored(functions[side], scales.signed, onSignedScale(limit));
-    }
-    const end = Number(limit.toPrecision(2));
-    byId("signed-low").textContent = `≤ −${end}`;
-    byId("signed-high").textContent = `≥ ${end}`;
+  } else if (mode === "eigenfunctions") {
+    const entry = shownEntry();
+    functions = { x: eigenfunction("x", entry.x), y: eigenfunction("y", entry.y) };
+  } else if (mode === "wavelets") {
+    const { x, y } = matched();
+    if (x.length) functions.x = wavelet("x", x[0]);
+    if (y.length) functions.y = wavelet("y", y[0]);
+  } else if (mode !== "plain") {
+    const values = errors[errorName(mode)];
+    colors.x = colored(values, scales.error, onErrorScale);
+    byId("unknown").hidden = !values.some(Number.isNaN);
+    scale = "error";
+  }
+  if (functions.x || functions.y) {
+    paintFunctions(colors);
+    scale = "signed";
   }
   for (const side of sides) {
     const plain = () => new Uint8Array(bodies[side].positions.length).map((_, i) => data.plain[i % 3]);
     bodies[side].paint(colors[side] ?? plain());
   }
-  document.body.dataset.shown = shown;
-  document.body.dataset.coloring = state.coloring;
+  announce(mode, scale);
   draw();
+}
+
+/** Fills in the colours of the functions, on one scale for both bodies, and the ends of the scale. */
+function paintFunctions(colors) {
+  const sizes = Float32Array.from([...(functions.x ?? []), ...(functions.y ?? [])], Math.abs).sort();
+  const limit = sizes[Math.round(WITHIN_SCALE * (sizes.length - 1))] || 1;
+  for (const side of sides) {
+    if (functions[side]) colors[side] = colored(functions[side], scales.signed, onSignedScale(limit));
+  }
+  const end = Number(limit.toPrecision(2));
+  byId("signed-low").textContent = `≤ −${end}`;
+  byId("signed-high").textContent = `≥ ${end}`;
 }
 
 // ---- Words and marks
@@ -392,16 +414,17 @@ function say(id, text) {
 
 function nameFilter() {
   const wavelets = filters - 1;
-  const ends = { 1: " (coarsest)", [wavelets]: " (finest)" };
-  return state.filter ? `wavelet ${state.filter} of ${wavelets}${ends[state.filter] ?? ""}` : "scaling function";
+  const ends = { 1: " (widest)", [wavelets]: " (narrowest)" };
+  if (!state.filter) return "scaling function";
+  return `wavelet ${state.filter} of ${wavelets}${ends[state.filter] ?? ""}`;
 }
 
 function inWords(error) {
-  if (Number.isNaN(error)) return "not known";
-  return error === Infinity ? "without end (on another component)" : error.toFixed(4);
+  if (Number.isNaN(error)) return "unknown";
+  return error === Infinity ? "infinite (the match is on a separate component of the surface)" : error.toFixed(4);
 }
 
-/** Mark what is picked, and say what the map says of it. */
+/** Marks the picked vertex and its matches, and says in words what is shown. */
 function tell() {
   const { x, y } = matched();
   let text = invitation;
@@ -417,42 +440,47 @@ function tell() {
   }
   const entry = shownEntry();
   if (entry?.known && !state.picked) text = `Eigenfunction ${entry.x} of the source, ${entry.y} of the target`;
-  if (state.coloring === "wavelets" && !entry?.known) {
-    if (functions.x && functions.y) text += ` · wavelets alike: cosine ${alikeness(functions.x, functions.y).toFixed(3)}`;
-    else if (!state.picked) text = "Point at a body to see the wavelets around that point, and around its match.";
+  if (shownMode() === "wavelets") {
+    if (functions.x && functions.y) {
+      text += ` · similarity of the wavelets ${similarity(functions.x, functions.y).toFixed(3)} (1 is the same)`;
+    } else if (!state.picked) text = "Point at a body to see the wavelet around that point and the wavelet around its match.";
   }
   for (const side of sides) bodies[side].mark(matched()[side]);
   say("readout", text);
   draw();
 }
 
-/** Let the pointer, or for good a click, pick a vertex of one side; null for none. */
+/** Picks a vertex of one side, or none (null). A picked vertex that is pinned stays when the pointer moves on. */
 function pick(side, vertex, pinned = false) {
   state.picked = vertex === null ? null : { side, vertex };
   state.pinned = pinned && vertex !== null;
   if (pinned) byId("vertex").value = state.picked && side === "x" ? vertex : "";
-  if (state.coloring === "wavelets" && !shownEntry()?.known) paint();
+  if (shownMode() === "wavelets") paint();
   tell();
 }
 const pin = (side, vertex) => pick(side, vertex, true);
 
-function chooseColoring(name) {
-  state.coloring = name;
-  chooseEntry(null);
+function chooseMode(mode) {
+  if (mode === "eigenfunctions") {
+    chooseEntry(lastEntry);
+    if (!shownEntry()?.known) chooseEntry([0, 0]); // this map or this page lacks the last entry
+  } else {
+    state.mode = mode;
+    chooseEntry(null);
+  }
 }
 
 function chooseMap(index) {
   state.map = index;
   preimages = readPreimages(maps[index]);
-  for (const input of document.querySelectorAll("input[name=coloring]")) {
-    const of = data.error_names[Number(input.value.split("-")[1])];
-    input.disabled = of !== undefined && !Object.hasOwn(maps[index].errors, of);
-    // What is not known of this map cannot stay chosen.
-    if (input.disabled && state.coloring === input.value) {
-      document.querySelector("input[value=transfer]").checked = true;
-      state.coloring = "transfer";
-    }
+  const { errors, functional } = maps[index];
+  for (const input of document.querySelectorAll("input[name=mode]")) {
+    const error = errorName(input.value);
+    input.disabled = input.value === "eigenfunctions" ? !functional : error !== undefined && !Object.hasOwn(errors, error);
+    // A mode that this map does not have cannot stay chosen.
+    if (input.disabled && state.mode === input.value) state.mode = "transfer";
   }
+  document.querySelectorAll("input[name=map]").forEach((input, i) => (input.checked = i === index));
   document.querySelectorAll("tbody tr").forEach((row, i) => row.setAttribute("aria-current", i === index));
   drawMatrix();
   paint();
@@ -486,8 +514,10 @@ function drawMatrix() {
   const end = largestEntry.toPrecision(2);
   byId("matrix-low").textContent = `−${end}`;
   byId("matrix-high").textContent = end;
-  const names = functional.pushforward ? ["target", "source"] : ["source", "target"];
-  byId("matrix-axes").textContent = `rows: ${names[0]}, columns: ${names[1]}`;
+  const [row, column] = functional.pushforward ? ["target", "source"] : ["source", "target"];
+  byId("matrix-axes").textContent =
+    `The map as a table: an entry says how strongly a vibration pattern of the ${row} (row) and a pattern of the ` +
+    `${column} (column) belong together. A good map between two poses of one body has its large entries near the diagonal.`;
 }
 
 function entryAt(event) {
@@ -507,13 +537,14 @@ function tellEntry() {
     ring.style.left = `${(100 * (entry.column + 0.5)) / matrix.width}%`;
     ring.style.top = `${(100 * (entry.row + 0.5)) / matrix.height}%`;
     const value = entry.value.toFixed(3).replace("-", "−");
-    const where = entry.known ? "" : " (not among those this page holds)";
-    say("entry", `C(${entry.row}, ${entry.column}) = ${value}: eigenfunction ${entry.x} of the source, ${entry.y} of the target${where}`);
+    const where = entry.known ? "" : " (which this page does not hold)";
+    say("entry", `Entry (${entry.row}, ${entry.column}) is ${value}: eigenfunction ${entry.x} of the source, ${entry.y} of the target${where}.`);
   } else say("entry", "Point at an entry to see its two eigenfunctions.");
 }
 
 function chooseEntry(entry, hovered = null) {
   Object.assign(state, { entry, hoveredEntry: hovered });
+  if (entry) lastEntry = entry;
   paint();
   tell();
   tellEntry();
@@ -541,7 +572,7 @@ function resetView() {
   untouched = true;
 }
 
-let leader = null; // the body that the other one follows just now
+let leader = null; // the body that the other body follows at the moment
 function follow(body) {
   draw();
   if (!byId("linked").checked || (leader && leader !== body)) return;
@@ -580,7 +611,7 @@ function onKey(body, event) {
   event.preventDefault();
 }
 
-// ---- What the user does
+// ---- Mouse, touch and keys
 
 for (const [side, body] of Object.entries(bodies)) {
   const { canvas, controls } = body;
@@ -595,7 +626,7 @@ for (const [side, body] of Object.entries(bodies)) {
     pin(side, body.vertexAt(event));
   });
 
-  let hovered = null; // the newest pointer position not yet looked at
+  let hovered = null; // the latest position of the pointer that has not been handled yet
   canvas.addEventListener("pointermove", (event) => {
     if (state.pinned || event.buttons || event.pointerType === "touch") return;
     if (!hovered) {
@@ -612,9 +643,8 @@ for (const [side, body] of Object.entries(bodies)) {
   });
 }
 
-// A click, also where the choice stays the same: it leaves eigenfunctions for what was shown before.
-for (const input of document.querySelectorAll("input[name=coloring]")) {
-  input.addEventListener("click", () => chooseColoring(input.value));
+for (const input of document.querySelectorAll("input[name=mode]")) {
+  input.addEventListener("click", () => chooseMode(input.value));
 }
 for (const input of document.querySelectorAll("input[name=map]")) {
   input.addEventListener("click", () => chooseMap(Number(input.value)));
@@ -644,7 +674,7 @@ matrix.addEventListener("keydown", (event) => {
     const step = event.shiftKey ? 10 : 1;
     const [row, column] = state.entry ?? [0, 0];
     const within = (index, size) => Math.max(0, Math.min(size - 1, index));
-    // The first key shows where one is.
+    // The first key only chooses the first entry.
     const [across, down] = state.entry ? move : [0, 0];
     chooseEntry([within(row + step * down, matrix.height), within(column + step * across, matrix.width)]);
   } else if (event.key === "Escape") chooseEntry(null);
@@ -660,25 +690,22 @@ byId("vertex").addEventListener("change", ({ target }) => {
   else if (target.reportValidity()) pin("x", target.valueAsNumber);
 });
 
-// Wide bodies one above the other on a narrow screen, tall ones side by side.
+// Narrow screens show wide bodies one above the other, and tall bodies side by side.
 document.body.dataset.shape = data.wide ? "wide" : "tall";
 
 const observer = new ResizeObserver(() => {
   for (const body of everyBody) body.resize();
   if (untouched) resetView();
-  // At once: resizing has emptied the canvas.
+  // Draw at once, because resizing has emptied the canvas.
   for (const body of everyBody) body.render();
 });
 for (const body of everyBody) observer.observe(body.canvas);
 
-// Some browsers remember choices over a reload.
-const chosen = (name) => document.querySelector(`input[name=${name}]:checked`)?.value;
-state.coloring = chosen("coloring");
 byId("filter").disabled = filters < 2;
 chooseFilter();
-chooseMap(Number(chosen("map") ?? 0));
+chooseMap(0);
 
-// For scripts and tests: mark a source vertex, see what is marked, what is shown, and where a vertex is in the
+// For scripts and tests: pick a source vertex, and read the state, the colours and the position of a vertex in the
 // window.
 window.jaxsmw = {
   pick: (vertex) => pin("x", vertex),
@@ -688,7 +715,8 @@ window.jaxsmw = {
     return { x: functions.x && Array.from(functions.x), y: functions.y && Array.from(functions.y) };
   },
   get state() {
-    const { map, coloring, filter, pinned, entry } = state;
-    return { source: bodies.x.marked, target: bodies.y.marked, map: maps[map].name, coloring, filter, pinned, entry };
+    const { map, filter, pinned, entry } = state;
+    const mode = shownMode();
+    return { source: bodies.x.marked, target: bodies.y.marked, map: maps[map].name, mode, filter, pinned, entry };
   },
 };

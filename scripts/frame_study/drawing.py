@@ -15,7 +15,8 @@ from jaxsmw import compute_spectrum
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.evaluation.journal import Row
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps, save_figure
-from jaxsmw.report.rendering import camera_axes, choose_azimuth, stand
+from jaxsmw.report.rendering import camera_axes, choose_azimuth
+from jaxsmw.report.standing import stand
 from jaxsmw.report.summary import draw_bank
 
 

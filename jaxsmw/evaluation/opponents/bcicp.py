@@ -87,7 +87,7 @@ class _Surface:
         """
         check_spectrum(mesh, spectrum)
         n = len(mesh.vertices)
-        on_surface = mesh.used_vertices & np.asarray(spectrum.mask)[:n]
+        on_surface = mesh.referenced_vertices & np.asarray(spectrum.mask)[:n]
         vertices, number = np.flatnonzero(on_surface), np.cumsum(on_surface) - 1
         positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
         edges = number[mesh.edges[on_surface[mesh.edges].all(axis=1)]]

@@ -1,0 +1,126 @@
+"""Bodies stand upright in pictures, whatever the convention of the file."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from report_helpers import TALL, ellipsoid, renumbered
+from synthetic import grid_mesh
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.creature import creature_pair
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.report.standing import guess_up, stand, stand_pair
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_stand_turns_the_named_axis_up(up: Any) -> None:
+    direction = {"x": 0, "y": 1, "z": 2}[up[-1]]
+    marked = replace(TALL, vertices=np.concatenate([TALL.vertices, np.zeros((3, 3)), np.eye(3)]))
+    standing = stand(marked, up)
+    frame = (standing.vertices[-3:] - standing.vertices[-6:-3]) * np.sqrt(TALL.area)
+    assert np.allclose(frame[direction], [0, -1 if up[0] == "-" else 1, 0])
+    assert np.linalg.det(frame) == pytest.approx(1)
+    assert standing.area == pytest.approx(1)
+    used = standing.vertices[: len(TALL.vertices)]
+    assert np.allclose(used.min(axis=0), -used.max(axis=0))
+
+
+# Rotations from y-up coordinates (x across the body, y up, z forward) to each convention.
+FROM_Y_UP = {
+    "y": np.eye(3),
+    "z": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "-y": np.diag([-1, -1, 1]),
+}
+
+
+def in_convention(mesh: Mesh, up: str) -> Mesh:
+    """The body of a y-up file, turned as in files of another convention."""
+    return replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[up].T)
+
+
+@pytest.mark.parametrize("up", ["y", "z", "-y"])
+@pytest.mark.parametrize("kind", ["biped", "quadruped"])
+def test_up_is_guessed_in_every_convention(kind: str, up: str) -> None:
+    pair = creature_pair(kind, vertices=1500)
+    for mesh in (pair.source, pair.target):
+        assert guess_up(in_convention(mesh, up)) == up
+
+
+def test_up_does_not_depend_on_vertex_numbers_units_or_unreferenced_vertices() -> None:
+    body = in_convention(creature_pair("quadruped", vertices=1500).source, "-y")
+    stray = np.concatenate([body.vertices, [[50.0, -9, 7]]])
+    for same in (
+        renumbered(body)[0],
+        replace(body, vertices=1e4 * body.vertices + [1e5, 0, -3e5]),
+        replace(body, vertices=stray),
+    ):
+        assert guess_up(same) == "-y"
+
+
+def test_bodies_without_limbs_stand_as_usual() -> None:
+    vertices, faces = grid_mesh(9, 9)
+    assert guess_up(Mesh(vertices, faces)) == "y"
+    assert guess_up(Mesh(vertices[:, [0, 2, 1]], faces)) == "z"
+    assert guess_up(Mesh(np.eye(3), np.array([[0, 1, 2]]))) == "z"
+    # A body that is slender along y is a person in a y-up file. Otherwise z is up.
+    person, animal = np.array([0.4, 1, 0.3]), np.array([0.3, 0.6, 1])
+    assert guess_up(ellipsoid(*person)) == "y" and guess_up(ellipsoid(*person[[0, 2, 1]])) == "z"
+    assert guess_up(ellipsoid(*animal[[0, 2, 1]])) == "z"
+
+
+@pytest.mark.parametrize(
+    ("name", "up"),
+    [
+        *((f"faust_r/off/tr_reg_{number}.off", "y") for number in ("002", "057", "069")),  # 057: on one leg
+        *((f"tosca_r/off/{name}.off", "z") for name in ("cat0", "cat6", "dog2", "centaur3", "michael8", "horse5")),
+        *((f"smal_r/off/{name}.off", "-y") for name in ("cow_alph", "fox-05", "hippo5", "lion6", "cougar")),
+        ("shrec19_r/off/10.off", "y"),
+        ("shrec19_r/off/16.off", "z"),
+        ("tosca_nonisometric/off/8_woman_02.off", "z"),
+    ],
+)  # fmt: skip
+def test_real_bodies_stand_upright(shared: Path, name: str, up: str) -> None:
+    assert guess_up(read_mesh(shared / "data" / name)) == up
+
+
+@pytest.mark.parametrize("up", ["y", "z", "-y"])
+def test_real_animals_stand_upright_in_every_convention(shared: Path, up: str) -> None:
+    for name in ("cat0", "dog0", "wolf0", "horse0", "horse6"):
+        mesh = read_mesh(shared / f"data/tosca_r/off/{name}.off")
+        y_up = replace(mesh, vertices=mesh.vertices @ FROM_Y_UP["z"])
+        assert guess_up(in_convention(y_up, up)) == up
+
+
+def test_stand_makes_faces_agree() -> None:
+    mixed = TALL.faces.copy()
+    mixed[::3] = mixed[::3, ::-1]
+    for faces in (TALL.faces, mixed):
+        standing = stand(replace(TALL, faces=faces))
+        outwards = np.einsum("ij,ij->i", standing.vertex_normals, standing.vertices)
+        assert np.all(outwards > 0) or np.all(outwards < 0)
+        assert np.array_equal(np.sort(standing.faces), np.sort(faces))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
+    with pytest.raises(InputError, match="nothing to draw"):
+        stand(replace(TALL, vertices=0 * TALL.vertices))
+    with pytest.raises(InputError, match="choose one of x, y, z"):
+        stand(TALL, "w")  # type: ignore[arg-type]
+
+
+def test_a_partial_shape_stays_small_beside_the_full_shape() -> None:
+    part = replace(TALL, faces=TALL.faces[TALL.vertices[TALL.faces, 1].min(axis=1) > 0])
+    assert part.area < 0.5 * TALL.area
+    whole = stand(TALL)
+    shown_part, shown_whole = stand_pair(part, TALL)
+    assert shown_whole.area == pytest.approx(1) and shown_part.area == pytest.approx(part.area / TALL.area)
+    assert np.array_equal(shown_whole.vertices, whole.vertices)
+    assert stand_pair(TALL, part)[0].area == pytest.approx(TALL.area / part.area)
+    # In another unit the full shape looks the same. A partial shape in millimetres counts as a full shape.
+    for other in (1.2, 1000.0):
+        assert stand_pair(replace(TALL, vertices=other * TALL.vertices), TALL)[0].area == pytest.approx(1)
