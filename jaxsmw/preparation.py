@@ -21,8 +21,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.initial_maps import InitialMap, initial_map
 from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage

@@ -1,4 +1,4 @@
-"""Many pairs at once give what each gives alone: padded, side by side, on several devices and processes."""
+"""Batches of pairs give the result of each pair alone: padded, on several devices, in several processes."""
 
 import os
 import socket
@@ -19,7 +19,8 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.runtime import batches as batch
-from jaxsmw.runtime.batches import bytes_per_pair, padded_size, refine_pairs, stack
+from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
+from jaxsmw.runtime.padding import padded_size
 
 SIZES = 150, 170, 260, 300
 PAIRS = [(0, 1), (1, 0), (2, 3), (0, 3), (1, 1), (0, 1), (3, 2)]
@@ -39,7 +40,7 @@ def test_padding_is_small_and_sizes_are_few(n):
     assert padded_size(padded) == padded
 
 
-def test_sixteen_sizes_serve_a_range_of_four():
+def test_seventeen_sizes_serve_a_range_of_four():
     assert len({padded_size(n) for n in range(4001, 16001)}) <= 17
 
 
@@ -53,7 +54,7 @@ def test_sixteen_sizes_serve_a_range_of_four():
     ],
     ids=["filtering", "least squares", "regularized"],
 )
-def test_every_pair_gets_what_it_gets_alone(refiner, pairs, batch_size):
+def test_every_pair_gets_the_result_that_it_gets_alone(refiner, pairs, batch_size):
     spectra, starts = make_problem()
     options = dict(refiner=refiner, iterations=3, history=True)
     found = dict(refine_pairs(spectra, PAIRS[:pairs], starts[:pairs], batch_size=batch_size, **options))
@@ -84,7 +85,7 @@ def test_samples_and_early_stop():
         np.testing.assert_array_equal(refined.pointwise_map, alone.pointwise_map)
 
 
-def test_a_failing_pair_does_not_touch_the_others():
+def test_a_failing_pair_does_not_affect_other_pairs():
     spectra, starts = make_problem()
     starts[3] = starts[3].at[5].set(-1)
     spectra[2] = eqx.tree_at(
@@ -126,7 +127,7 @@ def test_one_compilation_for_each_combination_of_sizes():
     assert len(traced) == len(combinations)
 
 
-def test_memory_picks_the_batch_size(monkeypatch):
+def test_memory_determines_the_batch_size(monkeypatch):
     spectra, starts = make_problem()
     sizes = []
     original = batch.compiled(batch._refine_batch)
@@ -145,7 +146,7 @@ def test_memory_picks_the_batch_size(monkeypatch):
 
 
 @pytest.mark.parametrize(("m", "n", "k"), [(2048, 2048, 50), (2048, 4096, 100), (1024, 1024, 20)])
-def test_memory_of_a_pair_is_about_what_the_compiler_says(m, n, k):
+def test_the_estimated_memory_of_a_pair_agrees_with_the_compiler(m, n, k):
     x, y = (random_spectrum(size, k, seed=size, dtype=np.float32) for size in (m, n))
     start = jnp.zeros(m, jnp.int32)
     batch_size = 4
@@ -158,11 +159,11 @@ def test_memory_of_a_pair_is_about_what_the_compiler_says(m, n, k):
     assert 0.5 < bytes_per_pair(m, n, k, 4) / used < 2
 
 
-def test_what_does_not_fit_together(monkeypatch):
-    # As users run it: checks of types at run time would forestall some sentences.
+def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
+    # Without the type checks of the tests, as for users, so that the sentences of the library appear.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     spectra, starts = make_problem()
-    with pytest.raises(ValueError, match="spectra are wanted, not str"):
+    with pytest.raises(ValueError, match="shape 0 is a str, but a Spectrum is needed"):
         refine_pairs(["cat.off"], [], [])
     with pytest.raises(ValueError, match="7 pairs and 6 initial maps"):
         refine_pairs(spectra, PAIRS, starts[:-1])
@@ -207,7 +208,7 @@ np.savez(
 
 
 def run_processes(output, count: int) -> None:
-    """The program in so many processes that share four devices."""
+    """Runs the program in several processes that share four devices."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
@@ -232,8 +233,8 @@ def run_processes(output, count: int) -> None:
 
 @pytest.mark.parametrize("processes", [1, 2])
 @pytest.mark.cluster
-def test_four_devices_give_what_one_gives(tmp_path, processes):
-    """Forced host devices, of one process or of two that find each other over the network."""
+def test_four_devices_give_the_results_of_one(tmp_path, processes):
+    """The host devices belong to one process, or to two processes connected by the network."""
     spectra, starts = make_problem()
     one = dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))
     run_processes(tmp_path / "results", processes)

@@ -406,7 +406,7 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
 
 def test_a_benchmark_leaves_the_calling_process_as_it_is(measure, monkeypatch):
     """Environment, listeners and compiled programs stay, though measuring would release programs in a worker."""
-    monkeypatch.setattr("jaxsmw.runtime.compilation._GOOD_PART", 0.0)
+    monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
     double = jax.jit(lambda x: 2 * x)
     double(1.0)
     environment, listeners = dict(os.environ), list(monitoring.get_event_duration_listeners())

@@ -1,4 +1,4 @@
-"""Compiler options: what they change, where they are known, and where they are not."""
+"""Compiler options and compilation ahead of time."""
 
 import logging
 from concurrent.futures import wait
@@ -21,14 +21,14 @@ def points():
     return tuple(jnp.asarray(generator.normal(size=(size, 12)).astype(np.float32)) for size in (300, 400))
 
 
-def test_the_library_for_products_is_left_out(points):
+def test_the_options_remove_the_library_for_products(points):
     plain, ours = (
         jax.jit(nearest_neighbor, compiler_options=options).lower(*points).compile().as_text()
         for options in ({}, compiler_options())
     )
     assert "__ynn_fusion" not in ours or not compiler_options()
     if jax.default_backend() == "cpu" and jax.__version_info__[:2] == (0, 10):
-        # The version that this was measured with.
+        # The option was measured with this version.
         assert "__ynn_fusion" in plain and compiler_options()
 
 
@@ -46,7 +46,7 @@ def test_sums_are_one_loop_and_nearly_as_exact():
     np.testing.assert_allclose(program(values), values.astype(np.float64).sum(axis=0), rtol=1e-5)
 
 
-def test_compiled_gives_the_same_and_once(points):
+def test_compiled_functions_are_traced_once_and_give_the_same(points):
     traced = []
 
     def search(queries, database, *, reverse):
@@ -62,7 +62,7 @@ def test_compiled_gives_the_same_and_once(points):
 
 
 @pytest.mark.parametrize("x64", [False, True])
-def test_what_was_compiled_ahead_is_not_compiled_again(caplog, x64):
+def test_a_program_that_was_compiled_ahead_is_not_compiled_again(caplog, x64):
     def total(values, *, weights, power):
         return jnp.sum(weights * values**power)
 
@@ -77,7 +77,7 @@ def test_what_was_compiled_ahead_is_not_compiled_again(caplog, x64):
             assert "XLA compilation of jit(total)" in caplog.text
 
 
-def test_what_cannot_be_compiled_ahead_is_left_for_the_call_to_say(points):
+def test_the_call_raises_the_errors_of_compiling_ahead(points):
     def refusing(queries):
         raise ValueError("no such search")
 
@@ -87,7 +87,7 @@ def test_what_cannot_be_compiled_ahead_is_left_for_the_call_to_say(points):
         compiled(refusing)(points[0])
 
 
-def test_no_options_where_there_are_none(monkeypatch):
+def test_unknown_options_are_omitted(monkeypatch):
     assert compilation._options_for("gpu") == {}
     known = "xla_disable_hlo_passes"
     monkeypatch.setattr(compilation, "_OPTIONS", {"xla_cpu_no_such_option": "", known: "dce"})
@@ -98,13 +98,13 @@ def test_no_options_where_there_are_none(monkeypatch):
         compilation._options_for.cache_clear()
 
 
-def test_what_is_done_to_options_stays_there():
+def test_changes_to_the_returned_options_have_no_effect():
     compiler_options()["xla_something"] = True
     assert "xla_something" not in compiler_options()
 
 
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory maps are looked at on Linux only")
-def test_programs_are_released_when_they_take_too_much(monkeypatch):
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory maps are counted on Linux only")
+def test_programs_are_released_when_they_use_many_memory_maps(monkeypatch):
     traced = []
 
     def total(values):
@@ -112,7 +112,7 @@ def test_programs_are_released_when_they_take_too_much(monkeypatch):
         return jnp.sum(values)
 
     for part, times in ((0.25, 1), (0.0, 2), (0.25, 2)):
-        monkeypatch.setattr(compilation, "_GOOD_PART", part)
+        monkeypatch.setattr(compilation, "_LARGEST_SHARE", part)
         compiled(total)(jnp.zeros(7))
         release_programs()
         compiled(total)(jnp.zeros(7))

@@ -36,7 +36,7 @@ def bodies() -> tuple[Mesh, Mesh]:
 
 @pytest.fixture(scope="module")
 def spectra(bodies) -> tuple[Spectrum, Spectrum]:
-    return jaxsmw.paired_spectra(*bodies, K)
+    return jaxsmw.paired_spectra(jaxsmw.Pair(*bodies), K)
 
 
 @pytest.fixture(scope="module")

@@ -100,7 +100,7 @@ def test_squares_sum_to_one(make, filters, lambda_max, seed):
 
 
 @pytest.mark.parametrize("make", PARSEVAL_OF_ANY_SIZE.values(), ids=PARSEVAL_OF_ANY_SIZE.keys())
-def test_more_filters_than_single_precision_has_octaves(make):
+def test_banks_with_more_filters_than_float32_has_octaves(make):
     eigenvalues = spectrum().astype(jnp.float32)
     np.testing.assert_allclose(frame_function(sample(make(200), eigenvalues, eigenvalues)), 1, atol=1e-5)
 
@@ -293,7 +293,7 @@ def test_warps_are_monotone(warp):
 
 
 @pytest.mark.parametrize("bank", [HalfCosine(), Itersine(), CubicSpline()])
-def test_the_distribution_forgets_the_spacing_of_eigenvalues(bank):
+def test_the_spectral_distribution_removes_the_spacing_of_eigenvalues(bank):
     eigenvalues = spectrum()
     adapted = Warped(bank, SpectralDistribution())
     responses = adapted(eigenvalues, eigenvalues)
@@ -303,7 +303,7 @@ def test_the_distribution_forgets_the_spacing_of_eigenvalues(bank):
     np.testing.assert_allclose(bank(evenly, evenly), responses, atol=1e-12)
 
 
-def test_the_distribution_gives_bands_equally_many_eigenvalues():
+def test_the_spectral_distribution_gives_bands_equal_numbers_of_eigenvalues():
     eigenvalues = spectrum(k=101) ** 2
     adapted = Warped(Itersine(), SpectralDistribution())(eigenvalues, eigenvalues)
     np.testing.assert_allclose(frame_function(adapted.T), [10.5, 20, 20, 20, 20, 10.5], atol=1e-10)
@@ -312,7 +312,7 @@ def test_the_distribution_gives_bands_equally_many_eigenvalues():
 
 
 def test_repeated_eigenvalues_are_filtered_alike():
-    # Three components, and the multiplicities of a sphere.
+    # The spectrum of a sphere with its multiplicities, and two more components.
     degrees = np.arange(8)
     exact = np.concatenate([[0, 0], np.repeat(degrees * (degrees + 1.0), 2 * degrees + 1)])
     noisy = np.sort(exact + 1e-9 * np.random.default_rng(0).uniform(size=exact.size))

@@ -69,7 +69,7 @@ def test_bounds_are_the_extrema_at_the_eigenvalues_or_on_the_interval():
 
 
 @pytest.mark.parametrize("bank", [CubicSpline(8), MexicanHat(8), Gabor(8), Heat([1, 10, 50])])
-def test_the_default_resolution_is_as_fine_as_it_says(bank):
+def test_the_default_resolution_is_as_fine_as_documented(bank):
     coarse = frame_bounds(bank, EIGENVALUES, over="interval")
     fine = frame_bounds(bank, EIGENVALUES, over="interval", resolution=100_001)
     np.testing.assert_allclose(coarse, fine, rtol=1e-5)
@@ -89,8 +89,8 @@ def test_bounds_are_traced_and_keep_the_precision():
     ("options", "message"),
     [({"over": "graph"}, "eigenvalues"), ({"over": "interval", "resolution": 1}, "at least 2")],
 )
-def test_hostile_options_are_refused(options, message):
-    # In the tests the type check is the first to refuse a word that is neither.
+def test_invalid_options_are_refused(options, message):
+    # In the tests the type check refuses an unknown word before the function does.
     with pytest.raises((ValueError, TypeError), match=message):
         frame_bounds(Meyer(), EIGENVALUES, **options)
 
@@ -108,7 +108,7 @@ def test_tightened_banks_are_parseval_and_proportional(bank):
 @pytest.mark.parametrize(
     "bank", [Meyer(), Itersine(overlap=4), HalfCosine(), Identity(), tighten(CubicSpline())]
 )
-def test_tightening_leaves_a_parseval_bank_as_it_is(bank):
+def test_tightening_does_not_change_a_parseval_bank(bank):
     expected = bank(EIGENVALUES, EIGENVALUES)
     np.testing.assert_allclose(tighten(bank)(EIGENVALUES, EIGENVALUES), expected, atol=1e-14)
 
@@ -127,14 +127,14 @@ def test_tightened_banks_are_pytrees_and_differentiable():
     )
 
 
-def test_nothing_is_made_of_a_vanishing_frame_function():
+def test_tightened_responses_vanish_with_the_frame_function():
     bank = LowPass(0.25)
     responses = tighten(bank)(EIGENVALUES, EIGENVALUES)
     passed = np.asarray(EIGENVALUES) < 0.49 * float(EIGENVALUES[-1])
     np.testing.assert_allclose(responses[0, passed], 1, atol=1e-15)
     slopes = jax.grad(lambda b, e: jnp.sum(tighten(b)(e, e)), argnums=(0, 1))(bank, EIGENVALUES)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
-    # So narrow that all but the centres underflow; the squares do long before.
+    # These filters underflow everywhere but near their centres. Their squares underflow much earlier.
     narrow = Gabor(3, 0.007)
     points = jnp.asarray([0.0, 0.25, 0.3, 0.4, 0.49, 1.0])
     plain, tight = narrow(points, points), tighten(narrow)(points, points)
@@ -154,14 +154,14 @@ class Constant(FilterBank):
         return jnp.full((2, len(points)), self.value)
 
 
-def test_tightening_does_not_hide_what_is_not_a_number():
+def test_tightening_does_not_hide_nan():
     bank = Constant(jnp.asarray(jnp.nan))
     assert np.isnan(tighten(bank)(EIGENVALUES, EIGENVALUES)).all()
     assert np.isnan(frame_bounds(tighten(bank), EIGENVALUES)).all()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_low_pass_filter_stays_one(dtype):
+def test_a_tightened_low_pass_filter_still_stops_high_eigenvalues(dtype):
     eigenvalues = EIGENVALUES.astype(dtype)
     for bank in (LowPass(), tighten(LowPass())):
         assert frame_bounds(bank, eigenvalues).lower == 0

@@ -10,7 +10,7 @@ from jaxsmw.core.pointwise_map import (
     search_patches,
     spectral_embeddings,
 )
-from jaxsmw.core.refiner import Problem
+from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 
 
@@ -24,14 +24,14 @@ def test_decode_finds_the_nearest_and_the_objective_is_their_distance(convention
     distances = cdist(queries, database) ** 2
     np.testing.assert_array_equal(t, distances.argmin(axis=1))
     refiner = WaveletPreservation(convention=convention)
-    problem = refiner.prepare(Problem(x, y))
-    objective = refiner.objective(problem, functional_map, t)
+    prepared, state = refiner.prepare(Problem(x, y)), State(functional_map)
+    objective = refiner.objective(prepared, state, t)
     np.testing.assert_allclose(objective, np.asarray(x.vertex_areas) @ distances.min(axis=1), rtol=1e-10)
-    worse = refiner.objective(problem, functional_map, t.at[0].set((t[0] + 1) % 30))
+    worse = refiner.objective(prepared, state, t.at[0].set((t[0] + 1) % 30))
     assert worse > objective
 
 
-def test_decode_in_patches_is_the_same():
+def test_decode_with_patches_gives_the_same_map():
     x, y = random_spectrum(200, 30, seed=1), random_spectrum(180, 30, seed=2).pad(256)
     functional_map = jnp.asarray(np.random.default_rng(0).normal(size=(30, 30)))
     for convention in ("pullback", "pushforward"):

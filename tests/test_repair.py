@@ -20,7 +20,7 @@ from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import distortion
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.report.summary import summarize
-from jaxsmw.runtime import batches
+from jaxsmw.runtime import padding
 from jaxsmw.stage import Stage
 
 LEVELS = (20, 20, 40, 40)
@@ -73,7 +73,7 @@ def test_swapped_limbs_are_repaired(body, swapped):
 def test_padding_changes_nothing(body, swapped, monkeypatch):
     _, found = outcome(body, swapped)
     n = len(swapped)
-    padded_size = batches.padded_size
+    padded_size = padding.padded_size
     monkeypatch.setattr("jaxsmw.preparation.padded_size", lambda size: padded_size(size) + 20)
     _, more = outcome(body, swapped)
     assert more.pointwise_map.shape[0] == found.pointwise_map.shape[0] + 20

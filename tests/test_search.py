@@ -82,7 +82,7 @@ def test_padding_changes_nothing():
 
 
 def test_float32_finds_the_same_far_from_the_origin():
-    """Scores lose digits where norms are large against distances; the exact second look makes up for it."""
+    """Scores lose digits if norms are large compared to distances. True distances of two candidates help."""
     generator = np.random.default_rng(0)
     database = generator.normal(size=(1000, 10)) + 20
     queries = database[generator.permutation(1000)] + 1e-3 * generator.normal(size=(1000, 10))
@@ -102,7 +102,7 @@ def test_vmap_equals_a_loop():
 
 
 def test_search_never_stores_all_distances():
-    """50 000 x 50 000 distances would take 10 GB in float32; the compiled program has to do with 1/50."""
+    """All 50 000 x 50 000 distances would take 10 GB in float32. The program uses less than 1/50 of that."""
     points = jax.ShapeDtypeStruct((50_000, 100), jnp.float32)
     memory = jax.jit(nearest_neighbor).lower(points, points).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 200e6
@@ -119,21 +119,21 @@ def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_
 @pytest.mark.parametrize(
     ("m", "n", "d"), [(1, 1, 1), (3, 50, 2), (50, 3, 30), (130, 210, 5), (300, 300, 1), (257, 500, 20)]
 )
-def test_patches_find_the_same_anywhere(m, n, d):
-    """Also where they have nothing to leave out: points spread evenly in all dimensions."""
+def test_patches_find_the_same_for_random_points(m, n, d):
+    """No patch can be skipped for points that are spread evenly in all dimensions."""
     check_against_brute_force(in_patches, m, n, d, draws=5)
 
 
 @pytest.fixture(scope="module")
 def embedding():
-    """A surface in 30 dimensions, as functional maps search it."""
+    """The spectral embedding of a surface in 30 dimensions."""
     return compute_spectrum(bumpy_mesh(4), 30).eigenvectors
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
 def test_patches_find_the_same_on_surfaces(embedding, dtype, noise):
-    """A good map, a poor one, and none at all; ties in 0.0 are between vertices that are the same."""
+    """The noise gives a perfect map, a poor map and a random map."""
     generator = np.random.default_rng(0)
     turned, _ = np.linalg.qr(np.eye(30) + noise * generator.normal(size=(30, 30)) / np.sqrt(30))
     database = jnp.asarray(embedding @ (turned * generator.uniform(0.1, 1, 30)), dtype)
@@ -147,7 +147,7 @@ def test_patches_find_the_same_on_surfaces(embedding, dtype, noise):
     np.testing.assert_allclose(*exact, rtol=1e-6 if dtype == jnp.float32 else 1e-13)
 
 
-def test_patches_are_of_all_points_and_of_equal_size(embedding):
+def test_patches_contain_all_points_and_have_equal_sizes(embedding):
     mask = jnp.asarray(np.random.default_rng(0).random(len(embedding)) < 0.9)
     patches = make_patches(embedding, mask, size=40, rank=4)
     assert patches.rows.shape[1] == -(-2562 // patches.rows.shape[0]) and 28 <= patches.rows.shape[1] <= 57
@@ -158,7 +158,7 @@ def test_patches_are_of_all_points_and_of_equal_size(embedding):
         assert not valid.any() or jnp.var(embedding[rows[valid]][:, :6], axis=0).sum() < 0.3 * everywhere
 
 
-def test_patches_leave_out_what_is_masked(embedding):
+def test_patches_ignore_masked_points(embedding):
     generator = np.random.default_rng(0)
     query_mask, database_mask = (jnp.asarray(generator.random(2562) < 0.5) for _ in range(2))
     found = in_patches(embedding, embedding, query_mask=query_mask, database_mask=database_mask)
@@ -166,8 +166,8 @@ def test_patches_leave_out_what_is_masked(embedding):
     np.testing.assert_array_equal(found[query_mask], wanted[query_mask])
 
 
-def test_patches_break_ties_like_all_with_all(embedding):
-    """Every point twice, far apart in the order of rows."""
+def test_patches_break_ties_like_the_exhaustive_search(embedding):
+    """Every point occurs twice, far apart in the order of rows."""
     twice = jnp.concatenate([embedding, embedding])
     np.testing.assert_array_equal(in_patches(embedding, twice, size=64), jnp.arange(2562))
 
@@ -178,7 +178,7 @@ def test_patches_under_vmap(embedding):
     np.testing.assert_array_equal(jax.vmap(in_patches, (None, 0))(embedding, turned), jnp.stack(looped))
 
 
-def test_patches_save_most_of_the_work(embedding):
+def test_most_patches_are_skipped(embedding):
     for scales, most in ((jnp.ones(30), 0.15), (jnp.linspace(1, 0.1, 30), 0.3)):
         ones = jnp.ones(2562, bool)
         queries, database = (make_patches(embedding, ones, size=size, rank=4) for size in (100, 20))

@@ -1,4 +1,4 @@
-"""Sinkhorn's iterations, against dense ones and what must hold."""
+"""Sinkhorn's iterations, compared with dense iterations, and their invariances."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ compiled = jax.jit(sinkhorn, static_argnames="iterations")
 
 
 def points(m=150, n=170, d=4, seed=0, dtype=np.float64):
-    """Two point sets and areas; m is more than one block."""
+    """Returns two point sets and their areas; m is more than one block of queries."""
     generator = np.random.default_rng(seed)
     queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
     areas = {
@@ -25,7 +25,7 @@ def points(m=150, n=170, d=4, seed=0, dtype=np.float64):
 
 
 def plan(soft: SoftMap) -> np.ndarray:
-    """All of it: each row is what a query gets of the database rows' own functions, times its area."""
+    """Returns the dense transport plan of a soft map."""
     n = len(soft.database)
     return np.asarray(soft.query_areas)[:, None] * np.asarray(soft.pull_back(jnp.eye(n)))
 
@@ -57,7 +57,7 @@ def test_agrees_with_dense_iterations():
 
 
 @pytest.mark.parametrize("iterations", [1, 5])
-def test_the_residual_is_what_columns_lack(iterations):
+def test_the_residual_is_the_error_of_the_columns(iterations):
     (queries, database), areas = points()
     soft = compiled(queries, database, **areas, temperature=0.2, iterations=iterations, tolerance=1e-6)
     assert not soft.converged and soft.iterations == iterations
@@ -65,7 +65,7 @@ def test_the_residual_is_what_columns_lack(iterations):
     assert float(soft.residual) == pytest.approx(np.abs(columns - np.asarray(soft.database_areas)).sum() / 2)
 
 
-def test_costs_hardly_more_than_the_best_assignment():
+def test_the_cost_is_close_to_that_of_the_best_assignment():
     (queries, database), _ = points(40, 40, 2)
     areas = {"query_areas": jnp.ones(40), "database_areas": jnp.ones(40)}
     soft = compiled(queries, database, **areas, temperature=0.2, iterations=20000, tolerance=1e-4)
@@ -73,7 +73,7 @@ def test_costs_hardly_more_than_the_best_assignment():
     distances = cdist(queries, database, "sqeuclidean")
     least = distances[linear_sum_assignment(distances)].mean()
     more = np.sum(plan(soft) * distances) - least
-    # No plan of these marginals costs less, and entropy, which is weighed against costs, is at most log 40.
+    # No plan with these marginals costs less. The entropy, which competes with the cost, is at most log 40.
     assert -1e-4 * distances.max() < more < float(soft.temperature) * np.log(40) < 0.4 * least
 
 
@@ -110,7 +110,7 @@ def test_neither_numbering_nor_signs_nor_units_matter():
     np.testing.assert_array_equal(q[np.asarray(other.pointwise_map())], np.asarray(soft.pointwise_map())[p])
 
 
-def test_vmap_is_one_after_the_other():
+def test_vmap_equals_a_loop():
     pairs = [points(seed=seed) for seed in range(3)]
     stacked, areas = jax.tree.map(lambda *each: jnp.stack(each), *pairs)
 
@@ -120,7 +120,7 @@ def test_vmap_is_one_after_the_other():
 
     together = jax.jit(jax.vmap(run))(stacked, areas)
     alone = [jax.jit(run)(*pair) for pair in pairs]
-    assert len({int(soft.iterations) for soft, _, _ in alone}) > 1  # each stops where it would alone
+    assert len({int(soft.iterations) for soft, _, _ in alone}) > 1  # each pair stops where it stops alone
     for found, expected in zip(
         jax.tree.leaves(together), zip(*map(jax.tree.leaves, alone), strict=True), strict=True
     ):
@@ -140,7 +140,7 @@ def test_compiles_once_for_all_temperatures_and_tolerances():
     assert len(traces) == 1
 
 
-def test_derivatives_are_those_of_differences():
+def test_derivatives_agree_with_finite_differences():
     (queries, database), areas = points(30, 25, 3)
     areas["query_areas"] = areas["query_areas"].at[3].set(0)
     areas["database_areas"] = areas["database_areas"].at[:2].set(0)
@@ -162,7 +162,7 @@ def test_derivatives_are_those_of_differences():
 
 
 def test_degenerate_points():
-    """One vertex on either side, all in one place, each met exactly, and every distance the same."""
+    """The cases are single points, coinciding points, exact matches, and equal distances."""
     one, three = jnp.zeros((1, 2)), jnp.asarray([[0.0, 0], [1, 0], [0, 1]])
     for queries, database in (
         (one, one),
@@ -180,8 +180,8 @@ def test_degenerate_points():
         np.testing.assert_allclose(plan(soft).sum(axis=0), 1 / n, atol=0.02 / n)
 
 
-def test_rows_that_nothing_would_reach_get_their_share():
-    """In float32, a row so far away that its share of every query is zero at first."""
+def test_distant_rows_get_their_share():
+    """The share of a distant row underflows to zero in the first iterations in float32."""
     (queries, database), _ = points(60, 60, 2, dtype=np.float32)
     database, ones = database.at[0].set(10.0), jnp.ones(60, jnp.float32)
     soft = compiled(
@@ -189,10 +189,10 @@ def test_rows_that_nothing_would_reach_get_their_share():
     )
     assert soft.potentials.dtype == jnp.float32
     assert soft.converged, float(soft.residual)
-    assert soft.potentials[0] > 200  # of which float32 has no exponential
+    assert soft.potentials[0] > 200  # its exponential overflows in float32
 
 
-def test_numbers_that_went_wrong_do_not_pass_for_convergence():
+def test_nan_is_not_reported_as_convergence():
     (queries, database), areas = points(20, 20)
     broken = queries.at[0, 0].set(jnp.nan)
     assert not compiled(broken, database, **areas, iterations=5).converged
@@ -202,7 +202,7 @@ def test_numbers_that_went_wrong_do_not_pass_for_convergence():
 
 
 @pytest.mark.parametrize("what", ["map", "gradient"])
-def test_nothing_of_all_queries_and_rows_is_stored(what):
+def test_no_array_of_all_queries_and_rows_is_stored(what):
     m, n, d = 6000, 5000, 20
     shapes = [jax.ShapeDtypeStruct(s, jnp.float32) for s in ((m, d), (n, d), (m,), (n,))]
 

@@ -1,4 +1,4 @@
-"""Soft recoveries and the loop that can be differentiated: limits, derivatives, memory, what is reported."""
+"""Soft recoveries and differentiable refinement: limits, derivatives, memory and reported failures."""
 
 import equinox as eqx
 import jax
@@ -20,13 +20,13 @@ from jaxsmw.core.solutions import DescriptorPair, Filtering, LeastSquares, Regul
 from jaxsmw.core.spectrum import Spectrum
 
 M, K = 120, 8
-# High, as vertices of random spectra are far from each other.
+# These temperatures are high because the vertices of random spectra are far from each other.
 RECOVERIES = {"softmax": Softmax(10.0), "few": NearestFew(5, 10.0), "sinkhorn": Sinkhorn(10.0, 6)}
 
 
 @pytest.fixture(scope="module")
 def pair():
-    """A shape, a shuffled and disturbed copy, and a start with a third of it wrong."""
+    """A shape, a shuffled and disturbed copy, and an initial map with a third of its matches wrong."""
     generator = np.random.default_rng(0)
     x = random_spectrum(M, K)
     order = generator.permutation(M)
@@ -45,11 +45,11 @@ def points(m=150, n=140, d=4):
 
 
 def dense(recovery: Recovery, queries, database, a, b):
-    """Rows of shares."""
+    """Returns the shares of all queries as a dense matrix."""
     return np.asarray(recovery(queries, database, a, b).pull_back(jnp.eye(database.shape[0])))
 
 
-def test_softmax_is_what_it_says():
+def test_softmax_follows_its_definition():
     queries, database, a, b = points()
     distances = cdist(queries, database, "sqeuclidean")
     a_, b_ = np.asarray(a / a.sum()), np.asarray(b / b.sum())
@@ -57,7 +57,7 @@ def test_softmax_is_what_it_says():
     expected = b_ * np.exp(-distances / temperature)
     expected /= expected.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(Softmax(0.7), queries, database, a, b), expected, atol=1e-12)
-    # Among few: the same, where the others are left out.
+    # NearestFew gives the same shares after all but the nearest rows are removed.
     few = np.where(distances <= np.sort(distances, axis=1)[:, 4:5], expected, 0)
     few /= few.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(NearestFew(5, 0.7), queries, database, a, b), few, atol=1e-12)
@@ -65,11 +65,11 @@ def test_softmax_is_what_it_says():
     np.testing.assert_array_equal(found.pointwise_map(), distances.argmin(axis=1))
     np.testing.assert_allclose(
         dense(NearestFew(1000, 0.7), queries, database, a, b), expected, atol=1e-12
-    )  # as many as there are
+    )  # more than there are rows
 
 
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
-def test_rows_of_no_area_get_nothing_and_change_nothing(recovery):
+def test_rows_without_area_get_no_share_and_change_no_share(recovery):
     queries, database, a, b = points()
     padded = jnp.concatenate([database, queries[:7]]), jnp.concatenate([b, jnp.zeros(7)])
     shares = dense(recovery, queries, padded[0], a, padded[1])
@@ -77,7 +77,7 @@ def test_rows_of_no_area_get_nothing_and_change_nothing(recovery):
     np.testing.assert_allclose(shares[:, :-7], dense(recovery, queries, database, a, b), atol=1e-12)
 
 
-def test_fewer_of_positive_area_than_asked_for():
+def test_fewer_rows_with_area_than_requested():
     queries, database, a, b = points(n=9)
     b = b.at[3:].set(0)
     shares = dense(NearestFew(5), queries, database, a, b)
@@ -111,7 +111,7 @@ def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
 
 
 def leaves_and_directions(pair):
-    """What derivatives are taken in, and one direction in each."""
+    """Returns the variables of the derivatives, and one direction in each variable."""
     x, y, _ = pair
     leaves = {
         "eigenvalues of X": x.eigenvalues,
@@ -160,7 +160,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_derivatives_are_those_of_finite_differences(pair, case):
+def test_derivatives_agree_with_finite_differences(pair, case):
     recovery, solution, differentiation = case
     leaves, directions = leaves_and_directions(pair)
     implicit = differentiation == "implicit"
@@ -191,7 +191,7 @@ def test_derivatives_are_those_of_finite_differences(pair, case):
         )
 
 
-def test_all_ways_agree_at_a_fixed_point(pair):
+def test_all_kinds_of_differentiation_agree_at_a_fixed_point(pair):
     leaves, _ = leaves_and_directions(pair)
 
     def gradient(differentiation):
@@ -214,16 +214,12 @@ def test_all_ways_agree_at_a_fixed_point(pair):
         assert outcome.result == RESULTS.successful and outcome.change < 1e-9
         for name, leaf in found.items():
             expected = gradients["unrolled"][0][name]
-            (
-                np.testing.assert_allclose(
-                    leaf, expected, atol=1e-7 * float(jnp.abs(expected).max()) + 1e-10
-                ),
-                way,
-            )
+            tolerance = 1e-7 * float(jnp.abs(expected).max()) + 1e-10
+            np.testing.assert_allclose(leaf, expected, atol=tolerance, err_msg=f"{way}, {name}")
     assert gradients["implicit"][1].iterations < 60 == gradients["unrolled"][1].iterations
 
 
-def test_not_coming_to_rest_is_named(pair):
+def test_a_missing_fixed_point_is_reported(pair):
     x, y, start = pair
     few = refine_softly(
         x, y, start, recovery=Softmax(10.0), iterations=2, differentiation="implicit", tolerance=1e-9
@@ -231,7 +227,7 @@ def test_not_coming_to_rest_is_named(pair):
     assert few.result == RESULTS.fixed_point_not_reached
 
 
-def test_what_is_not_at_rest_has_no_derivative(pair):
+def test_there_is_no_implicit_derivative_without_a_fixed_point(pair):
     x, y, start = pair
 
     def loss(temperature, iterations):
@@ -253,7 +249,7 @@ def test_what_is_not_at_rest_has_no_derivative(pair):
     np.testing.assert_allclose(tangent, gradient, rtol=1e-2)
 
 
-def test_the_start_has_a_derivative(pair):
+def test_a_soft_initial_map_has_a_derivative(pair):
     x, y, _ = pair
 
     def loss(features):
@@ -264,7 +260,7 @@ def test_the_start_has_a_derivative(pair):
 
 
 def test_the_layer_learns_features_that_match(pair):
-    """From features of chance to such as tell the shapes' vertices apart, by gradients through the layer."""
+    """Gradient descent through the layer turns random features into features that match."""
     x, y, _ = pair
     truth = jnp.argmin(jnp.sum((x.eigenvectors[:, None] - y.eigenvectors[None]) ** 2, axis=2), axis=1)
     layer = WaveletPreservationLayer(recovery_of_features=Softmax(1.0), recovery=Softmax(10.0), iterations=1)
@@ -283,16 +279,16 @@ def test_the_layer_learns_features_that_match(pair):
         (now, outcome), gradient = descend(weights)
         weights -= 0.2 * gradient / jnp.linalg.norm(gradient)
     assert outcome.result == RESULTS.successful and now < 0.1 * first
-    # Its leaves are what can be trained.
+    # The leaves of the layer are its trainable parameters: two temperatures.
     assert len(jax.tree.leaves(layer)) == 2
 
 
-def test_the_layer_is_a_function_for_models_of_any_library(pair):
+def test_models_of_any_library_can_use_the_layer(pair):
     x, y, _ = pair
     layer = WaveletPreservationLayer(recovery_of_features=Softmax(10.0), recovery=Softmax(10.0), iterations=1)
 
     def apply(parameters, inputs):
-        """As flax's modules have it: a pure function of nested dictionaries."""
+        """Applies a linear layer in the style of flax: a pure function of nested dictionaries."""
         return inputs @ parameters["params"]["kernel"]
 
     def loss(parameters, layer):
@@ -305,7 +301,7 @@ def test_the_layer_is_a_function_for_models_of_any_library(pair):
     assert beside == pytest.approx(float(inside))
     np.testing.assert_allclose(slope["params"]["kernel"], slopes["params"]["kernel"])
     assert 0 < float(jnp.abs(slope["params"]["kernel"]).max()) < float("inf")
-    # As one of the parameters, what it is made of is learned, too.
+    # As a parameter, the layer is learned, too.
     assert 0 < abs(float(slopes["layer"].recovery.temperature)) < float("inf")
 
 
@@ -378,17 +374,17 @@ def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differen
     assert program.compile().memory_analysis().temp_size_in_bytes < n * n * 4 / 3
 
 
-def test_what_went_wrong_is_named(pair):
+def test_failures_are_reported(pair):
     x, y, start = pair
     damaged = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors.at[3, 2].set(jnp.nan))
     assert refine_softly(x, damaged, start).result == RESULTS.nonfinite_spectrum
-    for nowhere in (start.at[0].set(M), -jnp.ones_like(start)):  # the latter is what a failure gives
+    for nowhere in (start.at[0].set(M), -jnp.ones_like(start)):  # a failed refinement returns the latter
         assert refine_softly(x, y, nowhere).result == RESULTS.invalid_initial_map
     few = NearestFew(3)(x.eigenvectors, y.eigenvectors, x.vertex_areas, y.vertex_areas)
     assert refine_softly(x, y, few).result == RESULTS.successful
     elsewhere = eqx.tree_at(lambda t: t.rows, few, few.rows.at[4, 2].set(M))
     assert refine_softly(x, y, elsewhere).result == RESULTS.invalid_initial_map
-    # As a step of training may make it.
+    # A training step can produce a negative temperature.
     below_zero = eqx.tree_at(lambda r: r.temperature, Softmax(), jnp.asarray(-0.1))
     assert refine_softly(x, y, start, recovery=below_zero).result == RESULTS.nonfinite_functional_map
 
@@ -413,7 +409,7 @@ def test_functions_of_another_shape_are_refused(pair):
             found.pull_back(y.eigenvectors[:, 0])
 
 
-def test_settings_that_do_not_exist(pair):
+def test_invalid_arguments_are_refused(pair):
     x, y, start = pair
     with pytest.raises(ValueError, match="positive tolerance, not 0"):
         refine_softly(x, y, start, tolerance=0.0)
@@ -440,7 +436,7 @@ def test_settings_that_do_not_exist(pair):
 
 
 @pytest.mark.parametrize("loop", [refine, refine_softly])
-def test_iterations_are_any_integer_and_nothing_else(pair, loop):
+def test_iterations_must_be_an_integer(pair, loop):
     x, y, start = pair
     two = loop(x, y, start, iterations=2)
     for integer in (np.int64(2), np.uint8(2), jnp.asarray(2)):
@@ -469,7 +465,7 @@ def test_the_coldest_temperatures_have_derivatives(pair, kind, dtype):
 
     differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
     one = jnp.asarray(1, dtype)
-    # All of them nearest neighbours: the map does not change, but with what it is multiplied by.
+    # At these temperatures all maps are nearest neighbours, so that only the factor changes the result.
     value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
     for temperature in (1e-12, 1e-30, 1e-37):
         found, (in_temperature, in_stretch) = differentiate(jnp.asarray(temperature), one)

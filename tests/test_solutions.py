@@ -1,4 +1,4 @@
-"""Ways to a functional map: what they minimise, what they must not depend on, and how they fail."""
+"""Solutions: the energies that they minimise, their invariances, and their failures."""
 
 import equinox as eqx
 import jax
@@ -62,7 +62,7 @@ def solve(solution, pair, pointwise_map, *, bank=None, convention="pullback", pr
 
 
 def objective(c, pair, pointwise_map, weights, descriptors, *, convention="pullback", bank=None):
-    """The sum of terms as the docstring writes it, term by term."""
+    """Returns the objective of the docstring, summed term by term."""
     bank = CubicSpline(4) if bank is None else bank
     problem = WaveletPreservation(bank=bank, convention=convention).problem(*pair)
     eigenvalues_out, eigenvalues_in = (s.eigenvalues for s in problem.spectra)
@@ -114,7 +114,7 @@ def with_weights(weights, descriptors, **options):
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize("weights", QUADRATIC, ids=lambda w: ", ".join(w))
 def test_quadratic_objectives_are_minimised_exactly(pair, pointwise_map, descriptors, weights, convention):
-    """Against the dense solution of the k² normal equations."""
+    """The result agrees with the dense solution of the k² normal equations."""
     c, result = solve(with_weights(weights, descriptors), pair, pointwise_map, convention=convention)
     assert result == RESULTS.successful
 
@@ -250,7 +250,7 @@ def test_signs_of_eigenvectors_do_not_matter(pair, pointwise_map, convention):
 
 
 class Gap(FilterBank):
-    """Passes nothing in the middle of the spectrum."""
+    """A bank that passes nothing in the middle of the spectrum."""
 
     def __call__(self, points, eigenvalues):
         return jnp.where(jnp.abs(points / eigenvalues[-1] - 0.5) < 0.2, 0.0, Meyer(3)(points, eigenvalues))
@@ -262,7 +262,7 @@ class Gap(FilterBank):
     [LeastSquares(), RegularizedLeastSquares(laplacian_commutativity=None)],
     ids=["exact", "regularized"],
 )
-def test_a_vanishing_frame_function_is_named(pair, pointwise_map, solution, convention):
+def test_a_vanishing_frame_function_is_reported(pair, pointwise_map, solution, convention):
     refiner = WaveletPreservation(bank=Gap(), solution=solution, convention=convention)
     refined = refine(*pair, pointwise_map, refiner=refiner)
     assert refined.result == RESULTS.undetermined_functional_map
@@ -272,8 +272,8 @@ def test_a_vanishing_frame_function_is_named(pair, pointwise_map, solution, conv
     assert refine(*pair, pointwise_map, refiner=filtering).result == RESULTS.successful
 
 
-def test_a_map_to_too_few_vertices_is_named(pair):
-    """One target for all vertices, and one filter only: the gram matrix has rank one."""
+def test_a_map_to_too_few_vertices_is_reported(pair):
+    """With one target for all vertices and one filter, the gram matrix has rank one."""
 
     class Flat(FilterBank):
         def __call__(self, points, eigenvalues):
@@ -288,7 +288,7 @@ def test_a_map_to_too_few_vertices_is_named(pair):
             assert refined.result == RESULTS.singular_system
 
 
-def test_the_height_of_a_bank_does_not_weigh(pair, pointwise_map):
+def test_the_height_of_a_bank_does_not_matter(pair, pointwise_map):
     class Raised(FilterBank):
         def __call__(self, points, eigenvalues):
             return 3.0 * CubicSpline(4)(points, eigenvalues)
@@ -317,7 +317,7 @@ def test_all_solutions_in_a_batch_of_refinements_and_on_samples():
     x, y = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *spectra) for spectra in zip(*pairs, strict=True))
     for solution in (LeastSquares(), LeastSquares("frobenius"), RegularizedLeastSquares(**PRECISE)):
         options = {"refiner": WaveletPreservation(solution=solution), "iterations": 2}
-        options |= {"samples_x": samples_x, "samples_y": samples_y}
+        options |= {"samples": (samples_x, samples_y)}
         batch = jax.vmap(lambda x, y, t, options=options: refine(x, y, t, **options))(x, y, maps)
         for i, pair in enumerate(pairs):
             alone = refine(*pair, maps[i], **options)
@@ -325,14 +325,14 @@ def test_all_solutions_in_a_batch_of_refinements_and_on_samples():
             np.testing.assert_allclose(batch.functional_map[i], alone.functional_map, atol=1e-7)
 
 
-def test_giving_up_is_named(pair, pointwise_map):
+def test_too_few_steps_are_reported(pair, pointwise_map):
     solution = RegularizedLeastSquares(orthogonality=1.0, max_steps=2, tolerance=1e-9)
     refined = refine(*pair, pointwise_map, refiner=WaveletPreservation(solution=solution))
     assert refined.result == RESULTS.solver_not_converged
     assert "max_steps" in RESULTS[refined.result]
 
 
-def test_numbers_that_went_wrong_have_a_code(pair, pointwise_map):
+def test_nan_in_a_spectrum_is_reported(pair, pointwise_map):
     x, y = pair
     broken = eqx.tree_at(lambda s: s.eigenvectors, x, x.eigenvectors.at[0, 0].set(jnp.nan))
     for solution in (Filtering(), LeastSquares(), RegularizedLeastSquares()):
@@ -340,7 +340,7 @@ def test_numbers_that_went_wrong_have_a_code(pair, pointwise_map):
         assert refined.result == RESULTS.nonfinite_spectrum
 
 
-def test_a_weight_that_is_not_a_number_is_named_also_in_a_batch(pair, pointwise_map):
+def test_an_invalid_weight_is_reported_also_in_a_batch(pair, pointwise_map):
     def result(weight):
         solution = RegularizedLeastSquares(orthogonality=weight)
         return refine(*pair, pointwise_map, refiner=WaveletPreservation(solution=solution)).result
@@ -354,7 +354,7 @@ def test_a_weight_that_is_not_a_number_is_named_also_in_a_batch(pair, pointwise_
 
 
 @pytest.mark.parametrize("operators", [False, True])
-def test_descriptors_that_are_not_numbers_are_named(pair, pointwise_map, operators):
+def test_nan_in_descriptors_is_reported(pair, pointwise_map, operators):
     x, y = pair
     values = np.random.default_rng(0).normal(size=(M, D))
     values[3, 1] = np.nan
@@ -390,7 +390,7 @@ def test_descriptors_in_the_eigenbases(pair):
     values = x.eigenvectors @ coefficients
     projected = DescriptorPair.project(values, values, x, x, operators=True)
     np.testing.assert_allclose(projected.x.coefficients, coefficients, atol=1e-12)
-    # Multiplication by a function, seen in the basis, is a symmetric matrix; by one it is the identity.
+    # Multiplication by a function is a symmetric matrix in the basis. For the function 1 it is the identity.
     operators = projected.x.operators
     np.testing.assert_allclose(operators, operators.transpose(0, 2, 1), atol=1e-12)
     ones = jnp.ones((M, 1))
@@ -400,7 +400,7 @@ def test_descriptors_in_the_eigenbases(pair):
 
 
 def test_descriptors_alone_find_the_functional_map_of_a_copy(pair):
-    """The descriptor-based functional map: as many functions as it takes to know C."""
+    """Enough descriptors determine the functional map without wavelets."""
     x, _ = pair
     order = jnp.asarray(np.random.default_rng(0).permutation(M))
     y = Spectrum(x.eigenvalues, x.eigenvectors[order], x.vertex_areas[order], x.mask)
@@ -456,8 +456,8 @@ def test_descriptors_need_a_weight_and_operators_their_matrices(pair):
         RegularizedLeastSquares(descriptors=descriptors, descriptor_commutativity=1.0)
 
 
-def test_adding_an_energy_of_ones_own(pair):
-    """`minimize` takes any sum of squares: here one whose minimum is known."""
+def test_minimize_with_another_energy(pair):
+    """`minimize` accepts any sum of squares; the minimum of this energy is known."""
     generator = np.random.default_rng(0)
     a, target = generator.normal(size=(K_Y, 20)), generator.normal(size=(K_X, K_Y))
     b = target @ a
@@ -473,7 +473,7 @@ def test_adding_an_energy_of_ones_own(pair):
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
 @pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])
 def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
-    """The residual of the stacked system of all scales and vertices is orthogonal to what C is fed."""
+    """The residual of the stacked system of all scales and vertices is orthogonal to the inputs of C."""
     reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
     x, y = (
         Spectrum(
@@ -490,9 +490,9 @@ def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
     assert result == RESULTS.successful
     areas = np.asarray(x.vertex_areas)[:, None]
     if convention == "pullback":
-        fed, returned = y.eigenvectors[t], x.eigenvectors
+        inputs, outputs = y.eigenvectors[t], x.eigenvectors
     else:
-        fed, returned = x.eigenvectors * areas, (y.eigenvectors * y.vertex_areas[:, None])[t]
+        inputs, outputs = x.eigenvectors * areas, (y.eigenvectors * y.vertex_areas[:, None])[t]
     weights = {
         ("pullback", "area"): areas,
         ("pushforward", "area"): 1 / areas,
@@ -500,8 +500,8 @@ def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
     g_out, g_in = (np.asarray(g) for g in problem.responses)
     correlation, size = 0.0, 0.0
     for scale_out, scale_in in zip(g_out, g_in, strict=True):
-        given = np.asarray(fed) * scale_in[None]
-        residual = given @ np.asarray(c).T - np.asarray(returned) * scale_out[None]
+        given = np.asarray(inputs) * scale_in[None]
+        residual = given @ np.asarray(c).T - np.asarray(outputs) * scale_out[None]
         correlation += residual.T @ (weights * given)
         size += np.linalg.norm(np.sqrt(weights) * given) * np.linalg.norm(np.sqrt(weights) * residual)
     assert np.abs(correlation).max() < 1e-10 * size

@@ -1,4 +1,4 @@
-"""The nearest point on triangles, against libigl, brute force and what must hold."""
+"""The nearest point on triangles, compared with libigl and brute force, and its invariances."""
 
 import igl
 import jax
@@ -17,7 +17,7 @@ def generator():
 
 
 def found(queries, points, faces, **options):
-    """Faces, weights, and how far each query is from its nearest point."""
+    """Returns faces, weights, and the distance from each query to its nearest point."""
     face, weights = nearest_point_on_triangles(
         jnp.asarray(queries), jnp.asarray(points), jnp.asarray(faces), **options
     )
@@ -26,7 +26,7 @@ def found(queries, points, faces, **options):
 
 
 def by_brute_force(queries, points, faces):
-    """Distances by non-negative least squares, the weights' sum being made one by a heavy row."""
+    """Returns distances by non-negative least squares. A heavy row makes the weights sum to one."""
     heavy = 1e4
     distances = []
     for query in queries:
@@ -43,7 +43,7 @@ def by_brute_force(queries, points, faces):
 def test_agrees_with_libigl_in_space(generator, dtype):
     mesh = bumpy_mesh(3)
     queries = generator.normal(size=(300, 3))
-    queries[:100] = mesh.vertices[:100]  # corners themselves
+    queries[:100] = mesh.vertices[:100]  # on corners
     expected, _, _ = igl.point_mesh_squared_distance(queries, mesh.vertices, mesh.faces)
     _, weights, distance = found(queries.astype(dtype), mesh.vertices.astype(dtype), mesh.faces)
     assert weights.dtype == dtype
@@ -74,7 +74,7 @@ def test_finds_points_of_the_surface_again(generator):
 
 @pytest.mark.parametrize("corners", [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [0, 1, 3]])
 def test_triangles_without_area(corners):
-    """A point, a segment given twice over, and three points in a row."""
+    """The triangles degenerate to a point, to a segment, and to three points in a row."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 5, 0], [2, 0, 0]])
     queries = np.array([[0.4, 1, 0], [-1, 0, 0], [3, 0, 0]])
     _, weights, distance = found(queries, points, np.array([corners]))
@@ -84,7 +84,7 @@ def test_triangles_without_area(corners):
     assert np.isfinite(weights).all()
 
 
-def test_masked_triangles_are_left_out(generator):
+def test_masked_triangles_are_ignored(generator):
     mesh = bumpy_mesh(2)
     queries = generator.normal(size=(50, 3))
     mask = generator.random(len(mesh.faces)) < 0.5
@@ -94,7 +94,7 @@ def test_masked_triangles_are_left_out(generator):
     np.testing.assert_allclose(distance, expected)
 
 
-def test_vmap_is_one_after_the_other(generator):
+def test_vmap_equals_a_loop(generator):
     mesh = bumpy_mesh(2)
     queries = jnp.asarray(generator.normal(size=(3, 40, 3)))
     points = jnp.asarray(mesh.vertices * np.array([1.0, 1.5, 2.0])[:, None, None])
@@ -106,7 +106,7 @@ def test_vmap_is_one_after_the_other(generator):
         np.testing.assert_allclose(together[1][pair], alone[1], atol=1e-12)
 
 
-def test_nothing_of_all_queries_and_triangles_is_stored():
+def test_no_array_of_all_queries_and_triangles_is_stored():
     m, n, f, d = 4000, 3000, 6000, 40
     shapes = (
         jax.ShapeDtypeStruct((m, d), jnp.float32),

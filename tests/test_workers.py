@@ -83,7 +83,7 @@ def test_giving_up_ends_the_workers_and_no_other_process():
 
 def fill() -> int:
     """Compiles a program in the worker, and lets the next call release all programs."""
-    compilation._GOOD_PART = 0.0
+    compilation._LARGEST_SHARE = 0.0
     global double
     double = jax.jit(lambda x: 2 * x)
     double(1.0)

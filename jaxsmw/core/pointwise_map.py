@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int, Int32
 from jaxsmw.choices import Search
 from jaxsmw.core.functional_map import Convention, out_and_in
 from jaxsmw.core.products import product
-from jaxsmw.core.search import Patches, make_patches, nearest_neighbor, nearest_neighbor_in_patches
+from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 
@@ -25,9 +25,9 @@ def spectral_embeddings(
     The embeddings are `Phi_X` and `Phi_Y C^T` in the pullback convention, and `Phi_X C^T` and `Phi_Y` in the
     pushforward convention. The convention matters because a filtered C shrinks the vectors that it maps. In
     the pushforward convention the *queries* shrink. They all come close to the few database points of small
-    norm, which become hubs that attract most queries. In the pullback convention the *database* shrinks, but
-    seen from any query its order stays the same. On real pairs, pullback maps are good and pushforward maps
-    fail.
+    norm, which become hubs that attract most queries. In the pullback convention the *database* shrinks,
+    which hardly changes the order of the distances from a query. On real pairs pullback maps are good, and
+    pushforward maps fail.
 
     **Returns:** The queries, one row per vertex of X, and the database, one row per vertex of Y.
     """
@@ -54,9 +54,7 @@ def decode(
     **Returns:** One vertex of Y per vertex of X, (m,).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
-    if patches is not None:
-        return nearest_neighbor_in_patches(queries, database, *patches)
-    return nearest_neighbor(queries, database, database_mask=spectrum_y.mask)
+    return nearest_vertices(queries, database, spectrum_y.mask, patches)
 
 
 def decode_to_triangles(

@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, nearest_neighbor, nearest_neighbor_in_patches
 from jaxsmw.core.spectrum import Spectrum
 
 Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
@@ -139,15 +138,3 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def convention(self) -> Convention:
         """The direction of the functional map."""
         return "pullback"
-
-
-def nearest_vertices(
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
-    database_mask: Bool[Array, " n"],
-    patches: tuple[Patches, Patches] | None,
-) -> Int32[Array, " m"]:
-    """The nearest database row of every query, by patches of both point sets if there are any."""
-    if patches is None:
-        return nearest_neighbor(queries, database, database_mask=database_mask)
-    return nearest_neighbor_in_patches(queries, database, *patches)

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
 from jaxsmw.core.products import product
 
-# The number of queries per block and of database rows per chunk, measured on two CPU cores with
+# The number of queries per block, and the number of database rows per chunk, measured on two CPU cores with
 # scripts/benchmark_speed.py. The scores of a block have to fit into the cache. A maximum over a chunk is
 # vectorised, an argmax is not.
-_BLOCK = 128
+BLOCK = 128
 _CHUNK = 64
 # Maxima over chunks are computed in runs of this length, maxima over boxes in this number of parts.
 _RUN, _PARTS = 8, 16
@@ -59,15 +59,15 @@ def nearest_neighbor(
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         products = product(rows, block.T)
         # With the queries last, a maximum over chunks is computed for neighbouring queries at once.
-        scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, _BLOCK)
+        scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, BLOCK)
         chunk_scores = _maximum(scores, 1, _CHUNK // _RUN)
         best_chunks = _two_best(chunk_scores)
-        chunk_rows = scores[best_chunks, :, jnp.arange(_BLOCK)[None, :]]
+        chunk_rows = scores[best_chunks, :, jnp.arange(BLOCK)[None, :]]
         candidates = best_chunks * _CHUNK + jnp.argmax(chunk_rows, axis=2)
         masked = jnp.isinf(half_norms[candidates])
         return _nearest(block, rows[candidates], candidates, masked, n).astype(jnp.int32)
 
-    return in_blocks(search, queries, _BLOCK)
+    return in_blocks(search, queries, BLOCK)
 
 
 def in_blocks(
@@ -272,6 +272,18 @@ def search_in_patches(
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
     kept = jnp.where(query_patches.mask, query_patches.rows, queries.shape[0])
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
+
+
+def nearest_vertices(
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    database_mask: Bool[Array, " n"],
+    patches: tuple[Patches, Patches] | None,
+) -> Int32[Array, " m"]:
+    """Returns the database row nearest to each query, by patches of both point sets if there are any."""
+    if patches is None:
+        return nearest_neighbor(queries, database, database_mask=database_mask)
+    return nearest_neighbor_in_patches(queries, database, *patches)
 
 
 class _Boxes(NamedTuple):

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Int64
 
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.descriptors import SampledPair, SampledShape
-from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
 
 
 def nearest_map(

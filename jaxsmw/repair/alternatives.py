@@ -26,8 +26,8 @@ from jaxsmw.repair.extremities import extremities, plausible_pairings
 from jaxsmw.repair.outcome import Outcome, score
 from jaxsmw.repair.scores import distinct, distortion, same_map
 from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 

@@ -17,7 +17,7 @@ from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 logger = logging.getLogger("jaxsmw")

@@ -1,8 +1,8 @@
-"""How functions are compiled where they are called from the host."""
+"""Compilation of functions that the host calls."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -11,20 +11,31 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 Function = TypeVar("Function", bound=Callable)
 
+_OPTIONS: dict[str, str | bool] = {
+    "xla_cpu_experimental_ynn_fusion_type": "",
+    "xla_disable_hlo_passes": "tree_reduction_rewriter",
+}
+# The share of a process's memory maps from which programs are released. A pair of new sizes takes up to three
+# hundredths of the maps, and 250 MB.
+_LARGEST_SHARE = 0.25
+
 
 def compiler_options() -> dict[str, str | bool]:
-    """What to give `jax.jit` as its `compiler_options`, for searches in particular.
+    """Returns the `compiler_options` for `jax.jit` that make searches fast on CPUs.
 
-    On CPUs XLA leaves products and sums to a library (YNNPACK) that takes longer to wake its threads than a
-    small one lasts: without it a search in patches takes half the time. And it makes several loops of each
-    long sum, to be rounded less: with one, programs compile in two thirds of the time (docs/speed.md), and
-    sums of a million numbers are still right within 5e-6. There are none for other devices, nor those that
-    XLA does not know. JAX accepts options in the outermost `jax.jit` only, which is why `jaxsmw.refine`, to
-    be called from other compiled functions, does not set them itself. They are for JAX's default backend,
-    whatever `jax.default_device` says.
+    By default XLA gives products and sums on CPUs to a library (YNNPACK), which takes longer to wake its
+    threads than a small operation lasts. Without the library, a search in patches takes half the time. XLA
+    also splits each long sum into several loops to reduce rounding. With one loop programs compile in two
+    thirds of the time (docs/speed.md), and sums of a million numbers are still right within 5e-6.
+
+    JAX accepts options in the outermost `jax.jit` only. Therefore `jaxsmw.refine`, which other compiled
+    functions may call, does not set them itself. The options are for the default backend of JAX, whatever
+    `jax.default_device` says. They are empty for other devices than CPUs, and without options that the
+    installed XLA does not know.
     """
     return dict(_options_for(jax.default_backend()))
 
@@ -35,6 +46,7 @@ def _options_for(backend: str) -> dict[str, str | bool]:
 
 
 def _known(option: str, value: str | bool) -> bool:
+    """Returns whether the installed XLA knows an option."""
     try:
         jax.jit(lambda: 0).lower().compile({option: value})
     except (jax.errors.JaxRuntimeError, ValueError):
@@ -42,68 +54,65 @@ def _known(option: str, value: str | bool) -> bool:
     return True
 
 
-_OPTIONS: dict[str, str | bool] = {
-    "xla_cpu_experimental_ynn_fusion_type": "",
-    "xla_disable_hlo_passes": "tree_reduction_rewriter",
-}
-
-
 def compiled(function: Function) -> Function:
-    """The function compiled with `compiler_options`, to be called from the host; the same for the same."""
+    """Returns the function compiled with `compiler_options`, for calls from the host.
+
+    The same function always gives the same compiled function.
+    """
     return _compiled(function, jax.default_backend())
 
 
 @cache
 def _compiled(function: Function, backend: str) -> Function:
-    # Equinox passes on what it does not know; its types do not say so.
+    # The types of Equinox do not say that it passes unknown options on to JAX.
     return eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
 
 
 def compile_ahead(
-    function: Function, arguments: Callable[[], tuple[tuple, dict[str, Any]]], **settings: Any
+    function: Callable,
+    arguments: Callable[[], tuple[tuple[PyTree, ...], Mapping[str, PyTree]]],
+    **settings: object,
 ) -> Future[object]:
-    """Begin to compile in the background what `compiled(function)` needs for arguments of some sizes.
+    """Starts to compile `compiled(function)` for arguments of given sizes, in the background.
 
-    Wait for the future before the call, or it compiles once more. What is wrong with the arguments is left
-    for the call to say.
+    Wait for the future before the call, or the call compiles the program again. Errors in the arguments stay
+    in the future; the call raises them.
 
     **Arguments:**
 
-    - `arguments`: makes arrays of these sizes, by position and by name; it is only traced.
-    - `settings`: what else the function gets.
+    - `arguments`: a function that returns arrays of these sizes, by position and by name. It is only traced.
+    - `settings`: the other arguments of the function.
     """
-    program: Any = compiled(function)
+    program: Any = compiled(function)  # the types of Equinox do not declare `lower`
     x64 = jax.config.read("jax_enable_x64")
 
-    def compile_it() -> object:
-        with jax.enable_x64(x64):  # which threads do not inherit
+    def compile_now() -> object:
+        with jax.enable_x64(x64):  # threads do not inherit this setting
             shapes = jax.eval_shape(arguments)
-            # Equinox traces arrays only; these have no memory.
+            # Equinox traces arrays only. Broadcast arrays of one element take no memory.
             positional, named = jax.tree.map(
                 lambda shape: np.broadcast_to(np.zeros((), shape.dtype), shape.shape), shapes
             )
             return program.lower(*positional, **named, **settings).compile()
 
     executor = ThreadPoolExecutor(1)
-    future = executor.submit(compile_it)
+    future = executor.submit(compile_now)
     executor.shutdown(wait=False)
     return future
 
 
 def release_programs() -> None:
-    """Let go of all compiled programs if they take a good part of the memory maps that a process may have.
+    """Releases all compiled programs of the process if they use a large share of its memory maps.
 
-    On Linux: with a few dozen pairs of unlike sizes they would take all, and LLVM ends a process that gets no
-    more. What is still needed is compiled again, or loaded if programs are kept on disk.
+    Commands call this function between pairs. Library functions must not call it: `jax.clear_caches` also
+    clears the programs of the caller. On Linux, programs for a few dozen pairs of different sizes would use
+    up all memory maps of the process, and LLVM then ends the process. Released programs are compiled again
+    when they are needed, or loaded if programs are kept on disk.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")
-        most = int(Path("/proc/sys/vm/max_map_count").read_text("ascii"))
+        available = int(Path("/proc/sys/vm/max_map_count").read_text("ascii"))
     except (OSError, ValueError):
         return
-    if used > _GOOD_PART * most:
+    if used > _LARGEST_SHARE * available:
         jax.clear_caches()
-
-
-# A pair of new sizes takes up to three hundredths, and 250 MB.
-_GOOD_PART = 0.25

@@ -1,4 +1,4 @@
-"""Computers with few cores: both shapes at once, and no threads that wait for each other."""
+"""Threads on computers with few cores: both shapes at once, without threads that wait for each other."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ Result = TypeVar("Result")
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """For as long NumPy's and SciPy's linear algebra uses one thread, and XLA's on CPUs, which is SciPy's.
+    """Returns a context in which the linear algebra of NumPy and SciPy uses one thread.
 
-    More gain nothing on small arrays; and OpenBLAS's, done with a matrix, keep their cores busy for another
-    while, waiting for the next one.
+    On CPUs this also holds for XLA, which uses the LAPACK of SciPy. More threads gain nothing on small
+    arrays. Worse, the threads of OpenBLAS keep their cores busy after each matrix while they wait for the
+    next.
     """
     return _libraries().limit(limits=1, user_api="blas")
 
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Those loaded; to look for them anew each time would take longer than what many a caller does."""
+    """Returns the loaded libraries. To look them up takes longer than many callers do."""
     return ThreadpoolController()
 
 
 def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
-    """The same for both shapes, in two threads with one core each; what takes long lets the other go on."""
-    # One limit around both: each would undo the other's at its end.
+    """Returns the results of a function for X and for Y, computed at the same time in two threads."""
+    # The limit has to enclose both threads. With one limit per thread, the end of one would lift the other.
     with one_blas_thread(), ThreadPoolExecutor(2) as executor:
         futures = [executor.submit(copy_context().run, compute, side) for side in (x, y)]
         result_x, result_y = (future.result() for future in futures)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
-from typing import Generic, Literal
+from typing import Generic, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
+from jaxsmw.choices import Search
 from jaxsmw.core.checks import check_choice
 from jaxsmw.core.refiner import PreparedT, Refiner, State, StateT
 from jaxsmw.core.spectrum import Spectrum
@@ -45,10 +46,10 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     """
 
     levels: tuple[int, ...] = eqx.field(static=True, default=(), converter=_whole_numbers)
-    search: Literal["auto", "exhaustive", "patches"] = eqx.field(static=True, default="auto")
+    search: Search = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
-        check_choice("search", self.search, ("auto", "exhaustive", "patches"))
+        check_choice("search", self.search, get_args(Search))
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each level needs at least 1 eigenvector")
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refiner import Prepared, Problem, nearest_vertices
+from jaxsmw.core.refiner import Prepared, Problem
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
     CoarseToFineState,
@@ -19,7 +19,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, nearest_neighbor
+from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
 # Ridge of the regression and smallest residual variance, relative to features of variance about 1. Values

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int32
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refiner import Prepared, Problem, nearest_vertices
+from jaxsmw.core.refiner import Prepared, Problem
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
     CoarseToFineState,
@@ -23,7 +23,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches
+from jaxsmw.core.search import Patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
 # Weights beside positions in units of the square root of the area: unit normals, and the first

@@ -12,10 +12,10 @@ from jaxsmw.choices import Search
 from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import chosen_patches, decode, spectral_embeddings
-from jaxsmw.core.refiner import Prepared, Problem, Refiner, State, nearest_vertices
+from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
+from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches
+from jaxsmw.core.search import Patches, nearest_vertices
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions import Filtering, Solution, WaveletProblem
 from jaxsmw.core.spectrum import Spectrum
@@ -104,14 +104,9 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         return State(found), result
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Nearest neighbours; see `decode`."""
-        return decode(
-            state.functional_map,
-            prepared.spectrum_x,
-            prepared.spectrum_y,
-            convention=self.convention,
-            patches=prepared.patches,
-        )
+        """Nearest neighbours of the vertices of X among those of Y; see `decode`."""
+        queries, database = self.embeddings(prepared, state)
+        return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " n"]:
         """Nearest neighbours of the vertices of Y among those of X."""

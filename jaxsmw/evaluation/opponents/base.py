@@ -19,7 +19,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.preparation import PreparedPair
-from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000

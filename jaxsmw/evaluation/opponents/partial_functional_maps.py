@@ -76,8 +76,8 @@ from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0

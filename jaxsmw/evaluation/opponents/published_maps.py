@@ -16,7 +16,7 @@ from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.map_files import read_pointwise_map
-from jaxsmw.runtime.batches import pad_rows
+from jaxsmw.runtime.padding import pad_rows
 
 
 @dataclass(frozen=True)
