@@ -195,17 +195,17 @@ def test_help_names_every_method():
 TOO_LONG = "x" * 300
 
 
-def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
+def test_names_longer_than_the_file_system_allows_are_refused(scape):
+    """The command line refuses such names before it calls these functions."""
     calls = [
-        (["benchmark", TOO_LONG], "is not a directory"),
-        (["benchmark", str(scape), "--methods", TOO_LONG], "is not a method"),
-        (["benchmark", str(scape), "--init", TOO_LONG], "is not an initial map"),
-        (["benchmark", str(scape), "--pairs", TOO_LONG], "cannot be read as text"),
+        (lambda: open_data_set(TOO_LONG), "is not a directory"),
+        (lambda: find_methods([TOO_LONG]), "is not a method"),
+        (lambda: Settings(TOO_LONG), "is not an initial map"),
+        (lambda: choose_pairs(open_data_set(scape), TOO_LONG, 0), "cannot be read as text"),
     ]
     for call, message in calls:
-        assert run_command(call) == 2
-        errors = capsys.readouterr().err
-        assert message in errors and TOO_LONG in errors and "Traceback" not in errors
+        with pytest.raises(InputError, match=f"{TOO_LONG}.*{message}"):
+            call()
 
 
 class Here(Executor):

@@ -288,7 +288,7 @@ def test_a_page_compares_maps(run, pair, tmp_path):
     assert [shown["name"] for shown in shown_maps(rendered)] == [str(path) for path in two]
 
 
-@pytest.mark.filterwarnings("default:the page does without wavelets")
+@pytest.mark.filterwarnings("default:the page has no wavelets")
 def test_a_page_of_a_partial_shape(run, pair, tmp_path):
     """The spectra cover the same range of eigenvalues. Without a common range the page has no wavelets."""
     call = ["render", pair / "x.off", pair / "y.ply", pair / "truth.txt", "--output", tmp_path / "p.html"]
@@ -300,7 +300,7 @@ def test_a_page_of_a_partial_shape(run, pair, tmp_path):
     mesh = read_mesh(pair / "y.ply")
     write_mesh(tmp_path / "large.off", make_mesh(1e3 * mesh.vertices, mesh.faces))
     outcome = run(*call[:2], tmp_path / "large.off", *call[3:], "--partial")
-    assert outcome.code == 0 and "warning: the page does without wavelets" in outcome.errors
+    assert outcome.code == 0 and "warning: the page has no wavelets" in outcome.errors
     assert shown_maps(tmp_path / "p.html")[0]["functional"] is None
 
 

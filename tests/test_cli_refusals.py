@@ -27,7 +27,9 @@ def test_a_tiny_mesh_is_refused(run, tmp_path):
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
     assert_refused(run(*call), naming="--init wks")
     assert_refused(run(*call, "--eigenvectors", "100"), naming="choose a number from 1 to 3")
-    assert_refused(run(*call, "--eigenvectors", "1", "--init", "hks"), naming="1 eigenvectors only tell to which")
+    assert_refused(
+        run(*call, "--eigenvectors", "1", "--init", "hks"), naming="1 eigenvectors only tell to which"
+    )
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
 

@@ -106,7 +106,7 @@ def write_report(
         expected = correspondence.expected_error()
     shown = _shown_maps(correspondence, errors, expected)
     with timed("pictures", steps):
-        captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
+        pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
     wavelets = _last_wavelets(correspondence)
     # The page's table of maps already has the errors of the initial and the refined map.
     others = {name: error for name, error in list(errors.items())[:-1] if name != "initial"}
@@ -134,8 +134,7 @@ def write_report(
     }
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
-    names = ("report.html", *(f"{name}.png" for name in figures), "summary.json")
-    return [directory / name for name in names]
+    return [directory / "report.html", *pictures, directory / "summary.json"]
 
 
 def _shown_maps(
@@ -171,8 +170,8 @@ def _save_figures(
     per_vertex: Mapping[str, Float[np.ndarray | Array, " m"]],
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
-) -> dict[str, str]:
-    """Writes all figures; returns the captions of the figures that the page shows as well, by name."""
+) -> tuple[list[Path], dict[str, str]]:
+    """Writes all figures; returns their files, and the captions of the figures on the page by name."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.stages[-1].refiner.convention
     figures = {
@@ -189,9 +188,10 @@ def _save_figures(
     if errors:
         figures["quality"] = draw_errors(errors)
         captions["quality"] = _QUALITY_CAPTION
-    for name, figure in figures.items():
-        save_figure(directory / f"{name}.png", figure)
-    return captions
+    files = {directory / f"{name}.png": figure for name, figure in figures.items()}
+    for file, figure in files.items():
+        save_figure(file, figure)
+    return list(files), captions
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
