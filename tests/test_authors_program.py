@@ -61,11 +61,10 @@ def test_every_iteration(reference, setting):
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_sampled_variant(reference, setting):
-    samples = {
-        f"samples_{side}": jnp.asarray(reference[f"{setting}_samples{number}"].astype(np.int32))
-        for side, number in (("x", 1), ("y", 2))
-    }
-    t, c = run(reference, setting, 5, **samples)
+    samples_x, samples_y = (
+        jnp.asarray(reference[f"{setting}_samples{number}"].astype(np.int32)) for number in (1, 2)
+    )
+    t, c = run(reference, setting, 5, samples=(samples_x, samples_y))
     assert np.mean(t == reference[f"{setting}_Tfast"]) >= 0.999
     np.testing.assert_allclose(c, reference[f"{setting}_Cfast"], atol=1e-8)
 

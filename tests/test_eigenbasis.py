@@ -388,7 +388,7 @@ def test_the_choice_of_the_eigensolver(monkeypatch):
     spy("_lanczos")
     mesh = bumpy_mesh(4)
     eigenpairs(mesh, 20)
-    monkeypatch.setattr(eigenbasis, "_APPROXIMATE_FROM", 2000)
+    monkeypatch.setattr(eigenbasis, "APPROXIMATE_FROM", 2000)
     eigenpairs(mesh, 20, eigensolver="exact")
     # The mesh is too small to approximate so many eigenvectors.
     eigenpairs(mesh, 200, eigensolver="approximate")

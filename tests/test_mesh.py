@@ -529,8 +529,8 @@ def test_welding_says_when_it_changes_nothing(saved):
         *plain.notes,
         "Welding changed nothing: no two vertices of faces have the same position.",
     )
-    twins = make_mesh([*SQUARE, SQUARE[0]], SQUARE_FACES, weld=True)
-    assert twins.faces.tolist() == SQUARE_FACES and "Welding changed nothing" in twins.notes[0]
+    mesh = make_mesh([*SQUARE, SQUARE[0]], SQUARE_FACES, weld=True)
+    assert mesh.faces.tolist() == SQUARE_FACES and "Welding changed nothing" in mesh.notes[0]
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl"])
@@ -686,7 +686,7 @@ HOSTILE = {
     "truncated in texture.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\nf 1/1 3/", "truncated"),
     "truncated text.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1", "'face'"),
     "truncated vertices.ply": (PLY_HEAD + PLY_FACE + T[:9], "'vertex'"),
-    "text goes on.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 2\n3 0 1 2\n", "goes on"),
+    "text goes on.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 2\n3 0 1 2\n", "continues after the last promised row"),
     "list of minus one.ply": (PLY_HEAD + PLY_FACE + T + "-1 0 1 2\n", "-1 numbers"),
     "list of nan.ply": (PLY_HEAD + PLY_FACE + T + "nan 0 1 2\n", "nan numbers"),
     "list of one and a half.ply": (PLY_HEAD + PLY_FACE + T + "1.5 0 1 2\n", "1.5 numbers"),
@@ -701,9 +701,9 @@ HOSTILE = {
         PLY_BINARY.replace(b"element face", b"element void 1000000000000\nelement face"), None
     ),
     "too many vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 4"), "'vertex'"),
-    "too few vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 2"), "goes on"),
+    "too few vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 2"), "continues after the last promised row"),
     "truncated.ply": (PLY_BINARY[:-1], "'face'"),
-    "goes on.ply": (PLY_BINARY + b"\1", "goes on"),
+    "goes on.ply": (PLY_BINARY + b"\1", "continues after the last promised row"),
     "list length negative.ply": (
         ply(
             "binary_big_endian",

@@ -480,6 +480,6 @@ def test_what_is_of_another_kind_is_named():
         "repair is 'accurate'; give RepairSettings.",
         "the samples of X is list, but an array is needed",
         "the mesh is 'mesh.off', but a Mesh is needed",
-        "source mesh: 'mesh.off' is the name of a file: read it with jaxsmw.read_mesh first.",
+        "source mesh: 'mesh.off' is a file name: read the file with jaxsmw.read_mesh first.",
         "'Robust' is no Laplacian: choose auto, cotangent, robust.",
     ]

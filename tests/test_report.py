@@ -44,7 +44,7 @@ def test_the_report_states_the_time_of_every_step_and_the_total(
     found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
 ) -> None:
     given = {"reading": 0.5, **found.seconds, "geodesic errors": 12.25}
-    write_report(tmp_path, found, errors=errors, seconds=given)
+    written = write_report(tmp_path, found, errors=errors, seconds=given)
     summary, page = read(tmp_path)
     times = summary["seconds"]
     assert list(times) == [*given, "expected error", "pictures", "total"]
@@ -54,7 +54,7 @@ def test_the_report_states_the_time_of_every_step_and_the_total(
     for name, seconds in times.items():
         assert summary["result"][f"time, {name}"] == f"{seconds:.2f} s"
         assert f"<dt>time, {name}</dt><dd>{seconds:.2f} s</dd>" in page
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(REPORT_FILES)
+    assert sorted(written) == sorted(tmp_path.iterdir()) == sorted(tmp_path / name for name in REPORT_FILES)
 
 
 def test_the_report_states_the_times_of_match_by_default(found: Correspondence, tmp_path: Path) -> None:

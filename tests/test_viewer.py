@@ -13,10 +13,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsmw.core.banks.filters import Meyer
 from matplotlib.image import imread
 from report_helpers import TALL, decode, embedded, renumbered
 
+from jaxsmw.core.banks import Meyer
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum

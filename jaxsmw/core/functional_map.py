@@ -19,7 +19,8 @@ all vertices count the same:
 | pushforward | area      | area_X(x)  | Phi_X(x)           | area_Y(T(x)) Phi_Y(T(x)) / area_X(x) |
 | pushforward | frobenius | 1          | area_X(x) Phi_X(x) | area_Y(T(x)) Phi_Y(T(x))             |
 
-The last line holds the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the paper. The energy of eq. (5) is
+In the last line, inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the paper. The
+energy of eq. (5) is
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 

@@ -76,13 +76,13 @@ def as_spectrum(
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
     """The `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type, with positions and normals."""
-    used = mesh.referenced_vertices
+    referenced = mesh.referenced_vertices
     # Relative to the centroid, single precision suffices wherever the mesh lies.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
-    positions = np.where(used[:, None], centered / np.sqrt(mesh.area), 0)
+    positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
     # Unlike `device_put`, `jnp.asarray` would compile a program for every size.
-    arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, used))
+    arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, referenced))
     return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
 
 
@@ -95,15 +95,15 @@ def eigenpairs(
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
     """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors and vertex areas, for total area 1."""
     check_kind("mesh", mesh, Mesh)
-    used = np.flatnonzero(mesh.referenced_vertices)
+    referenced = np.flatnonzero(mesh.referenced_vertices)
     if not isinstance(number_of_eigenvectors, int | np.integer):
         raise InputError(
             f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}: give an integer."
         )
-    if not 1 <= number_of_eigenvectors < len(used):
+    if not 1 <= number_of_eigenvectors < len(referenced):
         raise InputError(
-            f"{mesh.name}: cannot compute {number_of_eigenvectors} eigenvectors from {len(used)} referenced "
-            f"vertices: choose a number from 1 to {len(used) - 1}, or use a finer mesh."
+            f"{mesh.name}: cannot compute {number_of_eigenvectors} eigenvectors from {len(referenced)} "
+            f"referenced vertices: choose a number from 1 to {len(referenced) - 1}, or use a finer mesh."
         )
     if eigensolver not in get_args(Eigensolver):
         raise InputError(f"{eigensolver!r} is not an eigensolver: choose {', '.join(get_args(Eigensolver))}.")
@@ -117,10 +117,10 @@ def eigenpairs(
     def compute() -> dict[str, np.ndarray]:
         stiffness, areas = assemble_laplacian(mesh, laplacian=laplacian)
         areas = areas / areas.sum()
-        if all_referenced := len(used) == len(areas):
+        if all_referenced := len(referenced) == len(areas):
             local = stiffness, areas
         else:
-            local = stiffness[used][:, used], areas[used]
+            local = stiffness[referenced][:, referenced], areas[referenced]
         with one_blas_thread():
             values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
         # In place, because further copies could fill the memory for a large mesh.
@@ -128,7 +128,7 @@ def eigenpairs(
             column *= np.sign(column[np.argmax(np.abs(column))])
         if not all_referenced:
             eigenvectors = np.zeros((len(areas), number_of_eigenvectors))
-            eigenvectors[used] = vectors
+            eigenvectors[referenced] = vectors
             vectors = eigenvectors
         return {"eigenvalues": values, "eigenvectors": vectors, "vertex_areas": areas}
 

@@ -41,14 +41,15 @@ def assemble_laplacian(
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
         # robust_laplacian requires that every vertex has a face.
-        used = np.flatnonzero(mesh.referenced_vertices)
+        referenced = np.flatnonzero(mesh.referenced_vertices)
         compact = np.full(len(mesh.vertices), -1)
-        compact[used] = np.arange(len(used))
+        compact[referenced] = np.arange(len(referenced))
         local_stiffness, mass = robust_laplacian.mesh_laplacian(
-            np.ascontiguousarray(mesh.vertices[used]), np.ascontiguousarray(compact[mesh.faces])
+            np.ascontiguousarray(mesh.vertices[referenced]), np.ascontiguousarray(compact[mesh.faces])
         )
         scatter = sp.csc_matrix(
-            (np.ones(len(used)), (used, np.arange(len(used)))), shape=(len(mesh.vertices), len(used))
+            (np.ones(len(referenced)), (referenced, np.arange(len(referenced)))),
+            shape=(len(mesh.vertices), len(referenced)),
         )
         return (scatter @ local_stiffness @ scatter.T).tocsc(), scatter @ mass.diagonal()
     stiffness = -igl.cotmatrix(mesh.vertices, mesh.faces).tocsc()

@@ -106,9 +106,9 @@ class Mesh:
     @cached_property
     def referenced_vertices(self) -> Bool[np.ndarray, " n"]:
         """True for vertices with at least one face, False for unreferenced vertices."""
-        used = np.zeros(len(self.vertices), dtype=bool)
-        used[self.faces] = True
-        return used
+        referenced = np.zeros(len(self.vertices), dtype=bool)
+        referenced[self.faces] = True
+        return referenced
 
     @cached_property
     def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
@@ -172,7 +172,7 @@ class Diagnosis:
 
     - `vertices`, `faces`: their numbers.
     - `components`: the number of connected components, without unreferenced vertices.
-    - `unreferenced_vertices`: the number of unreferenced vertices, which no face references.
+    - `unreferenced_vertices`: the number of vertices that no face references.
     - `boundary_edges`, `boundary_loops`: the numbers of edges with one face, and of the connected chains that
       these edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
@@ -247,13 +247,13 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     A `Diagnosis`.
     """
-    unused = int((~mesh.referenced_vertices).sum())
+    unreferenced = int((~mesh.referenced_vertices).sum())
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
-        components=connected_components(mesh.edges, len(mesh.vertices))[0] - unused,
-        unreferenced_vertices=unused,
+        components=connected_components(mesh.edges, len(mesh.vertices))[0] - unreferenced,
+        unreferenced_vertices=unreferenced,
         boundary_edges=len(mesh.boundary_edges),
         boundary_loops=len(np.unique(boundary_chain[mesh.boundary_edges])),
         nonmanifold_edges=len(mesh.nonmanifold_edges),
@@ -282,12 +282,12 @@ def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -
 
     **Returns:** The rows (m, ...), unchanged at referenced vertices.
     """
-    used = mesh_x.referenced_vertices
-    if used.all():
+    referenced = mesh_x.referenced_vertices
+    if referenced.all():
         return matches
-    _, nearest = KDTree(mesh_x.vertices[used]).query(mesh_x.vertices[~used])
+    _, nearest = KDTree(mesh_x.vertices[referenced]).query(mesh_x.vertices[~referenced])
     extended = matches.copy()
-    extended[~used] = matches[used][nearest]
+    extended[~referenced] = matches[referenced][nearest]
     return extended
 
 
@@ -342,9 +342,9 @@ def make_mesh(
     notes = list(notes)
 
     if weld:
-        twin = first_equal_rows(position)
-        welded = int((twin[triangles] != triangles).any(axis=1).sum())
-        triangles = twin[triangles]
+        lowest = first_equal_rows(position)
+        welded = int((lowest[triangles] != triangles).any(axis=1).sum())
+        triangles = lowest[triangles]
         notes.append(
             f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one."
             if welded
@@ -367,17 +367,17 @@ def make_mesh(
             "check the positions and the faces."
         )
     _check_resolution(mesh)
-    rim = np.unique(mesh.boundary_edges)
-    twin = first_equal_rows(position[rim])
-    seam = int((np.bincount(twin, minlength=len(rim))[twin] > 1).sum())
+    boundary = np.unique(mesh.boundary_edges)
+    lowest = first_equal_rows(position[boundary])
+    seam = int((np.bincount(lowest, minlength=len(boundary))[lowest] > 1).sum())
     if seam:
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
-    unused = int((~mesh.referenced_vertices).sum())
-    if unused:
-        notes.append(f"{count_of(unused, 'unreferenced vertex')} (in no face) of {len(position)}.")
+    unreferenced = int((~mesh.referenced_vertices).sum())
+    if unreferenced:
+        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {len(position)}.")
     return replace(mesh, notes=tuple(notes))
 
 
@@ -402,11 +402,11 @@ def _check_resolution(mesh: Mesh) -> None:
     """Refuse positions that floating-point numbers cannot tell from those of their neighbors."""
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
     median = np.median(lengths[lengths > 0])
-    used = np.flatnonzero(mesh.referenced_vertices)
-    middle = np.median(mesh.vertices[used], axis=0)
+    referenced = np.flatnonzero(mesh.referenced_vertices)
+    middle = np.median(mesh.vertices[referenced], axis=0)
     for vertices, center, limit, place in (
         (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
-        (used, middle, LARGEST_DISTANCE, "middle of the mesh"),
+        (referenced, middle, LARGEST_DISTANCE, "middle of the mesh"),
     ):
         distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
         if distances.max() > limit:
@@ -487,6 +487,6 @@ def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)
     starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)
-    twins = np.empty(len(rows), dtype=np.int64)
-    twins[order] = order[starts][np.cumsum(starts) - 1]
-    return twins
+    lowest = np.empty(len(rows), dtype=np.int64)
+    lowest[order] = order[starts][np.cumsum(starts) - 1]
+    return lowest

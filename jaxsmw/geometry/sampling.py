@@ -29,21 +29,21 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
     **Raises:** `InputError` if the mesh has fewer referenced vertices.
     """
-    used = np.flatnonzero(mesh.referenced_vertices)
-    if not 1 <= number_of_samples <= len(used):
+    referenced = np.flatnonzero(mesh.referenced_vertices)
+    if not 1 <= number_of_samples <= len(referenced):
         raise InputError(
-            f"{mesh.name}: cannot choose {number_of_samples} samples from {len(used)} referenced vertices: "
-            f"choose a number from 1 to {len(used)}."
+            f"{mesh.name}: cannot choose {number_of_samples} samples from {len(referenced)} referenced "
+            f"vertices: choose a number from 1 to {len(referenced)}."
         )
-    positions = mesh.vertices[used]
+    positions = mesh.vertices[referenced]
     chosen = np.empty(number_of_samples, dtype=np.int64)
     chosen[0] = np.argmax(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))
-    squared_distance = np.full(len(used), np.inf)
+    squared_distance = np.full(len(referenced), np.inf)
     for index in range(1, number_of_samples):
         offsets = positions - positions[chosen[index - 1]]
         squared_distance = np.minimum(squared_distance, np.einsum("ud,ud->u", offsets, offsets))
         chosen[index] = np.argmax(squared_distance)
-    return used[chosen]
+    return referenced[chosen]
 
 
 class SurfaceSamples(NamedTuple):

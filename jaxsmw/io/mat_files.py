@@ -47,7 +47,7 @@ def parse_variables(data: bytes) -> dict[str, Any]:
         variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
     except InputError:
         raise
-    except Exception:  # SciPy answers damaged files with whatever goes wrong first
+    except Exception:  # damaged files can raise any exception in SciPy
         raise InputError(
             "is damaged or not a .mat file: save it again, with save(..., '-v7') in MATLAB or "
             "scipy.io.savemat in Python."
@@ -94,8 +94,8 @@ def read_matrix(
 ) -> Float64[np.ndarray, "rows columns"]:
     """Read a matrix of real numbers.
 
-    A file with a single matrix is read whatever the name of the matrix is. A single row is read as a column,
-    because lists in MATLAB may be either.
+    A single matrix in a file may have any name. A single row is read as a column, because lists in MATLAB may
+    be either.
 
     **Arguments:**
 

@@ -40,7 +40,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         MAT: a struct `surface` with X, Y, Z (or VERT) and TRIV, counted from 1, as in the TOSCA data set. The
         struct may be a field of another struct, as in the files of `write_spectrum`.
     - `weld`: as in `make_mesh`. Welding changes nothing in an STL file, because its corners are merged
-      already.
+        already.
 
     **Returns:**
 
@@ -285,7 +285,7 @@ def _parse_ply(data: bytes) -> _Polygons:
                 "the file is truncated or its header is wrong, export the mesh again."
             ) from None
     if body[offset:].strip():
-        raise InputError("goes on after the last promised row: the header is wrong, export the mesh again.")
+        raise InputError("continues after the last promised row: the header is wrong, export the mesh again.")
 
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]

@@ -185,7 +185,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             arrays = [file[field] for field in fields]
     except InputError:
         raise
-    except Exception:  # NumPy answers damaged files with whatever goes wrong first
+    except Exception:  # damaged files can raise any exception in NumPy
         raise InputError(f"{path}: is damaged or lacks one of {', '.join(fields)}: write it again.") from None
     return make_spectrum(*arrays, name=name)
 

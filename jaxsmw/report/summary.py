@@ -120,7 +120,7 @@ def write_report(
         refiner=WaveletPreservation() if wavelets is None else wavelets[0],
         statistics=summarize(correspondence, others, expected, steps),
         error_meanings=_ERROR_MEANINGS,
-        figures=[(caption, (directory / f"{name}.png").read_bytes()) for name, caption in captions.items()],
+        figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
     )
     summary = {
@@ -170,8 +170,8 @@ def _save_figures(
     per_vertex: Mapping[str, Float[np.ndarray | Array, " m"]],
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
-) -> tuple[list[Path], dict[str, str]]:
-    """Writes all figures; returns their files, and the captions of the figures on the page by name."""
+) -> tuple[list[Path], dict[Path, str]]:
+    """Writes all figures; returns their files, and the captions of the files that the page shows as well."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.stages[-1].refiner.convention
     figures = {
@@ -188,10 +188,10 @@ def _save_figures(
     if errors:
         figures["quality"] = draw_errors(errors)
         captions["quality"] = _QUALITY_CAPTION
-    files = {directory / f"{name}.png": figure for name, figure in figures.items()}
-    for file, figure in files.items():
-        save_figure(file, figure)
-    return list(files), captions
+    files = {name: directory / f"{name}.png" for name in figures}
+    for name, figure in figures.items():
+        save_figure(files[name], figure)
+    return list(files.values()), {files[name]: caption for name, caption in captions.items()}
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:

@@ -53,8 +53,8 @@ class RegularizedLeastSquares(Solution[None]):
 
     The terms are scaled so that weights near one are comparable, whatever the height of a bank or the units
     of descriptors: C = 0, or either side of a difference alone, costs about k_out. To this end the wavelet
-    term is divided by the mean of the frame function, which is one for a Parseval frame. `F_out` and all
-    `D_out` together are scaled to the squared norm k_out.
+    term is divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled to
+    the squared norm k_out, and so are all `D_out` together.
 
     The wavelet term and the descriptor term have many thousand columns. They are first reduced to k_in
     columns, exactly. Then `optimistix.least_squares` takes Gauss–Newton steps, and conjugate gradients solve
@@ -89,10 +89,16 @@ class RegularizedLeastSquares(Solution[None]):
             if getattr(self, term) is not None:
                 check_between(self, term, getattr(self, term))
         if self.wavelet_preservation is None and self.descriptor_preservation is None:
-            raise ValueError("without wavelet and descriptor preservation nothing ties C to the shapes")
+            raise ValueError(
+                "C is undetermined without wavelet_preservation and descriptor_preservation: give one "
+                "of these weights"
+            )
         weighted = self.descriptor_preservation is not None or self.descriptor_commutativity is not None
         if weighted != (self.descriptors is not None):
-            raise ValueError("descriptors and a weight for their preservation or commutativity go together")
+            raise ValueError(
+                "descriptors need a weight, descriptor_preservation or descriptor_commutativity, and these "
+                "weights need descriptors"
+            )
         if not self.tolerance > 0 or self.max_steps < 1:
             raise ValueError(f"tolerance={self.tolerance} and max_steps={self.max_steps} must be positive")
         if (
@@ -186,7 +192,7 @@ class RegularizedLeastSquares(Solution[None]):
     ) -> QuadraticEnergy:
         """Returns the weighted sum of the given energy and descriptor preservation."""
         if (energy is None) != (self.wavelet_preservation is None):
-            raise ValueError("an energy and a weight for it, wavelet_preservation, go together")
+            raise ValueError("an energy needs the weight wavelet_preservation, the weight needs an energy")
         quadratic = QuadraticEnergy.zero(*shape, dtype)
         if energy is not None and self.wavelet_preservation is not None:
             quadratic += self.wavelet_preservation.astype(dtype) * energy
