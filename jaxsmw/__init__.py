@@ -1,18 +1,29 @@
 """Deformable shape correspondence in JAX by multiscale spectral manifold wavelets preservation.
 
-The public names stand in `__init__.pyi`; they are loaded when first used, so that `jaxsmw --help` need not
-wait for JAX.
+`__init__.pyi` lists the public names. A name is loaded at its first use, so `jaxsmw --help` need not wait for
+JAX. This module imports hardly anything, so the command line handles Ctrl-C soon after its start.
 """
 
-import lazy_loader
-
-_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from functools import cache
 
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        # Imported late: this module takes as long to load as all the rest of `jaxsmw --help`.
         from importlib import metadata
 
         return metadata.version("jaxsmw")
-    return _load(name)
+    load, _, names = _public()
+    return names if name == "__all__" else load(name)
+
+
+def __dir__() -> list[str]:
+    _, list_names, _ = _public()
+    return list_names()
+
+
+@cache
+def _public() -> tuple:
+    """Returns the module's `__getattr__`, `__dir__` and `__all__` for the public names."""
+    import lazy_loader
+
+    return lazy_loader.attach_stub(__name__, __file__)

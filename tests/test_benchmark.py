@@ -209,6 +209,19 @@ def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
         assert "cannot be used (File name too long): choose another name" in message
 
 
+def test_functions_refuse_names_longer_than_the_file_system_allows(scape):
+    """The command line refuses such names before it calls these functions."""
+    calls = [
+        (lambda: open_data_set(TOO_LONG), "is not a directory"),
+        (lambda: find_methods([TOO_LONG]), "is not a method"),
+        (lambda: Settings(TOO_LONG), "is not an initial map"),
+        (lambda: choose_pairs(open_data_set(scape), TOO_LONG, 0), "cannot be read as text"),
+    ]
+    for call, message in calls:
+        with pytest.raises(InputError, match=f"{TOO_LONG}.*{message}"):
+            call()
+
+
 class Here(Executor):
     """Runs each task immediately, in this process."""
 

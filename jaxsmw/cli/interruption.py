@@ -11,18 +11,21 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
+from _thread import allocate_lock
 from contextlib import contextmanager, suppress
-from typing import Any
+
+# Few and fast imports: Ctrl-C leaves a traceback until the signal is handled.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 # The main thread ends the process as soon as it runs Python code. The second thread acts after these seconds.
 _PATIENCE = 0.2
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
 # The first interruption locks this for good.
-_ending = threading.Lock()
+_ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
@@ -30,6 +33,8 @@ def end_when_interrupted() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         return
     signal.signal(signal.SIGINT, _end)
+    import threading
+
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -69,7 +74,7 @@ def _wait_for_signal(reading: int) -> None:
     _die()
 
 
-def _end(*_: Any) -> None:
+def _end(*_: object) -> None:
     if not _ending.acquire(blocking=False):
         return
     console = -1
@@ -97,9 +102,9 @@ def _remove_unfinished_files() -> None:
 def _die() -> None:
     """Die of SIGINT: a shell ends its loop only if the interrupted command dies of the signal."""
     with suppress(Exception):
-        if threading.current_thread() is threading.main_thread():
+        try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        else:  # `signal.signal` works in the main thread only
+        except ValueError:  # refused outside of the main thread
             import ctypes
 
             ctypes.pythonapi.PyOS_setsig(signal.SIGINT, signal.SIG_DFL)
