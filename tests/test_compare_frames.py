@@ -274,7 +274,7 @@ def test_projection_gives_the_nearest_orthogonal_matrix():
     for update in ("filtering", "projected"):
         method = variants.refiner(DEFAULT._replace(update=update), Meyer(4), x, y, number_of_filters=4)
         problem = method.prepare(Problem(x, y))
-        found[update] = np.asarray(method.update(problem, start, None)[0])
+        found[update] = np.asarray(method.update(problem, start, None)[0].functional_map)
     np.testing.assert_allclose(found["projected"] @ found["projected"].T, np.eye(10), atol=1e-12)
     nearest = np.linalg.norm(found["projected"] - found["filtering"])
     generator = np.random.default_rng(0)
@@ -306,7 +306,11 @@ def test_only_what_is_provably_equal_is_not_measured():
             variants.refiner(variant, banks[frame], x, y, number_of_filters=FILTERS)
             for variant in (Variant(frame, u, "pushforward") for u in ("filtering", "least squares (area)"))
         )
-        maps = [m.update(m.prepare(x, y), jnp.arange(150), None)[0] for m in (one, other)]
+        prepared = [m.prepare(Problem(x, y)) for m in (one, other)]
+        maps = [
+            m.update(p, jnp.arange(150), None)[0].functional_map
+            for m, p in zip((one, other), prepared, strict=True)
+        ]
         np.testing.assert_allclose(*maps, atol=1e-9)
 
 

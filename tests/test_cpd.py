@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from jaxsmw import decode, encode
+from jaxsmw.core.refiner import Problem
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.opponents.cpd import (
     DriftRecovery,
@@ -183,11 +184,12 @@ def test_refiner_recovers_by_drift(pair):
     """`DriftRecovery` encodes by least squares and recovers by drift."""
     _, x, y = pair
     refiner = DriftRecovery(rank=LOW_RANK, drift_iterations=4)
-    problem = refiner.prepare(Problem(x, y))
+    prepared = refiner.prepare(Problem(x, y))
     initial_map = jnp.asarray(np.where(np.arange(M) % 3 > 0, ORDER, 0), jnp.int32)
-    functional_map, _ = refiner.update(problem, initial_map, None)
+    state, _ = refiner.update(prepared, initial_map, None)
+    functional_map = state.functional_map
     np.testing.assert_allclose(functional_map, encode(initial_map, x, y), atol=1e-12)
-    found = refiner.recover(problem, functional_map)
+    found = refiner.recover(prepared, state)
     drifted = recover_by_drift(functional_map, x, y, rank=LOW_RANK, iterations=4)
     np.testing.assert_array_equal(found, drifted)
     assert np.any(found != decode(functional_map, x, y))
