@@ -235,7 +235,7 @@ def test_tosca_in_matlab_files(tmp_path):
     for name, fault in (
         ("other", "holds no struct 'surface'"),
         ("damaged", "is damaged"),
-        ("text", "is damaged or no file"),
+        ("text", "is damaged or not a .mat file"),
     ):
         with pytest.raises(InputError, match=f"{name}.mat: {fault}"):
             read_mesh(tmp_path / f"{name}.mat")
