@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.choices import Eigensolver, Laplacian
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_PRESET, Eigensolver, Laplacian
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
@@ -89,7 +89,7 @@ class Correspondence:
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
-        """The last functional map: from functions on Y to functions on X, in the pullback convention."""
+        """The last functional map, in the convention of the last refiner (pullback: Y to X)."""
         return np.asarray(self.refinement.functional_map)
 
     def surface_points(self) -> SurfacePoints:
@@ -203,8 +203,8 @@ def match(
     mesh_x: Mesh | MeshLike,
     mesh_y: Mesh | MeshLike,
     *,
-    preset: PresetName | Preset | Stage | Sequence[Stage] = "accurate",
-    init: InitialMap | ArrayLike | SurfacePoints = "shot",
+    preset: PresetName | Preset | Stage | Sequence[Stage] = DEFAULT_PRESET,
+    init: InitialMap | ArrayLike | SurfacePoints = DEFAULT_INITIAL_MAP,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
