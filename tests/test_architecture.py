@@ -1,14 +1,19 @@
-"""Imports between the rooms of the house point one way, and the public names stay few."""
+"""The layers of the library import only from lower layers, imports have no cycle, and public names stay few."""
 
 import ast
 import graphlib
+import sys
 from pathlib import Path
 
 import jaxsmw
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from draw_imports import NAMESPACES, imported_modules
+
 LIBRARY = Path(jaxsmw.__file__).parent
-# From the ground floor up: a room imports from itself and from rooms before it.
-ROOMS = (
+# The layers from bottom to top: a layer imports only from itself and from layers before it.
+LAYERS = (
     "errors",
     "choices",
     "core",
@@ -29,42 +34,31 @@ ROOMS = (
 )
 
 
-def imports():
-    """Each module of the library with the modules of the library that it imports, anywhere in its code."""
-    modules = {".".join(p.relative_to(LIBRARY).with_suffix("").parts): p for p in LIBRARY.rglob("*.py")}
-    names = {name.removesuffix(".__init__"): path for name, path in modules.items() if name != "__init__"}
-    found = {}
-    for name, path in names.items():
-        found[name] = set()
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxsmw"):
-                base = node.module.removeprefix("jaxsmw").removeprefix(".")
-                inner = {f"{base}.{alias.name}".removeprefix(".") for alias in node.names}
-                found[name] |= {one if one in names else base for one in inner} - {""}
-    return found
-
-
-def test_rooms_import_only_from_rooms_below():
+def test_layers_import_only_from_lower_layers():
     upwards = [
         f"{module} imports {other}"
-        for module, others in imports().items()
+        for module, others in imported_modules().items()
         for other in others
-        if (room := module.split(".")[0]) in ROOMS and ROOMS.index(other.split(".")[0]) > ROOMS.index(room)
+        if (layer := module.split(".")[0]) in LAYERS and LAYERS.index(other.split(".")[0]) > LAYERS.index(layer)
     ]
     assert not upwards
 
 
-def test_every_module_lives_in_a_room():
-    namespaces = {"__main__", "banks", "functional_maps", "learning"}
-    assert {module.split(".")[0] for module in imports()} <= {*ROOMS, *namespaces}
+def test_every_module_belongs_to_a_layer_or_a_namespace():
+    assert {module.split(".")[0] for module in imported_modules()} <= {*LAYERS, *NAMESPACES}
+
+
+def test_public_names_stay_few():
+    """More names belong in `jaxsmw.banks`, `jaxsmw.io`, `jaxsmw.evaluation` and the like."""
+    assert len(jaxsmw.__all__) <= 50
 
 
 def test_imports_have_no_cycle():
-    graphlib.TopologicalSorter(imports()).prepare()
+    graphlib.TopologicalSorter(imported_modules()).prepare()
 
 
-def test_the_core_knows_no_host_libraries():
-    """Traced code has no business with files, SciPy's solvers or meshes."""
+def test_the_core_imports_no_host_libraries():
+    """JAX traces the code of the core, so this code must not use files, SciPy's solvers or meshes."""
     for path in (LIBRARY / "core").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             found = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
