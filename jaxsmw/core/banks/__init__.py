@@ -10,9 +10,9 @@ the lowest eigenvalues.
   any bank into a tight frame.
 """
 
-from jaxsmw.core.banks.base import FilterBank, sample_bank
+from jaxsmw.core.banks.base import FilterBank
 from jaxsmw.core.banks.dilates import CubicSpline, Heat, MexicanHat
-from jaxsmw.core.banks.frames import FrameBounds, Tightened, frame_bounds, frame_function, tighten
+from jaxsmw.core.banks.frames import FrameBounds, frame_bounds, frame_function, tighten
 from jaxsmw.core.banks.learned import SoftmaxFrame
 from jaxsmw.core.banks.single import ExponentialWindow, Identity, LowPass
 from jaxsmw.core.banks.transitions import Held, Meyer, Papadakis, Regular, Simoncelli, SimpleTight
@@ -41,11 +41,9 @@ __all__ = [
     "SimpleTight",
     "SoftmaxFrame",
     "SpectralDistribution",
-    "Tightened",
     "Warp",
     "Warped",
     "frame_bounds",
     "frame_function",
-    "sample_bank",
     "tighten",
 ]

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.choices import Search
-from jaxsmw.core.banks import FilterBank, Meyer, sample_bank
+from jaxsmw.core.banks import FilterBank, Meyer
+from jaxsmw.core.banks.base import sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
