@@ -35,7 +35,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
 
 MethodName = Literal[
-    "start",
+    "initial",
     "mwp",
     "accurate",
     "mwp-sampled",

@@ -48,7 +48,7 @@ from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
-FIG9_METHODS = ("start", "mwp", "mwp-sampled", "zoomout")
+FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
 # fig9 uses one of so many pairs that the other experiments use.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
@@ -175,7 +175,7 @@ def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[
 
 def other_settings() -> dict[str, Method]:
     """Returns the methods with published settings, and with each of the changes in `_CHANGES`, by name."""
-    found = {"start": METHODS["start"]}
+    found = {"initial": METHODS["initial"]}
     for name, changes in _CHANGES.items():
         method = found[name] = METHODS[name]
         assert dataclasses.is_dataclass(method)
@@ -212,7 +212,7 @@ def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
 def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
     """Returns all methods that suit the pairs; with `--quick` three fast methods."""
     every = suited_methods(pairs)
-    return {name: every[name] for name in ("start", "mwp", "zoomout-sampled")} if options.quick else every
+    return {name: every[name] for name in ("initial", "mwp", "zoomout-sampled")} if options.quick else every
 
 
 def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:

@@ -53,7 +53,7 @@ def scape(tmp_path_factory) -> Path:
 
 
 def command(data: Path, output: Path, *options: str) -> list[str]:
-    methods = ["start", "mwp"]
+    methods = ["initial", "mwp"]
     arguments = ["benchmark", data, "--output", output, "--methods", *methods, *options]
     return [sys.executable, "-m", "jaxsmw", *map(str, arguments)]
 
@@ -76,7 +76,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
 
     second = subprocess.run(call, check=True, capture_output=True, text=True)
     lines = results.read_text().splitlines()
-    assert lines[: len(kept)] == kept  # a second measurement would have other times
+    assert lines[: len(kept)] == kept  # a second measurement would have different times
     assert len(lines) == len(set(lines)) == 1 + 6 * 2
     assert second.stdout.startswith("| method | mean error |")
     assert run_command(call[3:]) == 0
@@ -85,9 +85,9 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     table = pyarrow.parquet.read_table(output / "results.parquet").to_pylist()
     assert len(table) == 12 and table[0]["curve"][-1] <= 1 and isinstance(table[0]["mean"], float)
     means = {
-        name: np.mean([row["mean"] for row in table if row["method"] == name]) for name in ("start", "mwp")
+        name: np.mean([row["mean"] for row in table if row["method"] == name]) for name in ("initial", "mwp")
     }
-    assert means["mwp"] < 0.5 * means["start"]
+    assert means["mwp"] < 0.5 * means["initial"]
     for name in ("summary.md", "table.tex", "curves.png", "shapes.csv", "provenance.json"):
         assert (output / name).stat().st_size > 100
 
@@ -96,8 +96,8 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
 
 
 @pytest.mark.cluster
-def test_a_dask_cluster_loses_a_worker(scape, tmp_path):
-    """A real scheduler and two workers on loopback: all results arrive, and none arrives twice."""
+def test_each_result_arrives_once_although_a_dask_worker_is_killed(scape, tmp_path):
+    """A real Dask scheduler and two workers communicate over the loopback interface."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     started = [
         subprocess.Popen(
@@ -151,7 +151,7 @@ def test_a_scheduler_that_does_not_answer_is_named(scape, tmp_path):
             pass
 
 
-def test_pairs_are_chosen(scape, tmp_path):
+def test_pairs_are_drawn_by_the_seed_or_read_from_a_list(scape, tmp_path):
     data_set = open_data_set(scape)
     every = [pair.name for pair in data_set.pairs]
     assert len(every) == 6
@@ -171,13 +171,13 @@ def test_pairs_are_chosen(scape, tmp_path):
 
 
 def test_unknown_methods_and_initial_maps_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"'magic' is not a method: choose from start, mwp"):
+    with pytest.raises(InputError, match=r"'magic' is not a method: choose from initial, mwp"):
         find_methods(["mwp", "magic"])
     with pytest.raises(InputError, match=r"'luck' is not an initial map: choose from shot"):
         Settings("luck")
     for name in ("mwp", "mine", "other/mine"):
         (tmp_path / name).mkdir(parents=True)
-    assert list(find_methods(["mwp", "start", "mwp", str(tmp_path / "mine")])) == ["mwp", "start", "mine"]
+    assert list(find_methods(["mwp", "initial", "mwp", str(tmp_path / "mine")])) == ["mwp", "initial", "mine"]
     for names in (["mwp"], ["mine", "other/mine"]):
         with pytest.raises(InputError, match="another method is called m"):
             find_methods([str(tmp_path / name) for name in names])
@@ -222,8 +222,8 @@ def test_functions_refuse_names_longer_than_the_file_system_allows(scape):
             call()
 
 
-class Here(Executor):
-    """Runs each task immediately, in this process."""
+class ImmediateExecutor(Executor):
+    """Run each task immediately, in this process."""
 
     def submit(self, function, /, *arguments, **options):
         future = Future()
@@ -235,15 +235,15 @@ class Here(Executor):
 
 
 def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
-    """Runs some methods on some pairs, in this process."""
+    """Run some methods on some pairs, in this process."""
     data_set = open_data_set(data)
     chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
-    return run_benchmark(data_set, chosen, output, find_methods(names), every, Here())
+    return run_benchmark(data_set, chosen, output, find_methods(names), every, ImmediateExecutor())
 
 
 @pytest.fixture
 def measure(scape, tmp_path):
-    """`run_here` on the poses, with results in the test's own directory."""
+    """`run_here` on the shapes of `scape`, with results in the temporary directory of the test."""
 
     def run(names, *, output=tmp_path, data=scape, **options):
         return run_here(names, output, data, **options)
@@ -255,7 +255,7 @@ def measure(scape, tmp_path):
 def finished(scape, tmp_path_factory) -> Path:
     """The results of one method on two pairs."""
     directory = tmp_path_factory.mktemp("finished")
-    run_here(["start"], directory, scape)
+    run_here(["initial"], directory, scape)
     return directory
 
 
@@ -270,28 +270,28 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     output = tmp_path / "output"
     output.mkdir()
     rows = measure(
-        ["start", "mwp", str(tmp_path / "perfect")], output=output, init=str(tmp_path / "rough")
+        ["initial", "mwp", str(tmp_path / "perfect")], output=output, init=str(tmp_path / "rough")
     ).rows
     means = {
-        name: [float(r["mean"]) for r in rows if r["method"] == name] for name in ("start", "mwp", "perfect")
+        name: [float(r["mean"]) for r in rows if r["method"] == name] for name in ("initial", "mwp", "perfect")
     }
     assert means["perfect"] == [0, 0]
-    assert min(means["start"]) > 0.1 and max(means["mwp"]) < 0.02
+    assert min(means["initial"]) > 0.1 and max(means["mwp"]) < 0.02
     assert [row["seconds"] for row in rows if row["method"] == "perfect"] == ["nan", "nan"]
     other = tmp_path / "other"
     other.mkdir()
     (tmp_path / "perfect" / "mesh000_mesh001.map").unlink()
-    with pytest.raises(InputError, match=r"mesh000_mesh001.map: is missing, like 1 of 6 maps"):
-        measure(["start", str(tmp_path / "perfect")], output=other, pairs="6")
+    with pytest.raises(InputError, match=r"mesh000_mesh001.map: is missing \(1 of 6 maps are missing\)"):
+        measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
     (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
-    found = measure(["start", str(tmp_path / "perfect")], output=other, pairs="6")
+    found = measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
     assert list(found.failures) == ["mesh000 to mesh001"] and len(found.rows) == 10
     with pytest.raises(InputError, match=r"all other results are kept:\nmesh000 to mesh001: .*has 2 lines"):
         found.check()
 
 
 def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(measure, tmp_path):
-    """The ground truth of a sphere is the identity, its mirrored ground truth and the map are the reflection."""
+    """The ground truth of the sphere is the identity. The mirrored ground truth and the map are a reflection."""
     vertices, faces = sphere_mesh(3)
     reflected = KDTree(vertices).query(vertices * [-1, 1, 1])[1]
     data = tmp_path / "data"
@@ -307,7 +307,7 @@ def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(meas
         output = tmp_path / f"mirrored-{mirrored}"
         output.mkdir()
         (row, _) = measure(
-            ["start"], data=data, output=output, mirrored=mirrored, init=str(tmp_path / "flipped")
+            ["initial"], data=data, output=output, mirrored=mirrored, init=str(tmp_path / "flipped")
         ).rows
         assert row["truth"] == ("mirrored" if mirrored else "direct")
         assert float(row["mean"]) == 0 if mirrored else float(row["mean"]) > 0.2
@@ -317,27 +317,27 @@ def test_a_changed_shape_is_detected(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     output.mkdir()
-    measure(["start"], data=data, output=output)
+    measure(["initial"], data=data, output=output)
     for file in data.iterdir():
         file.write_text(file.read_text() + "\n")
     with pytest.raises(InputError, match="has changed since results"):
-        measure(["start"], data=data, output=output)
+        measure(["initial"], data=data, output=output)
 
 
-def test_one_bad_shape_does_not_stop_the_others(measure, scape, tmp_path):
+def test_a_bad_shape_does_not_stop_other_pairs(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     output.mkdir()
     contents = (data / "mesh002.off").read_text()
     (data / "mesh002.off").write_text(contents[: len(contents) // 2])
-    found = measure(["start"], data=data, output=output, pairs="6")
+    found = measure(["initial"], data=data, output=output, pairs="6")
     assert len(found.rows) == 2 and len((output / "results.csv").read_text().splitlines()) == 1 + 2
     with pytest.raises(InputError) as caught:
         found.check()
     _, *causes = str(caught.value).splitlines()
     assert len(causes) == 1 and "and 2 more: " in causes[0] and causes[0].count("mesh002.off") == 1
     (data / "mesh002.off").write_text(contents)
-    found = measure(["start"], data=data, output=output, pairs="6")
+    found = measure(["initial"], data=data, output=output, pairs="6")
     found.check()
     assert len(found.rows) == 6
 
@@ -368,12 +368,12 @@ def with_words_for_numbers(lines: list[str]) -> list[str]:
         (lambda lines: [lines[0], '"' + lines[1], *lines[2:]], "is not a table of results"),
     ],
 )
-def test_damaged_results_are_named_and_left_as_they_are(measure, finished, tmp_path, name, damage, message):
+def test_damaged_results_are_named_and_not_changed(measure, finished, tmp_path, name, damage, message):
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     damaged = "".join(f"{line}\n" for line in damage((tmp_path / name).read_text().splitlines()))
     (tmp_path / name).write_text(damaged)
     with pytest.raises(InputError, match=message) as caught:
-        measure(["start"])
+        measure(["initial"])
     assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
     assert "restore the file, or remove it" in str(caught.value)
     assert (tmp_path / name).read_text() == damaged
@@ -381,19 +381,19 @@ def test_damaged_results_are_named_and_left_as_they_are(measure, finished, tmp_p
 
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv", "provenance.json"])
 @pytest.mark.parametrize("contents", [bytes(range(256)) * 4, b"\0" * 100 + b"\n", b"not a table", b"\xff\n"])
-def test_files_of_another_kind_are_named_and_left_as_they_are(measure, finished, tmp_path, name, contents):
+def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_path, name, contents):
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     (tmp_path / name).write_bytes(contents)
     with pytest.raises(
         InputError, match=f"{name}(, line 1)?: is (not the header|not a table|damaged)"
     ) as caught:
-        measure(["start"])
+        measure(["initial"])
     assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents
 
 
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize("kept", [None, 0, 10])
-def test_removed_and_empty_files_and_unfinished_headers_are_measured_again(
+def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
     measure, finished, tmp_path, name, kept
 ):
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
@@ -401,15 +401,15 @@ def test_removed_and_empty_files_and_unfinished_headers_are_measured_again(
     (tmp_path / name).unlink()
     if kept is not None:
         (tmp_path / name).write_bytes(contents[:kept])
-    assert len(measure(["start"]).rows) == 2
+    assert len(measure(["initial"]).rows) == 2
     header, *rows = (tmp_path / name).read_text().splitlines()
     assert header == contents.decode().splitlines()[0]
     assert len(rows) == contents.decode().count("\n") - 1
 
 
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
-    call = ["benchmark", str(scape), "--methods", "start", "--pairs", "1", "--output", str(tmp_path)]
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(ImmediateExecutor()))
+    call = ["benchmark", str(scape), "--methods", "initial", "--pairs", "1", "--output", str(tmp_path)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 0
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
     capsys.readouterr()
@@ -418,13 +418,13 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
     assert "is not a table of results" in message and "remove it to measure its rows again" in message
 
 
-def test_a_benchmark_leaves_the_calling_process_as_it_is(measure, monkeypatch):
-    """Environment, listeners and compiled programs stay, though measuring would release programs in a worker."""
+def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
+    """The environment, the listeners and the compiled programs are kept. Only workers release programs."""
     monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
     double = jax.jit(lambda x: 2 * x)
     double(1.0)
     environment, listeners = dict(os.environ), list(monitoring.get_event_duration_listeners())
-    assert len(measure(["start", "mwp"]).rows) == 4
+    assert len(measure(["initial", "mwp"]).rows) == 4
     assert dict(os.environ) == environment
     assert monitoring.get_event_duration_listeners() == listeners
     assert double._cache_size() == 1
@@ -442,30 +442,30 @@ def test_importing_the_benchmark_registers_no_listener():
     assert found.stdout == "True\n"
 
 
-def test_tables_show_the_measured_pairs(scape, tmp_path, monkeypatch, capsys):
+def test_tables_are_written_although_a_shape_cannot_be_read(scape, tmp_path, monkeypatch, capsys):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     (data / "mesh002.off").write_text("OFF\n1")
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(Here()))
-    call = ["benchmark", str(data), "--methods", "start", "--output", str(output)]
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(ImmediateExecutor()))
+    call = ["benchmark", str(data), "--methods", "initial", "--output", str(output)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 2
     printed = capsys.readouterr()
-    assert "| start |" in printed.out and "| start |" in (output / "summary.md").read_text()
+    assert "| initial |" in printed.out and "| initial |" in (output / "summary.md").read_text()
     assert "2 of 6 pairs" in (output / "summary.md").read_text()
     assert "5 shapes or pairs could not be measured" in (output / "summary.md").read_text()
     assert printed.err.count("mesh002.off:") == 1 and (output / "results.parquet").exists()
 
 
-def test_results_of_another_data_set_are_not_mixed_in(measure, scape, tmp_path):
+def test_results_of_another_data_set_are_refused(measure, scape, tmp_path):
     output, data = tmp_path / "output", tmp_path / "data"
     output.mkdir()
-    measure(["start"], output=output)
+    measure(["initial"], output=output)
     for file in scape.iterdir():
         data.mkdir(exist_ok=True)
         shutil.copy(file, data / file.name.replace("mesh", "tr_reg_"))
     kept = (output / "results.csv").read_bytes()
     with pytest.raises(InputError, match=r"results of another data set, with a shape mesh00\d"):
-        measure(["start"], data=data, output=output)
+        measure(["initial"], data=data, output=output)
     assert (output / "results.csv").read_bytes() == kept
 
 
@@ -500,7 +500,7 @@ def test_tables_summarise_the_rows():
 
 
 class Slow(Method):
-    """Compiles a program in each run, takes some seconds, and counts its runs."""
+    """A method that compiles a program in each run, sleeps for some seconds, and counts its runs."""
 
     number_of_eigenvectors = 1
     reference = "nothing"
@@ -516,8 +516,8 @@ class Slow(Method):
         ), RESULTS.successful
 
 
-def test_times_are_without_compilation(monkeypatch):
-    """A method that compiles runs again, unless its run takes long."""
+def test_times_exclude_compilation(monkeypatch):
+    """A method runs a second time if its first run compiles a program and does not take long."""
     monkeypatch.setattr(measurement, "_LONG", 0.5)
     monkeypatch.setattr(measurement, "_warm", {"short"})
     spectrum = random_spectrum(30, 5, seed=0)
@@ -539,7 +539,7 @@ def test_the_first_row_of_a_table_is_its_header():
 
 
 def test_the_digest_covers_all_code_that_results_depend_on():
-    """After a change of any such code, results are not mixed with older results."""
+    """The digest prevents results of changed code from being mixed with older results."""
     measured = {path.resolve() for path in measured_code()}
     script = "import sys, jaxsmw.evaluation.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
     found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)

@@ -77,7 +77,7 @@ def test_interrupted_imports(pair, tmp_path, module):
 IN_GARBAGE_COLLECTION = """
     import gc
     def interrupt_late(phase, _):
-        if phase == "start" and "jaxsmw.matching" in sys.modules:
+        if phase == "initial" and "jaxsmw.matching" in sys.modules:
             gc.callbacks.clear()
             interrupt()
     gc.callbacks.append(interrupt_late)
@@ -137,7 +137,7 @@ def test_an_interrupted_benchmark(tmp_path):
     data.mkdir()
     for number in range(3):
         write_mesh(data / f"mesh00{number}.off", bumpy_mesh(3))
-    call = ("benchmark", data, "--methods", "start", "--workers", "1", "--output", output)
+    call = ("benchmark", data, "--methods", "initial", "--workers", "1", "--output", output)
     process = started("", *call, start_new_session=True)
     while not (output / "shapes.csv").exists():
         assert process.poll() is None

@@ -68,7 +68,7 @@ def test_other_meshes_keep_the_ground_truth(data, tmp_path, name):
 @pytest.fixture
 def command(tmp_path, monkeypatch):
     """Runs the command in this process with two methods, and returns its exit code."""
-    some = {name: METHODS[name] for name in ("start", "mwp")}
+    some = {name: METHODS[name] for name in ("initial", "mwp")}
     monkeypatch.setattr(reproduce_paper, "methods", lambda *_: some)
     monkeypatch.setattr(reproduce_paper, "open_executor", lambda *_: ThreadPoolExecutor(1))
 

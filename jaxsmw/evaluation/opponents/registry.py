@@ -1,4 +1,4 @@
-"""The methods by the names that the command line and the results use."""
+"""The methods by name. The command line and the results use these names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxsmw.evaluation.opponents.spectral_icp import NO_FILTER, SPECTRAL_ICP
 from jaxsmw.evaluation.opponents.zoomout import ZOOMOUT, ZOOMOUT_SAMPLED
 
 METHODS: dict[str, Method] = {
-    "start": UNREFINED,
+    "initial": UNREFINED,
     "mwp": MWP,
     "accurate": ACCURATE,
     "mwp-sampled": MWP_SAMPLED,
@@ -35,6 +35,7 @@ METHODS: dict[str, Method] = {
 """The methods that need no other library, by name, in the order of the tables."""
 
 MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
+"""The largest number of eigenvectors that any of `METHODS` uses."""
 
 
 def known_methods() -> dict[str, Method]:
@@ -48,7 +49,12 @@ def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
 
 
 def find_methods(names: Iterable[str]) -> dict[str, Method]:
-    """Looks up methods by name; a name may also be a directory with maps that were computed elsewhere.
+    """Returns methods by name.
+
+    **Arguments:**
+
+    - `names`: names of known methods, or directories with maps of other programs (files `X_Y.map`).
+      Repeated names count once.
 
     **Returns:** The methods, each under its own name or under the name of its directory.
 
@@ -69,7 +75,7 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
         directory = Path(name).resolve()
         if directory.name in {**known, **found}:
             raise InputError(
-                f"{directory}: another method is called {directory.name} already: rename the directory."
+                f"{directory}: another method already has the name {directory.name}: rename the directory."
             )
         found[directory.name] = PublishedMaps(directory)
     return found
