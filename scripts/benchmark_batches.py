@@ -1,11 +1,12 @@
-"""How many pairs a second a device refines, one by one and side by side, beside its matrix products.
+"""Measures how many pairs per second a device refines, one by one and in batches.
 
     python scripts/benchmark_batches.py [--vertices N] [--eigenvectors K] [--batch-sizes B ...] [--quick]
 
-Ways to run over the same pairs, in turns in one process, in float32, 3 iterations: a Python loop over
-`refine`, `jax.lax.map`, `jax.vmap` of several sizes, and `jaxsmw.refine_pairs`, which is what users call and
-which includes the transfer of starts and results. The floor is the matrix products of all iterations alone,
-in full float32. Memory is what the compiled program says it takes besides its arguments.
+The script refines the same pairs in several ways, in turns in one process, in float32 with 3 iterations: by
+a Python loop over `refine`, by `jax.lax.map`, by `jax.vmap` with several batch sizes, and by
+`jaxsmw.refine_pairs`. Users call `refine_pairs`; its time includes the transfer of initial maps and results.
+The lower bound is the time of the matrix products of all iterations alone, in full float32. The memory is the
+temporary memory that the compiled program reports, without its arguments.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, medians, random_spectrum
+from benchmark_speed import ITERATIONS, medians
 from jax import lax
 from jaxtyping import Array, Int
 
@@ -31,24 +32,35 @@ from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
 
 
-def one(pair: Pair) -> Refinement:
+def refine_one(pair: Pair) -> Refinement:
     return refine(*pair, iterations=ITERATIONS)
 
 
-def mapped(batch: Pair) -> Refinement:
-    return lax.map(one, batch)
+def one_by_one(batch: Pair) -> Refinement:
+    return lax.map(refine_one, batch)
 
 
-def side_by_side(batch: Pair, size: int) -> Refinement:
-    return lax.map(one, batch, batch_size=size)
+def in_batches(batch: Pair, size: int) -> Refinement:
+    return lax.map(refine_one, batch, batch_size=size)
+
+
+def random_spectrum(generator: np.random.Generator, n: int, k: int) -> Spectrum:
+    """Return a random spectrum of n vertices and k eigenvectors that belongs to no mesh."""
+    orthonormal, _ = np.linalg.qr(generator.standard_normal((n, k)))
+    return Spectrum(
+        jnp.asarray(4 * np.pi * np.arange(k), jnp.float32),
+        jnp.asarray(np.sqrt(n) * orthonormal, jnp.float32),
+        jnp.full(n, 1 / n, jnp.float32),
+        jnp.ones(n, bool),
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("--vertices", type=int, default=5000)
-    parser.add_argument("--eigenvectors", type=int, default=100)
+    parser.add_argument("--vertices", type=int, default=5000, help="(default: %(default)s)")
+    parser.add_argument("--eigenvectors", type=int, default=100, help="(default: %(default)s)")
     parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64])
     parser.add_argument("--repeats", type=int, default=5)
@@ -63,11 +75,11 @@ def main() -> None:
     generator = np.random.default_rng(0)
     shapes = [random_spectrum(generator, n, k) for _ in range(8)]
     pairs = [(i % 8, (i // 8 + i + 1) % 8) for i in range(count)]
-    starts = [jnp.asarray(generator.integers(0, n, n), jnp.int32) for _ in pairs]
+    initial_maps = [jnp.asarray(generator.integers(0, n, n), jnp.int32) for _ in pairs]
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
-    batch = x, y, jnp.stack(starts)
+    batch = x, y, jnp.stack(initial_maps)
 
-    # What all iterations of one pair multiply, several pairs at once, of which only a maximum is kept.
+    # The matrix products of one iteration, for several pairs at once. Only the maxima are kept.
     @jax.jit
     def products(a: Array, b: Array) -> Array:
         return lax.map(
@@ -76,12 +88,12 @@ def main() -> None:
             batch_size=min(4, count),
         )
 
-    separate = [(shapes[i], shapes[j], start) for (i, j), start in zip(pairs, starts, strict=True)]
+    separate = [(shapes[i], shapes[j], T) for (i, j), T in zip(pairs, initial_maps, strict=True)]
 
-    programs = {"lax.map": jax.jit(mapped)}
+    programs = {"lax.map": jax.jit(one_by_one)}
     for size in options.batch_sizes:
         if size <= count:
-            programs[f"vmap of {size}"] = jax.jit(partial(side_by_side, size=size))
+            programs[f"vmap of {size}"] = jax.jit(partial(in_batches, size=size))
     memory = {
         name: program.lower(batch).compile().memory_analysis().temp_size_in_bytes
         for name, program in programs.items()
@@ -93,11 +105,11 @@ def main() -> None:
     seconds = medians(
         {
             "products alone": lambda: [products(x.eigenvectors, y.eigenvectors) for _ in range(ITERATIONS)],
-            "loop": lambda: [one(pair) for pair in separate],
+            "loop": lambda: [refine_one(pair) for pair in separate],
             **{name: run(program) for name, program in programs.items()},
             "refine_pairs": lambda: [
                 refined.pointwise_map
-                for _, refined in refine_pairs(shapes, pairs, starts, iterations=ITERATIONS)
+                for _, refined in refine_pairs(shapes, pairs, initial_maps, iterations=ITERATIONS)
             ],
         },
         options.repeats,

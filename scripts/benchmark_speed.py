@@ -1,24 +1,27 @@
-"""How fast things are, beside what they cannot do without.
+"""Measures the speed of each part of the library, and compares it with a lower bound or another library.
 
     python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
 
-- `refinement`: three iterations at the paper's setting in float32, at several sizes: with all compared with
-  all, in patches, on samples; against three matrix products (m x k) (k x n) alone, in the fastest of
-  several ways to have them, and against a plain argmin over stored distances;
-- `eigenbasis`: 100 eigenpairs, exact and approximate, against SciPy's shift-invert `eigsh` with its defaults,
-  in CPU time; with the approximate eigenvalues' errors;
-- `side_by_side_eigenbases`: those of both shapes in the time of one, in threads and by processes;
-- `stages`: what else the host does for one shape;
-- `command`: from starting Python to the map on the disk, with and without compiled programs from before;
-- `peers`: from two mesh files to the refined map, and refinement alone, against pyFM and geomfum where they
-  are installed (`jaxsmw[peers]`);
-- `scale`: from two mesh files of up to a million vertices to the refined map, each size in a process of its
-  own: time and peak memory of each stage, accuracy, and the exponents with which they grow.
+- `refinement`: three iterations at the paper's setting in float32, at several sizes. The search compares all
+  with all, works in patches, or works on samples. The lower bound is three matrix products (m x k) (k x n)
+  alone, computed in the fastest of several ways. A plain argmin over stored distances is measured, too.
+- `eigenbasis`: CPU time of 100 exact and approximate eigenpairs, compared with SciPy's shift-invert `eigsh`
+  with default settings; also the errors of the approximate eigenvalues.
+- `side_by_side_eigenbases`: the eigenbases of two shapes at once, in threads and in processes, compared with
+  the eigenbasis of one shape.
+- `stages`: other computations on the host for one shape.
+- `command`: whole commands, from the start of Python to the map on the disk, with and without cached
+  compiled programs.
+- `peers`: from two mesh files to the refined map, and refinement alone, compared with pyFM and geomfum if
+  they are installed (`jaxsmw[peers]`).
+- `scale`: from two mesh files of up to a million vertices to the refined map, with a new process for each
+  size. The table shows time, peak memory, errors, and the exponents of the growth of time and memory.
 
-What is compared runs in turns in one process, so that a busy moment hits all of it; ratios are of medians.
-Shapes are procedural creatures, for `scale` with edges split and vertices moved at random; with `--data` in
-the last two parts two people of the remeshed FAUST set instead. DIR gets the tables as `speed.md`, all
-numbers as `speed.json`, and a plot over sizes as `speed.png`. Quick does the smallest sizes only, in three
+The candidates of a comparison run in turns in one process, so that other load on the machine affects all of
+them. Ratios are ratios of medians. Shapes are procedural creatures. For `scale`, their edges are split and
+their vertices are moved at random. With `--data`, `peers` and `scale` use two people of the remeshed FAUST
+set instead. The script writes the tables to `speed.md`, all numbers to `speed.json`, and a plot over the
+sizes to `speed.png`, all in DIR. With `--quick` it measures only the smallest sizes, which takes three
 minutes.
 """
 
@@ -83,19 +86,19 @@ ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
 LARGE = (100_000, 300_000, 1_000_000)
 XLA_DEFAULTS = ", XLA's defaults"
-# Beyond this many vertices a stored distance matrix would be gigabytes.
+# With more vertices, a stored matrix of all distances would take gigabytes.
 STORED = 10_000
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
-"""A title, what was measured, a table, and its numbers."""
+"""The title of a table, a note on what was measured, the rows of the table, and all numbers."""
 
 
 class PlainSearch(WaveletPreservation):
-    """The same method with the search one writes first."""
+    """Wavelet preservation with the simplest search: an argmin over a stored matrix of all distances."""
 
-    def recover(self, problem, functional_map):
-        database = problem.spectrum_y.eigenvectors @ functional_map.T
-        products = problem.spectrum_x.eigenvectors @ database.T
+    def recover(self, prepared, state):
+        queries, database = self.embeddings(prepared, state)
+        products = queries @ database.T
         return jnp.argmin(0.5 * jnp.sum(database**2, axis=1)[None, :] - products, axis=1).astype(jnp.int32)
 
 
@@ -106,7 +109,15 @@ def medians(
     *,
     warm: bool = True,
 ) -> dict[str, float]:
-    """Median seconds of each candidate, run in turns; the first turn compiles and does not count."""
+    """Run the candidates in turns, and return the median seconds of each candidate.
+
+    **Arguments:**
+
+    - `candidates`: the functions to time, by name.
+    - `repeats`: the number of turns that count.
+    - `clock`: the clock, in seconds.
+    - `warm`: whether to run one more turn first, which compiles and does not count.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
         for name, candidate in candidates.items():
@@ -118,14 +129,17 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """A table with a row for each candidate, and its ratio to one of them."""
+    """Return a table with the seconds of each candidate and the ratio to the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
 
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Ways to have the products of all eigenvectors' rows, `ITERATIONS` times."""
-    # In blocks that stay in the processor's cache, of which as little as possible is kept.
+    """Return several ways to multiply all rows of both eigenbases, `ITERATIONS` times, by name.
+
+    The products are the lower bound for a search that compares all vertices with all vertices.
+    """
+    # Blocks of products fit into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
     blocks = jnp.pad(rows, ((0, -rows.shape[0] % 256), (0, 0))).reshape(-1, 256, rows.shape[1])
 
@@ -149,7 +163,7 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
 
 
 def refinement(options: argparse.Namespace) -> Iterator[Part]:
-    """One pair at several sizes."""
+    """Yield the times of refinement of one pair, for each size."""
     for size in options.sizes:
         pair = creature_pair(vertices=size)
         meshes = pair.source, pair.target
@@ -197,7 +211,7 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
-    """Of one shape."""
+    """Yield the CPU times of the eigenbasis of one shape, for each size."""
     for size in [*options.sizes, *LARGE[: 0 if options.quick else 1]]:
         mesh = finer(creature_pair(vertices=min(size, SIZES[-1])).source, size)
         stiffness, areas = assemble_laplacian(mesh)
@@ -223,15 +237,19 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
         excess = ours("approximate")[1:] / ours("exact")[1:] - 1
         yield (
             f"Eigenbasis, {len(mesh.vertices)} vertices",
-            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Ours include the Laplacian and a check. "
-            f"Approximate eigenvalues are {excess.mean():.2%} too large ({excess.max():.2%} at most).",
+            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the Laplacian and a check. "
+            f"Approximate eigenvalues are {excess.mean():.2%} too large in the mean, and "
+            f"{excess.max():.2%} at most.",
             compared(seconds, "SciPy's eigsh"),
             {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
         )
 
 
 def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
-    """Of two shapes at once, in wall time: in threads, as `match` does, and by processes that wait for it."""
+    """Yield the wall times of the eigenbases of two shapes at once, for each size.
+
+    `match` uses threads. The processes are started beforehand, so their start does not count.
+    """
     for size in options.sizes:
         pair = creature_pair(vertices=size)
         meshes = [pair.source, pair.target]
@@ -260,27 +278,27 @@ def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
 
 
 kept_meshes: list[Mesh] = []
-"""Those of a process that computes eigenbases when told."""
+"""The meshes of this process, of which `eigenbasis_of` computes eigenbases."""
 
 
 def keep(meshes: Sequence[Mesh]) -> None:
-    """What a process begins with."""
+    """Store the meshes for `eigenbasis_of` in this process."""
     kept_meshes[:] = meshes
 
 
 def eigenbasis_of(number: int) -> None:
-    """Of one of the `kept_meshes`."""
+    """Compute the eigenbasis of one of the `kept_meshes`."""
     eigenpairs(kept_meshes[number], EIGENVECTORS)
 
 
 def eigenbasis_in_one_thread(number: int) -> None:
-    """The same where nobody else has limited threads."""
+    """Compute the eigenbasis of one of the `kept_meshes` with one BLAS thread."""
     with one_blas_thread():
         eigenbasis_of(number)
 
 
 def stages(options: argparse.Namespace) -> Iterator[Part]:
-    """Of the host, for one shape."""
+    """Yield the times of computations on the host for one shape, for each size."""
     for size in options.sizes:
         mesh = creature_pair(vertices=size).source
         sources = np.arange(0, len(mesh.vertices), len(mesh.vertices) // 100)
@@ -310,7 +328,7 @@ def stages(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def command(options: argparse.Namespace) -> Iterator[Part]:
-    """New processes, two meshes of 7000 vertices, nothing kept but compiled programs."""
+    """Yield the times of whole commands in new processes, for two meshes of 7000 vertices."""
     pair = creature_pair(vertices=SIZES[0])
     with tempfile.TemporaryDirectory() as directory:
         files = [str(Path(directory) / f"{side}.off") for side in ("source", "target")]
@@ -324,7 +342,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
 
             def run() -> None:
                 for entry in cache.glob("*.npz") if cache else ():
-                    entry.unlink()  # spectra, not programs
+                    entry.unlink()  # cached spectra; compiled programs stay
                 subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
 
             return run
@@ -352,24 +370,31 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         )
     yield (
         "Commands",
-        "New processes; no spectra kept.",
+        "New processes without cached spectra.",
         compared(seconds, "two eigenbases"),
         {"seconds": seconds},
     )
 
 
 class Truth(NamedTuple):
-    """A pair, and for some vertices of the source the vertices of the target that are the same points."""
+    """A pair of meshes with ground truth.
+
+    **Attributes:**
+
+    - `meshes`: source and target.
+    - `rows`: the vertices of the source with ground truth (r,).
+    - `targets`: the true match of each of these vertices (r,).
+    """
 
     meshes: tuple[Mesh, Mesh]
     rows: Int64[np.ndarray, " r"]
     targets: Int64[np.ndarray, " r"]
 
     def error(self, pointwise_map: np.ndarray, target: Mesh) -> float:
-        """Mean geodesic error in thousandths of the square root of the area.
+        """Return the mean geodesic error in thousandths of the square root of the target's area.
 
-        The map may be that of finer versions of both meshes: what it finds on such a `target` counts as the
-        nearest vertex here.
+        The map may lead from a finer version of the source (see `finer`) to a finer version `target` of the
+        target. Each match is then replaced by the nearest vertex of the target of this pair.
         """
         coarse = self.meshes[1]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
@@ -383,7 +408,7 @@ class Truth(NamedTuple):
 
 
 def pair_with_truth(options: argparse.Namespace) -> Truth:
-    """Two people of the remeshed FAUST set, or two poses of a creature."""
+    """Return two people of the remeshed FAUST set if `--data` is given, else two poses of a creature."""
     if options.data is None:
         pair = creature_pair(vertices=SIZES[0])
         return Truth((pair.source, pair.target), np.arange(len(pair.true_map)), pair.true_map)
@@ -396,9 +421,10 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
 
 
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
-    """The mesh with its longest edges split until it has so many vertices, all moved by a tenth of an edge.
+    """Split the longest edges of a mesh until it has `number_of_vertices`, and add noise to the positions.
 
-    The first vertices are those of the mesh.
+    The standard deviation of the noise is a tenth of the mean edge length. The vertices of the given mesh
+    come first. A mesh that already has enough vertices gets no noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -420,13 +446,20 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
 def split_faces(
     faces: Int64[np.ndarray, "f 3"], middles: Int64[np.ndarray, "f 3"], number: int
 ) -> Int64[np.ndarray, "g 3"]:
-    """What becomes of the faces with so many split edges: into four like itself where all three are.
+    """Select the faces of which `number` edges are split, and subdivide them.
 
-    `middles` has the new vertices on a face's edges, from corner i to the next; -1 where there is none.
+    **Arguments:**
+
+    - `faces`: the faces of the mesh (f, 3).
+    - `middles`: for each face, the new vertices on the edges from corner i to the next corner (f, 3); -1 for
+      an edge that is not split.
+    - `number`: the number of split edges, 0 to 3. With 3, a face becomes four similar faces.
+
+    **Returns:** The subdivided faces (g, 3).
     """
     chosen = (middles >= 0).sum(axis=1) == number
     faces, middles = faces[chosen], middles[chosen]
-    # The one that is not split comes last; of a single one that is, first.
+    # Rotate the corners: with two split edges the third edge is last, with one split edge this edge is first.
     first = (np.argmin(middles >= 0, axis=1) + 1) % 3
     if number == 1:
         first = np.argmax(middles, axis=1)
@@ -443,7 +476,10 @@ def split_faces(
 
 
 def peak_memory() -> float:
-    """Of this process so far, in GiB; on Linux without what its parent had."""
+    """Return the peak memory of this process so far, in GiB.
+
+    On Linux, `VmHWM` leaves out the memory of the parent process, which `getrusage` can include.
+    """
     status = Path("/proc/self/status")
     if status.exists():
         (kilobytes,) = re.findall(r"VmHWM:\s*(\d+) kB", status.read_text("utf-8"))
@@ -454,14 +490,17 @@ def peak_memory() -> float:
 def matched_from_files(
     files: list[str], preset: PresetName
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
-    """Name, seconds and peak memory of each stage; initial and refined map."""
+    """Match two mesh files, and measure the stages.
+
+    **Returns:** Name, seconds and peak memory in GiB of each stage; the initial and the refined map.
+    """
     stages = [("start", time.perf_counter(), 0.0)]
 
     class Watch(logging.Handler):
-        """Stages are logged as they begin, which is when those before have ended."""
+        """Records the time of each log message. Each stage logs its beginning, after the end of the last."""
 
         def emit(self, record: logging.LogRecord) -> None:
-            if not record.args:  # not what is said of outcomes
+            if not record.args:  # messages with arguments report outcomes
                 stages.append((record.getMessage(), time.perf_counter(), peak_memory()))
 
     logger = logging.getLogger("jaxsmw")
@@ -476,14 +515,14 @@ def matched_from_files(
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
-    """Sizes one after the other, each in a new process."""
+    """Yield the scaling of the presets `paper` and `accurate`."""
     large = () if options.quick else LARGE
     yield scaled(options, "paper", (10_000, 30_000, *large))
     yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
 
 
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
-    """One preset at several sizes."""
+    """Measure one preset at several sizes, each in a new process."""
     truth = pair_with_truth(options)
     rows, measured = [], []
     for size in sizes:
@@ -506,7 +545,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
     columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
 
     def exponent(values: list[float]) -> str:
-        # The smallest size is mostly what does not depend on it.
+        # The smallest size is left out: constant costs dominate its time.
         return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
 
     if len(measured) > 2:
@@ -516,7 +555,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
         rows.append(["exponent", *stages, total, memory, "", ""])
     return (
         f"Scale, {preset}",
-        f"The preset {preset}, from two PLY files, compilation included; peak memory of the whole process; "
+        f"The preset {preset}, from two PLY files, with compilation; peak memory of the whole process; "
         "mean geodesic errors x10^-3.",
         [["vertices", *columns], *rows],
         {"measured": measured},
@@ -524,11 +563,14 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
 
 
 def peers(options: argparse.Namespace) -> Iterator[Part]:
-    """One pair; every library reads the files, computes its eigenbases and refines."""
+    """Yield the times of several libraries for one pair.
+
+    Each library reads the files, computes its eigenbases and refines.
+    """
     truth = pair_with_truth(options)
     missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
     if missing:
-        print(f"\npeers: {' and '.join(missing)} not installed; pip install 'jaxsmw[peers]' for all.")
+        print(f"\npeers: {' and '.join(missing)} not installed: install with pip install 'jaxsmw[peers]'.")
     with tempfile.TemporaryDirectory() as directory:
         files = [str(Path(directory) / f"{side}.off") for side in range(2)]
         for file, mesh in zip(files, truth.meshes, strict=True):
@@ -544,12 +586,12 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
             runs["pyFM, ZoomOut 20 to 100 from our start"] = pyfm_from_files
         if "geomfum" not in missing:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
-        our_start(*files)
+        our_initial_map(*files)
         measured: dict[str, dict[str, Any]] = {}
         for turn in range(2 if options.quick else 4):  # the first compiles
             for name, run in runs.items():
                 if turn > 1 and name.startswith("geomfum"):
-                    continue  # a minute each
+                    continue  # each run takes a minute
                 start = time.perf_counter()
                 found, refining = run(files)
                 taken = time.perf_counter() - start
@@ -576,7 +618,8 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     yield (
         f"Peers, {m} x {n} vertices",
         f"One process, medians; the first time includes compilation. Ours: k = {EIGENVECTORS}, {ITERATIONS} "
-        "iterations from SHOT. Rows from our start leave out the time to compute it.",
+        "iterations from SHOT. Rows from our start begin with our initial map, and leave out the time of its "
+        "computation.",
         table,
         {"measured": measured},
     )
@@ -585,7 +628,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
 def ours_from_files(
     files: list[str], search: Search = "auto", samples: int | None = None
 ) -> tuple[np.ndarray, float]:
-    """The map, and the seconds of refinement alone."""
+    """Match with this library; return the map, and the seconds of refinement alone."""
     refiner = WaveletPreservation(search=search)
     stage = Stage(
         refiner, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples
@@ -595,15 +638,15 @@ def ours_from_files(
 
 
 @cache
-def our_start(*files: str) -> np.ndarray:
-    """The initial map of `match`, kept from call to call: peers are not charged for it."""
+def our_initial_map(*files: str) -> np.ndarray:
+    """Return the initial map of `match`, cached, so that its time does not count for other libraries."""
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
 def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
-    """Descriptors, functional map and ZoomOut of `pyFM.functional.FunctionalMapping`, as they come.
+    """Match with `pyFM.functional.FunctionalMapping`: default descriptors, functional map, and ZoomOut.
 
-    It takes ten steps from k = 50, of 1 by default.
+    ZoomOut takes ten steps from k = 50. Each step adds `step` eigenvectors.
     """
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
@@ -618,12 +661,12 @@ def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarra
 
 
 def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
-    """`pyFM.refine.zoomout_refine` in steps of 5."""
+    """Refine our initial map with `pyFM.refine.zoomout_refine` in steps of 5 eigenvectors."""
     from pyFM.mesh import TriMesh
     from pyFM.refine import zoomout_refine
     from pyFM.spectral import p2p_to_FM
 
-    first = our_start(*files)
+    first = our_initial_map(*files)
     x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
     start = time.perf_counter()
     k = EIGENVECTORS - ZOOMOUT_STEPS * 5
@@ -642,13 +685,17 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
 
 
 def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
-    """`geomfum.refine.ZoomOut` in steps of 5, with areas: its default, without, is slower and worse."""
+    """Refine our initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
+
+    Functional maps are computed with vertex areas. The default of geomfum, without areas, is slower and less
+    accurate.
+    """
     from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
     from geomfum.laplacian import LaplacianSpectrumFinder
     from geomfum.refine import ZoomOut
     from geomfum.shape import TriangleMesh
 
-    first = our_start(*files)
+    first = our_initial_map(*files)
     find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
     x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
     start = time.perf_counter()
@@ -659,12 +706,12 @@ def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     return np.asarray(P2pFromFmConverter()(refined, y, x)), time.perf_counter() - start
 
 
-# From 20 eigenvectors to 100.
+# 16 steps of 5 eigenvectors lead from 20 eigenvectors to 100.
 ZOOMOUT_STEPS = 16
 
 
 def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Seconds and memory over sizes, of the parts that have several."""
+    """Plot seconds and memory over the sizes, for the parts with several sizes."""
     panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for part in ("refinement", "eigenbasis"):
         for measured in numbers.get(part, []):
@@ -684,7 +731,7 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # One colour with and without our options, whose lack shows as dots.
+            # One colour with and without our compiler options; dotted lines are without.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}
@@ -705,7 +752,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="measure only the smallest sizes")
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
     parser.add_argument(
         "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"

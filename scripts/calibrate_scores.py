@@ -1,4 +1,4 @@
-"""Measures how reliable the scores are that need no ground truth.
+"""Measures how reliable expected errors and scores are, although they are computed without ground truth.
 
     python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME]
         [--output FILE.md]
@@ -11,8 +11,8 @@ The script draws pairs at random from each data set (see `docs/datasets.md`) and
 - The true errors of all vertices, in tenths by their expected errors.
 - For the preset `accurate`: how often each score prefers the result to a mirrored map. The mirrored map is
   computed from the mirrored ground truth, by the same stages without repair. The table covers only data sets
-  with a mirrored ground truth for every vertex. The uncertainty of the regression is that of a regression
-  started from the map.
+  with a mirrored ground truth for every vertex. The uncertainty comes from a feature regression that starts
+  from the map.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Measured(NamedTuple):
 def measure(
     pair: DataPair, seed: int, preset: PresetName = "accurate", number_of_samples: int | None = 1000
 ) -> Measured:
-    """Matches a pair, and compares the scores of the result with the ground truth."""
+    """Matches a pair, and measures the errors and the scores of the result."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     found = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
@@ -116,7 +116,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
                 f"{sum(held) / total:.0%}" if total else "—",
             ]
         )
-    yield "Errors x 10⁻³; the worst tenth is taken for each pair.\n\n" + markdown(rows)
+    yield "Errors x 10⁻³. The worst tenth is determined for each pair separately.\n\n" + markdown(rows)
 
     everything = [pair for pairs in measured.values() for pair in pairs]
     true, expected = (
@@ -148,10 +148,14 @@ def main() -> None:
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument("--pairs", metavar="N", default="20", help="pairs from each data set (default: 20)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default: 0)")
-    parser.add_argument("--preset", choices=PRESETS, default="accurate", help="(default: accurate)")
-    parser.add_argument("--output", metavar="FILE.md", type=Path, help="file for the tables")
+    parser.add_argument(
+        "--preset", choices=PRESETS, default="accurate", help="preset of the matches (default: accurate)"
+    )
+    parser.add_argument(
+        "--output", metavar="FILE.md", type=Path, help="file to which the tables are written, too"
+    )
     options = parser.parse_args()
-    warnings.simplefilter("ignore")  # about each mesh
+    warnings.simplefilter("ignore")  # about the quality of each mesh
 
     chosen: list[tuple[DataSet, DataPair]] = []
     for directory in options.data_sets:

@@ -1,16 +1,16 @@
-"""Which frame, which update, which convention: one study on remeshed FAUST and TOSCA, figures and tables.
+"""Compares frames, updates and conventions on remeshed FAUST and TOSCA, and writes figures and tables.
 
     python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
                                      [--workers N] [--quick]
 
-It needs what the extra `dev` installs: `pip install -e ".[dev]"`.
+The script needs the extra `dev`: `pip install -e ".[dev]"`.
 
 DATA_DIRECTORY holds `faust_r` and `tosca_r`, the remeshed sets of Ren et al. (2018): meshes
-`off/NAME.off`, ground truth `corres/NAME.vts`, and `test_pairs.txt` with two names per line. The output
-directory gets everything from this one command: `summary.md` with all tables, the figures, `results.csv` (a
-row per pair and variant), `parameters.csv` (eigenvectors x filters x iterations), `invariance.csv`,
-`times.csv`, and `provenance.json` with versions, machine, seeds and settings. Interrupted in whatever way,
-it goes on where it was when started again.
+`off/NAME.off`, ground truth `corres/NAME.vts`, and `test_pairs.txt` with two names per line. The script
+writes to the output directory: `summary.md` with all tables, the figures, `results.csv` (a row per pair and
+variant), `parameters.csv` (eigenvectors x filters x iterations), `invariance.csv`, `times.csv`, and
+`provenance.json` with versions, machine, seeds and settings. After an interruption the same command
+continues.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ QUICK = Settings(
 
 
 def evenly_spread(items: Sequence, count: int) -> list:
-    """So many of the items, from the first to the last; all if there are no more."""
+    """Return `count` items, evenly spread from the first to the last; all items if there are fewer."""
     places = np.linspace(0, len(items) - 1, min(count, len(items)))
     return [items[int(place)] for place in np.round(places)]
 
@@ -75,16 +75,16 @@ def select_pairs(data: Path, count: int) -> list[PairName]:
     for data_set in DATA_SETS:
         listing = data / data_set / "test_pairs.txt"
         if not listing.is_file():
-            raise InputError(f"{listing}: is missing; give the directory that holds {data_set}.")
+            raise InputError(f"{listing}: is missing: give the directory that holds {data_set}.")
         lines = [line.split() for line in listing.read_text("utf-8").splitlines() if line.strip()]
         if wrong := [line for line in lines if len(line) != 2]:
-            raise InputError(f"{listing}: {' '.join(wrong[0])!r} does not name two shapes; correct the line.")
+            raise InputError(f"{listing}: {' '.join(wrong[0])!r} does not name two shapes: correct the line.")
         pairs += [PairName(data_set, *line) for line in evenly_spread(lines, count)]
     return pairs
 
 
 def digest(data: Path, pairs: list[PairName]) -> str:
-    """A hash of all files that pairs are read from."""
+    """Return a hash of the contents of all files of the pairs."""
     found = hashlib.sha256()
     for pair in pairs:
         for name in pair[1:]:
@@ -95,7 +95,7 @@ def digest(data: Path, pairs: list[PairName]) -> str:
 
 
 class Journals:
-    """The tables that grow while the study runs, and what they should hold in the end."""
+    """The tables that grow while the study runs, and the rows that they must contain at the end."""
 
     def __init__(self, output: Path, pairs: list[PairName], settings: Settings, measured: list[Variant]):
         self.pairs, self.settings, self.measured = pairs, settings, measured
@@ -115,7 +115,7 @@ class Journals:
         self.invariance = Journal(output / "invariance.csv", [*PairName._fields, "frame", "scale"])
 
     def missing(self) -> Iterator[Task]:
-        """What is left to do, by pair."""
+        """Yield one task for each pair with missing rows."""
         for pair in self.pairs:
             parameters = self.parameters_wanted if pair in self.parameters_of else []
             task = Task(
@@ -133,7 +133,7 @@ class Journals:
         self.invariance.append(invariance)
 
     def sort(self) -> None:
-        """Put all rows in an order that does not depend on which worker was first."""
+        """Sort all rows, so that their order does not depend on the order in which workers finish."""
         self.results.sort((*pair, *variant) for pair in self.pairs for variant in self.measured)
         self.parameters.sort(
             (*pair, *cell)
@@ -145,7 +145,10 @@ class Journals:
 
 
 def run(data: Path, journals: Journals, workers: int) -> None:
-    """Measure what is missing, pair by pair in worker processes, and keep each pair as it comes."""
+    """Measure the missing rows pair by pair in worker processes, and save the rows of each pair at once.
+
+    **Raises:** `InputError` at the end if pairs could not be measured.
+    """
     tasks = list(journals.missing())
     if not tasks:
         return
@@ -167,15 +170,18 @@ def run(data: Path, journals: Journals, workers: int) -> None:
             progress.update()
     if failed:
         raise InputError(
-            f"{len(failed)} pairs could not be measured, the others are kept: {'; '.join(failed)}. Mend "
-            "them and start again."
+            f"{len(failed)} pairs could not be measured ({'; '.join(failed)}), and the results of the other "
+            "pairs are kept: repair the files of these pairs, and start again."
         )
 
 
 def measured_times(
     output: Path, data: Path, pairs: list[PairName], measured: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Times per update, measured in one process while nothing else of this study runs; once per directory."""
+    """Return the times per update, from `times.csv` if this file exists.
+
+    Otherwise they are measured in one process while nothing else of this study runs.
+    """
     path = output / "times.csv"
     key = [*PairName._fields, *Variant._fields]
     if not path.exists():
@@ -194,12 +200,21 @@ def main() -> None:
     )
     parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument(
-        "--output", type=Path, help="default: docs/frames, with --quick a new temporary directory"
+        "--output",
+        type=Path,
+        help="output directory (default: docs/frames, with --quick a new temporary directory)",
     )
-    parser.add_argument("--pairs", type=int, help="per data set (default: 40, with --quick 2)")
-    parser.add_argument("--seed", type=int, default=0, help="at least 0 (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="default: %(default)s")
-    parser.add_argument("--quick", action="store_true", help="a small study that tries everything out")
+    parser.add_argument(
+        "--pairs", type=int, help="number of pairs from each data set (default: 40, with --quick 2)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed, at least 0 (default: %(default)s)")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=os.cpu_count(),
+        help="number of worker processes (default: %(default)s)",
+    )
+    parser.add_argument("--quick", action="store_true", help="run a small study that exercises all parts")
     options = parser.parse_args()
     settings = replace(QUICK if options.quick else Settings(), seed=options.seed)
     if options.pairs is not None:
@@ -209,16 +224,16 @@ def main() -> None:
     )
     try:
         if settings.pairs < 1 or options.workers < 1 or settings.seed < 0:
-            raise InputError("a study needs at least 1 pair per data set, 1 worker and a seed from 0 on.")
+            raise InputError("--pairs and --workers must be at least 1, and --seed at least 0.")
         study(options.data, output, settings, options.workers)
     except InputError as error:
         sys.exit(f"compare_frames: {error}")
     except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted; the same command with --output {output} goes on from here")
+        sys.exit(f"\ninterrupted; the same command with --output {output} continues from the saved results")
 
 
 def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
-    """Measure, summarise and draw."""
+    """Run the study: measure all pairs, write the summary, and draw the figures."""
     check_drawable()
     jax.config.update("jax_platforms", "cpu")
     pairs = select_pairs(data, settings.pairs)
@@ -237,7 +252,9 @@ def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
         journals.sort()
         times = measured_times(output, data, pairs, measured, settings)
         if code_digest(code) != origin["versions"]["code"]:
-            raise InputError(f"{output}: the code changed while it was measured: remove it and start again.")
+            raise InputError(
+                f"{output}: the code changed during the study: remove this directory, and start again."
+            )
         whole = Study(journals.results.rows, times, pairs, every, same, settings)
         with atomic_write(output / "summary.md") as temporary:
             temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")

@@ -3,9 +3,9 @@
     pip install -e ".[report]"
     python scripts/draw_documentation.py [DATA_DIRECTORY]
 
-The tutorial's own code draws its pictures. The failure cases are procedural. With a DATA_DIRECTORY, as for
-scripts/compare_frames.py, there are two cases with real shapes: SHREC'16 topology and non-isometric pairs of
-TOSCA. The script takes some minutes.
+The code in the tutorial draws the pictures of the tutorial. The failure cases are procedural. With a
+DATA_DIRECTORY (see docs/datasets.md), the script adds two cases with real shapes: a pair of SHREC'16 topology
+(`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The script takes some minutes.
 """
 
 import argparse
@@ -32,12 +32,22 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# Dithered, this number of colours is enough for smoothly coloured bodies, in a third of the space.
+# With dithering, this number of colours suffices for smoothly coloured bodies. The files take a third of the
+# space.
 COLORS = 256
 
 
 class Case(NamedTuple):
-    """A pair, options of `jaxsmw.match` with which the match fails, and options that cure the failure."""
+    """A failure case.
+
+    **Attributes:**
+
+    - `name`: the name of the case and of its picture.
+    - `source`, `target`, `truth`: the pair and its ground truth.
+    - `failing`: options of `jaxsmw.match` with which the match fails.
+    - `cure`: options with which the match succeeds; None if there are none.
+    - `up`: the vertical axis of both shapes, or None to let the drawing choose it.
+    """
 
     name: str
     source: jaxsmw.Mesh
@@ -49,7 +59,7 @@ class Case(NamedTuple):
 
 
 def procedural_cases() -> Iterator[Case]:
-    """The cases that need no data."""
+    """Yields the cases that need no data."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
@@ -69,7 +79,7 @@ def procedural_cases() -> Iterator[Case]:
 
 
 def real_cases(data: Path) -> Iterator[Case]:
-    """The cases with real shapes."""
+    """Yields the cases with real shapes."""
     for name, directory, names, cure in (
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
@@ -82,7 +92,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """A body with five equal hanging arms, and the points of a sphere that became its vertices (n, 3)."""
+    """Returns a body with five equal hanging arms, and for each vertex its point on a sphere (n, 3)."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -101,13 +111,13 @@ def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"
 def landmarks_on_arms(
     at_source: Float[np.ndarray, "m 3"], at_target: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "2 2"]:
-    """The tips of two neighbouring arms, as landmarks."""
+    """Returns the tips of two neighbouring arms as landmarks."""
     tips = np.array([[1, 0, 0], [np.cos(2 * np.pi / 5), np.sin(2 * np.pi / 5), 0]])
     return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
 
 
 def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """The front half of the source, as a mesh of its own, and its ground truth."""
+    """Returns the front part of the source as a separate mesh, and the ground truth of this mesh."""
     full, ahead = pair.source, pair.source.vertices[:, 2]
     faces = full.faces[(ahead[full.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
     used, numbers = np.unique(faces, return_inverse=True)
@@ -119,7 +129,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """The target with few vertices, and as ground truth the nearest of them to each true match."""
+    """Decimates the target; the ground truth becomes the vertex that is nearest to each true match."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
@@ -133,10 +143,10 @@ def draw_case(case: Case) -> str:
         if settings is None:
             cells += ["", ""]
             continue
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             result = jaxsmw.match(case.source, case.target, **{"preset": "paper"} | settings)
-        for warning in told:
+        for warning in caught:
             print(f"{case.name}, {settings}: {warning.message}")
         error = jaxsmw.geodesic_error(case.target, result.pointwise_map, case.truth)
         expected = result.expected_error()
@@ -154,7 +164,7 @@ def draw_case(case: Case) -> str:
 
 
 def save_small(path: Path, figure: Figure | Path) -> None:
-    """Writes a figure or a larger picture as a PNG of at most 1200 pixels in width and with few colours."""
+    """Writes a figure or an image file as a PNG at most 1200 pixels wide, with few colours."""
     if isinstance(figure, Path):
         image = Image.open(figure)
     else:
@@ -173,16 +183,16 @@ def save_small(path: Path, figure: Figure | Path) -> None:
 
 
 def draw_tutorial() -> None:
-    """Runs the code of the tutorial and keeps its pictures."""
+    """Runs the code of the tutorial, and saves the pictures that the tutorial shows."""
     page = (DOCS / "tutorial.md").read_text("utf-8")
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL))
-    began = Path.cwd()
+    previous_directory = Path.cwd()
     with tempfile.TemporaryDirectory() as directory:
         os.chdir(directory)
         try:
             exec(compile(code, "docs/tutorial.md", "exec"), {})
         finally:
-            os.chdir(began)
+            os.chdir(previous_directory)
         for name in re.findall(r"\]\(pictures/(\w+\.png)\)", page):
             save_small(PICTURES / name, Path(directory) / name)
 
@@ -193,7 +203,7 @@ def main() -> None:
     )
     parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument(
-        "--only", nargs="+", metavar="NAME", help="draw only these: tutorial, or names of cases"
+        "--only", nargs="+", metavar="NAME", help="draw only these pictures: `tutorial`, or names of cases"
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)

@@ -1,6 +1,6 @@
-"""Draws an interactive page in headless Chromium, with the wavelets around one point.
+"""Takes a screenshot of an interactive page in headless Chromium, with the wavelets around one point.
 
-Run as `python scripts/draw_page.py PAGE.html PICTURE.png`. Needs the extra `test`, Chromium and its driver.
+Run `python scripts/draw_page.py PAGE.html PICTURE.png`. This needs the extra `test`, Chromium and its driver.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # 256 dithered colours are enough and halve the size.
+        # 256 dithered colours look the same and halve the size of the file.
         picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 

@@ -1,20 +1,27 @@
-"""Can descriptors be learned that start a refinement better than SHOT does?
+"""Trains descriptors, and tests whether they give better initial maps for refinement than SHOT.
 
     python scripts/learn_descriptors.py DATA_DIRECTORY [--output DIRECTORY] [--steps N] [--test-pairs N]
                                         [--seed N] [--quick]
 
-It needs the extra `learn`: `pip install -e ".[learn]"`.
+The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` makes descriptors of
-vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` behind it makes of those
-of two shapes a functional map and a soft map, and by gradients through both the network is trained by Adam
-(optax) on pairs of FAUST's first five people, one at each step: once with the truth, once without.
+DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` computes descriptors of
+vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` computes a functional map and a
+soft map from the descriptors of two shapes. Gradients pass through the layer and the network. Each step of
+Adam (optax) uses one pair of the first five people of FAUST. Two networks are trained: one with ground truth
+(`labels`), one without (`cycles`).
 
-Then nearest neighbours of SHOT, of the network before learning and of both that were learned are the starts
-from which the preset `paper` refines pairs of the other people and of TOSCA. `summary.md` says how they
-compare, `curves.png` shows how losses fell, `errors.csv` has the errors of every pair, `provenance.json` what
-all comes from, and `descriptors_labels.eqx` and `descriptors_cycles.eqx` hold what was learned:
-`load(path)(described(mesh))`. Interrupted, it goes on where it was, if started again with the same settings.
+Then the preset `paper` refines pairs of the other people and of TOSCA from four initial maps: the nearest
+neighbours of SHOT, of the untrained network, and of both trained networks. The script writes
+
+- `summary.md`: the comparison;
+- `curves.png`: the losses over the steps;
+- `errors.csv`: the errors of every pair;
+- `provenance.json`: settings, versions and machine;
+- `descriptors_labels.eqx` and `descriptors_cycles.eqx`: the trained networks, for
+  `load(path)(described(mesh))`.
+
+After an interruption the same command continues.
 """
 
 from __future__ import annotations
@@ -43,13 +50,13 @@ from learning import (
     measure,
     padded,
     parser,
-    places,
     reading,
     refined,
     root_mean_square,
     running,
     smoothed,
     train,
+    unit_area_positions,
 )
 
 from jaxsmw import (
@@ -74,14 +81,26 @@ from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
-# Of the parts of the loss without labels that are no lengths.
+# The weight of those terms of the loss `cycles` that are not lengths.
 WEIGHT = 0.1
 WATCHED_PAIRS = 4
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of a network: what it takes to make another of the same leaves."""
+    """The sizes of a network, from which a network with leaves of the same shapes can be built.
+
+    **Attributes:**
+
+    - `inputs`: the number of SHOT entries per vertex.
+    - `waves`: the number of entries of the wave kernel signature per vertex.
+    - `width`: the number of channels in each block.
+    - `blocks`: the number of `WaveletBlock`s.
+    - `filters`: the number of filters of the Meyer frame in each block.
+    - `outputs`: the number of descriptors per vertex.
+
+    **Raises:** `ValueError` if a size is not a positive integer.
+    """
 
     inputs: int = SHOT_DIMENSION
     waves: int = 32
@@ -93,15 +112,16 @@ class Sizes:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             if type(value) is not int or value < 1:
-                raise ValueError(f"a network has at least one of its {name}, not {value!r}")
+                raise ValueError(f"Sizes.{name} must be an integer of at least 1, not {value!r}")
 
 
 class WaveletBlock(eqx.Module):
-    """Features of vertices and of their surroundings, mixed.
+    """A residual block that combines the features of each vertex with features of its neighbourhood.
 
-    Every channel is filtered on the surface: it keeps of each scale of a tight frame a share that is learned.
-    What comes out and what came in go through two dense layers, vertex by vertex, and are added to what came
-    in. Signs of eigenvectors cancel in the filters, and renumbering vertices renumbers features.
+    The block filters every channel on the surface. The filter of a channel is a sum of the squared filters of
+    a Meyer frame, weighted by learned shares. At each vertex, two dense layers take the normalised and the
+    filtered features, and the block adds their output to its input. The output does not depend on the signs
+    of the eigenvectors. Renumbering the vertices permutes the rows of the output.
     """
 
     shares: Float[Array, "filters width"]
@@ -111,7 +131,7 @@ class WaveletBlock(eqx.Module):
 
     def __init__(self, sizes: Sizes, key: PRNGKeyArray):
         keys = jax.random.split(key, 2)
-        # Low-pass filters, each channel's with another end.
+        # Training starts from low-pass filters with a different cutoff for each channel.
         scale, ends = jnp.arange(sizes.filters) + 0.5, jnp.linspace(0, sizes.filters, sizes.width)
         self.shares = jax.nn.sigmoid(2 * (ends[None, :] - scale[:, None]))
         self.norm = eqx.nn.LayerNorm(sizes.width)
@@ -129,7 +149,12 @@ class WaveletBlock(eqx.Module):
 
 
 class DescriptorNetwork(eqx.Module):
-    """Descriptors of the vertices of a shape whose spectrum has SHOT as its own (`Spectrum.descriptors`)."""
+    """A network that computes descriptors of the n vertices of a shape.
+
+    The spectrum of the shape must carry SHOT descriptors (`Spectrum.descriptors`); see `described`.
+
+    **Raises:** `ValueError` if the spectrum has no descriptors, or descriptors of another dimension.
+    """
 
     enter: eqx.nn.Linear
     blocks: tuple[WaveletBlock, ...]
@@ -150,10 +175,10 @@ class DescriptorNetwork(eqx.Module):
         if given is None or given.shape[1] != self.sizes.inputs:
             raise ValueError(
                 f"the spectrum has {'no' if given is None else given.shape[1]} descriptors, where "
-                f"{self.sizes.inputs} are needed: describe it by shot_descriptors"
+                f"{self.sizes.inputs} are needed: add the result of shot_descriptors by with_descriptors"
             )
         waves = wave_kernel_signature(spectrum, dimensions=self.sizes.waves) - 1
-        # SHOT has length 1: now every entry has mean square 1.
+        # Each SHOT descriptor has length 1. Scaled, its entries have mean square 1.
         inputs = jnp.concatenate([given * self.sizes.inputs**0.5, waves], axis=1)
         features = jax.vmap(self.enter)(inputs)
         for block in self.blocks:
@@ -162,21 +187,21 @@ class DescriptorNetwork(eqx.Module):
 
 
 def layer() -> WaveletPreservationLayer:
-    """What turns descriptors of samples of two shapes into maps; it has nothing to be learned here."""
-    # Samples' eigenvectors are not orthonormal.
+    """Return the layer that computes maps from descriptors; its own parameters are not trained here."""
+    # Eigenvectors restricted to samples are not orthonormal.
     refiner = WaveletPreservation(Meyer(6), Filtering("least_squares"))
     return WaveletPreservationLayer(refiner, iterations=2)
 
 
 class Shape(NamedTuple):
-    """A shape with SHOT, on samples of its vertices, which is what is trained on."""
+    """A shape for training: its spectrum with SHOT, and the positions, both at s samples of its vertices."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
 
 
 class TrainingPair(NamedTuple):
-    """Two shapes, and where in Y the samples of X belong."""
+    """Two shapes, and the position on Y of the ground truth of each sample of X."""
 
     x: Shape
     y: Shape
@@ -184,7 +209,7 @@ class TrainingPair(NamedTuple):
 
 
 class Source(NamedTuple):
-    """What a shape's samples come from."""
+    """A mesh, the vertices that were sampled, and the sampled shape."""
 
     mesh: Mesh
     samples: Int[np.ndarray, " s"]
@@ -193,30 +218,38 @@ class Source(NamedTuple):
 
 @cache
 def source(file: Path) -> Source:
-    """A shape as training takes it."""
+    """Read a mesh, and sample it for training."""
     mesh = read_mesh(file)
     samples = farthest_point_samples(mesh, SAMPLES)
     spectrum = described(mesh).sample(jnp.asarray(samples))
-    return Source(mesh, samples, Shape(spectrum, jnp.asarray(places(mesh)[samples], float)))
+    return Source(mesh, samples, Shape(spectrum, jnp.asarray(unit_area_positions(mesh)[samples], float)))
 
 
 @cache
 def prepared(pair: DataPair) -> TrainingPair:
-    """A pair as training takes it."""
+    """Read and sample both shapes of a pair for training."""
     x, y = map(source, pair.meshes)
     truth = pair.ground_truth(x.mesh, y.mesh).everywhere(x.mesh)[x.samples]
-    return TrainingPair(x.shape, y.shape, jnp.asarray(places(y.mesh)[truth], float))
+    return TrainingPair(x.shape, y.shape, jnp.asarray(unit_area_positions(y.mesh)[truth], float))
 
 
 def described(mesh: Mesh) -> Spectrum:
-    """A spectrum as a `DescriptorNetwork` wants it, of area 1, with SHOT, padded."""
+    """Return the spectrum of a mesh as a `DescriptorNetwork` needs it: of area 1, with SHOT, padded."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
     return padded(spectrum.with_descriptors(jnp.asarray(shot)))
 
 
 class Matched(NamedTuple):
-    """What descriptors of a shape and of another come to, by themselves and by the layer."""
+    """The maps between two shapes that follow from their descriptors.
+
+    **Attributes:**
+
+    - `by_descriptors`: the soft map between the descriptors.
+    - `by_layer`: the soft map that the layer recovers from its functional map.
+    - `functional_map`: the functional map of the layer.
+    - `energy`: the wavelet-preservation energy of the functional map under `by_layer`, per eigenvector.
+    """
 
     by_descriptors: SoftMap | SparseSoftMap
     by_layer: SoftMap | SparseSoftMap
@@ -225,18 +258,18 @@ class Matched(NamedTuple):
 
 
 def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
-    """Soft maps from X to Y, the functional map, and how badly that preserves wavelets, per eigenvector."""
+    """Compute the maps from X to Y with a network."""
     features = network(x.spectrum), network(y.spectrum)
     spectra = [side.spectrum.truncate(LAYER_EIGENVECTORS) for side in (x, y)]
-    of_layer = layer()
-    found = of_layer(*features, *spectra)
-    by_descriptors = of_layer.recovery_of_features(*features, *(s.vertex_areas for s in spectra))
-    energy = of_layer.refiner.problem(*spectra, sampled=True).energy(found.soft_map)(found.functional_map)
+    module = layer()
+    found = module(*features, *spectra)
+    by_descriptors = module.recovery_of_features(*features, *(s.vertex_areas for s in spectra))
+    energy = module.refiner.problem(*spectra, sampled=True).energy(found.soft_map)(found.functional_map)
     return Matched(by_descriptors, found.soft_map, found.functional_map, energy / LAYER_EIGENVECTORS)
 
 
 def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
-    """The loss with labels: how far from the truth the layer takes points, and descriptors by themselves."""
+    """The loss `labels`: the distances between the ground truth and both soft maps of `Matched`, weighted."""
     found = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
         root_mean_square(soft_map.pull_back, pair.y.positions, pair.truth)
@@ -246,23 +279,29 @@ def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[A
 
 
 def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
-    """The loss without.
+    """The loss `cycles`, which needs no ground truth.
 
-    What of wavelets is lost, how far functional maps there and back are from undoing each other, and how far
-    from where it began a point comes back to, by the layer and by descriptors themselves.
+    The loss is a weighted sum of the wavelet-preservation energies in both directions, the deviation of the
+    product of both functional maps from the identity, and the distances between points of X and their images
+    under the forward and backward soft maps.
     """
-    there, back = matched(network, pair.x, pair.y), matched(network, pair.y, pair.x)
-    round_trip = product(there.functional_map, back.functional_map)
+    forward, backward = matched(network, pair.x, pair.y), matched(network, pair.y, pair.x)
+    round_trip = product(forward.functional_map, backward.functional_map)
     bijectivity = jnp.mean(
         jnp.sum((round_trip - jnp.eye(*round_trip.shape, dtype=round_trip.dtype)) ** 2, axis=1)
     )
     by_layer, by_descriptors = (
         root_mean_square(
-            lambda f, go=go, come=come: go.pull_back(come.pull_back(f)), pair.x.positions, pair.x.positions
+            lambda f, to_y=to_y, to_x=to_x: to_y.pull_back(to_x.pull_back(f)),
+            pair.x.positions,
+            pair.x.positions,
         )
-        for go, come in ((there.by_layer, back.by_layer), (there.by_descriptors, back.by_descriptors))
+        for to_y, to_x in (
+            (forward.by_layer, backward.by_layer),
+            (forward.by_descriptors, backward.by_descriptors),
+        )
     )
-    return WEIGHT * (there.energy + back.energy + bijectivity) + by_layer + by_descriptors / 2
+    return WEIGHT * (forward.energy + backward.energy + bijectivity) + by_layer + by_descriptors / 2
 
 
 LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]] = {
@@ -272,7 +311,7 @@ LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]]
 
 
 def save(network: DescriptorNetwork, path: Path) -> None:
-    """Write a network: a line of JSON with its sizes and its float type, then its leaves."""
+    """Write a network to a file: one line of JSON with the sizes and the float type, then the leaves."""
     header = {"sizes": asdict(network.sizes), "dtype": str(network.leave.weight.dtype)}
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         stream.write(json.dumps(header).encode() + b"\n")
@@ -280,9 +319,9 @@ def save(network: DescriptorNetwork, path: Path) -> None:
 
 
 def load(path: Path) -> DescriptorNetwork:
-    """Read what `save` wrote.
+    """Read a network that `save` wrote.
 
-    **Raises:** `InputError` if it did not write this file, or not all of it.
+    **Raises:** `InputError` if the file is damaged or was not written by `save`.
     """
     with reading(path) as stream:
         header = json.loads(stream.readline(_LONGEST_HEADER))
@@ -299,22 +338,24 @@ _LONGEST_HEADER = 1000
 
 @eqx.filter_jit
 def nearest_descriptors(network: DescriptorNetwork, x: Spectrum, y: Spectrum) -> Int[Array, " m"]:
-    """The vertices of Y whose descriptors are nearest to those of X's vertices."""
+    """Return, for each vertex of X, the vertex of Y with the nearest descriptors."""
     return nearest_neighbor(network(x), network(y), database_mask=y.mask)
 
 
-def of_pair(pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of each start, and of what refinement makes of it."""
+def descriptor_errors(
+    pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
+) -> dict[str, float]:
+    """Mean geodesic errors x 10³ of each initial map, before and after refinement."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
     spectra = x.with_descriptors(None), y.with_descriptors(None)
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
-    starts = {REFERENCE: prepared.initial_map}
+    initial_maps = {REFERENCE: prepared.initial_map}
     for name, network in networks.items():
-        starts[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
-    maps = {f"{name}{START}": found for name, found in starts.items()}
-    maps |= {f"{name}{REFINED}": refined(spectra, found) for name, found in starts.items()}
+        initial_maps[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
+    maps = {f"{name}{START}": found for name, found in initial_maps.items()}
+    maps |= {f"{name}{REFINED}": refined(spectra, found) for name, found in initial_maps.items()}
     return errors(pair, mesh_x, mesh_y, maps, seed)
 
 
@@ -322,17 +363,17 @@ REFERENCE, START, REFINED = "SHOT", ", start", ", refined"
 
 
 def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
-    """The page, in parts."""
+    """Yield the parts of `summary.md`."""
     yield "# Learned descriptors\n"
     yield (
-        f"{steps} steps of Adam for each loss, each of one pair on {SAMPLES} samples. Mean geodesic errors x "
-        "10⁻³ √area of nearest neighbours of descriptors, and of what the preset `paper` makes of them "
-        f"(k = {EIGENVECTORS}, {ITERATIONS} iterations); in brackets 95 % bootstrap intervals of the mean "
-        "difference from SHOT, pair by pair.\n"
+        f"{steps} steps of Adam for each loss, each step on one pair with {SAMPLES} samples per shape. Mean "
+        "geodesic errors x 10⁻³ √area of the nearest neighbours of descriptors (initial map), and after "
+        f"refinement by the preset `paper` (k = {EIGENVECTORS}, {ITERATIONS} iterations); in parentheses the "
+        "mean paired difference from SHOT with its 95 % bootstrap interval.\n"
     )
-    of_pairs = next(iter(measured.values()))[0]
-    names = [name.removesuffix(START) for name in of_pairs if name.endswith(START)]
-    for title, suffix in (("start", START), ("refined", REFINED)):
+    first_pair = next(iter(measured.values()))[0]
+    names = [name.removesuffix(START) for name in first_pair if name.endswith(START)]
+    for title, suffix in (("initial map", START), ("refined", REFINED)):
         here = {
             f"{data_set}, {title}": [{name: pair[name + suffix] for name in names} for pair in pairs]
             for data_set, pairs in measured.items()
@@ -342,11 +383,11 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
 
 
 def draw(curves: Mapping[str, Trained], path: Path) -> None:
-    """How losses fell, on pairs trained on and on others."""
+    """Draw the losses over the steps, on the training pairs and on pairs of other people."""
     figure, axes = plt.subplots(1, len(curves), figsize=(5 * len(curves), 3.4), layout="constrained")
     for axis, (name, curve) in zip(axes, curves.items(), strict=True):
-        axis.plot(*smoothed(curve.losses), label="pairs trained on, running mean")
-        axis.plot(curve.steps, curve.watched, "o-", label=f"{WATCHED_PAIRS} pairs of people not seen")
+        axis.plot(*smoothed(curve.losses), label="training pairs, running mean")
+        axis.plot(curve.steps, curve.watched, "o-", label=f"{WATCHED_PAIRS} pairs of other people")
         axis.set(title=f"loss, {name}", xlabel="step", ylim=(0, None))
         axis.legend()
     with atomic_write(path) as temporary:
@@ -381,7 +422,7 @@ def main() -> None:
             networks[f"learned from {name}"] = load(path)
         measured = measure(
             run.data,
-            lambda pair: of_pair(pair, networks, run.seed),
+            lambda pair: descriptor_errors(pair, networks, run.seed),
             number_of_pairs=run.test_pairs,
             seed=run.seed,
             directory=run.directory,

@@ -1,20 +1,25 @@
-"""Can a tight frame be learned that matches shapes better than Meyer's?
+"""Trains tight frames, and tests whether they match shapes better than the Meyer frame.
 
     python scripts/learn_frame.py DATA_DIRECTORY [--output DIRECTORY] [--steps N] [--test-pairs N] [--seed N]
                                   [--quick]
 
-It needs the extra `learn`: `pip install -e ".[learn]"`.
+The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `SoftmaxFrame`, a Parseval frame whatever
-its parameters are, starts like Meyer's with six filters and is trained on pairs of FAUST's first five people
-by Adam (optax), one pair at each step, with gradients through `refine_softly` on samples of both
-shapes: once with the truth, once without. What is minimised is how far matches are from the truth, or how far
-one is from where one began after going there and back, as the root of the mean square over a soft map.
+DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which is
+a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step of
+Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on
+samples of both shapes. Two frames are trained, each with its own loss:
 
-Then Meyer's frame and both that were learned refine pairs of the five other people and of TOSCA with
-`jaxsmw.refine` from the same start. `summary.md` says how they compare, `frames.png` shows them, and
-`frame_labels.npz` and `frame_cycles.npz` hold them (`Warped(SoftmaxFrame(logits), Power())`). Interrupted,
-it goes on where it was, if started again with the same settings.
+- `labels`: the distance between matches and the ground truth;
+- `cycles`: the distance between each point and its image under the forward map followed by the backward map.
+  This loss needs no ground truth.
+
+Both distances are root mean squares over the shares of the soft maps.
+
+Then `jaxsmw.refine` refines pairs of the five other people and of TOSCA with the Meyer frame and with both
+trained frames, from the same initial maps. The script writes `summary.md` with the errors, `frames.png` with
+the filters and losses, and `frame_labels.npz` and `frame_cycles.npz` with the trained frames
+(`Warped(SoftmaxFrame(logits), Power())`). After an interruption the same command continues.
 """
 
 from __future__ import annotations
@@ -37,12 +42,12 @@ from learning import (
     errors,
     measure,
     parser,
-    places,
     refined,
     root_mean_square,
     running,
     smoothed,
     train,
+    unit_area_positions,
 )
 from scipy.spatial import KDTree
 
@@ -71,39 +76,50 @@ TEMPERATURE, LEARNING_RATE, FLOOR = 0.1, 0.3, 0.05
 
 
 class Sampled(NamedTuple):
-    """A pair on samples of both shapes, which is what is trained on."""
+    """A training pair, restricted to s samples of each shape.
+
+    **Attributes:**
+
+    - `spectrum_x`, `spectrum_y`: the spectra of both shapes at the samples.
+    - `positions_x`, `positions_y`: the positions of the samples, in square roots of the area of each shape.
+    - `initial_map`: the initial map from the samples of X to the samples of Y.
+    - `reverse_initial_map`: the initial map from the samples of Y to the samples of X.
+    - `truth`: the position on Y of the ground truth of each sample of X, in the units of `positions_y`.
+    """
 
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     positions_x: Float[Array, "s 3"]
     positions_y: Float[Array, "s 3"]
-    start: Int[Array, " s"]
-    way_back: Int[Array, " s"]
+    initial_map: Int[Array, " s"]
+    reverse_initial_map: Int[Array, " s"]
     truth: Float[Array, "s 3"]
 
 
 def bank_of(frame: SoftmaxFrame) -> FilterBank:
-    """Knots evenly spaced in frequency."""
+    """Return the frame as a filter bank whose knots are evenly spaced in frequency."""
     return Warped(frame, Power())
 
 
 def like_meyer() -> SoftmaxFrame:
-    """Where learning starts."""
+    """Return the frame from which training starts: close to the Meyer frame, with all filters positive."""
     return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 
 @cache
 def sampled(pair: DataPair) -> Sampled:
-    """Samples, starts in both directions and truth of a pair, lengths in square roots of the area."""
+    """Sample both shapes of a pair, and compute the initial maps and the ground truth between the samples."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     pair_of_meshes = Pair(mesh_x, mesh_y)
     spectra = paired_spectra(pair_of_meshes, EIGENVECTORS)
     samples = [farthest_point_samples(mesh, SAMPLES) for mesh in (mesh_x, mesh_y)]
-    positions = [places(mesh)[chosen] for mesh, chosen in zip((mesh_x, mesh_y), samples, strict=True)]
+    positions = [
+        unit_area_positions(mesh)[chosen] for mesh, chosen in zip((mesh_x, mesh_y), samples, strict=True)
+    ]
 
     def nearest(pointwise_map: np.ndarray, source: int, mesh: Mesh) -> np.ndarray:
-        """Among samples, from a map of all vertices to all."""
-        found = places(mesh)[pointwise_map[samples[source]]]
+        """Restrict a map between all vertices to the samples: each match becomes the nearest sample."""
+        found = unit_area_positions(mesh)[pointwise_map[samples[source]]]
         return KDTree(positions[1 - source]).query(found)[1].astype(np.int32)
 
     truth = pair.ground_truth(mesh_x, mesh_y).everywhere(mesh_x)[samples[0]]
@@ -112,77 +128,77 @@ def sampled(pair: DataPair) -> Sampled:
         *(jnp.asarray(place, jnp.float32) for place in positions),
         jnp.asarray(nearest(initial_map(pair_of_meshes, *spectra), 0, mesh_y)),
         jnp.asarray(nearest(initial_map(pair_of_meshes.reversed(), *spectra[::-1]), 1, mesh_x)),
-        jnp.asarray(places(mesh_y)[truth], jnp.float32),
+        jnp.asarray(unit_area_positions(mesh_y)[truth], jnp.float32),
     )
 
 
 def soft_map(
-    frame: SoftmaxFrame, spectrum_x: Spectrum, spectrum_y: Spectrum, start: Int[Array, " s"]
+    frame: SoftmaxFrame, spectrum_x: Spectrum, spectrum_y: Spectrum, initial: Int[Array, " s"]
 ) -> SoftMap | SparseSoftMap:
-    """What the frame makes of a start."""
-    # Samples' eigenvectors are not orthonormal.
+    """Return the soft map that `refine_softly` computes with the frame from an initial map."""
+    # Eigenvectors restricted to samples are not orthonormal.
     refiner = WaveletPreservation(bank_of(frame), Filtering("least_squares"))
     recovery: Recovery = Softmax(TEMPERATURE)
     options = {"refiner": refiner, "recovery": recovery, "iterations": ITERATIONS - 1}
-    return refine_softly(spectrum_x, spectrum_y, start, **options).soft_map
+    return refine_softly(spectrum_x, spectrum_y, initial, **options).soft_map
 
 
 def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """The loss with labels."""
-    found = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.start)
+    """The loss `labels`: the mean distance between soft matches and the ground truth."""
+    found = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     return root_mean_square(found.pull_back, pair.positions_y, pair.truth)
 
 
-def distance_there_and_back(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """The loss without: how far from where it began a point of X comes back to."""
-    there = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.start)
-    back = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.way_back)
+def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
+    """The loss `cycles`: the mean distance between points of X and their images under both soft maps."""
+    forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
+    backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
     return root_mean_square(
-        lambda values: there.pull_back(back.pull_back(values)), pair.positions_x, pair.positions_x
+        lambda values: forward.pull_back(backward.pull_back(values)), pair.positions_x, pair.positions_x
     )
 
 
 LOSSES: dict[str, Callable[[SoftmaxFrame, Sampled], Float[Array, ""]]] = {
     "labels": distance_to_truth,
-    "cycles": distance_there_and_back,
+    "cycles": round_trip_distance,
 }
 
 
 def save(frame: SoftmaxFrame, path: Path) -> None:
-    """As what NumPy reads."""
+    """Write the logits of a frame to an `.npz` file."""
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, logits=np.asarray(frame.logits))
 
 
 def load(path: Path) -> FilterBank:
-    """The bank of a saved frame."""
+    """Read the filter bank of a frame that `save` wrote."""
     with np.load(path) as arrays:
         return bank_of(SoftmaxFrame(arrays["logits"]))
 
 
-def of_pair(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of refinement with each bank, from the same start."""
+def refinement_errors(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
+    """Mean geodesic errors x 10³ of refinement with each bank, from the same initial map."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
-    spectra, start = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map
-    maps = {name: refined(spectra, start, WaveletPreservation(bank)) for name, bank in banks.items()}
+    spectra, initial = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map
+    maps = {name: refined(spectra, initial, WaveletPreservation(bank)) for name, bank in banks.items()}
     return errors(pair, mesh_x, mesh_y, maps, seed)
 
 
 def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
-    """The page, in parts."""
+    """Yield the parts of `summary.md`."""
     yield "# Learned frames\n"
     yield (
         f"Frames of {FILTERS} filters and {KNOTS} knots, {steps} steps of Adam; k = {EIGENVECTORS}, "
-        f"{ITERATIONS} iterations from SHOT. Mean geodesic errors x 10⁻³ √area; in brackets 95 % bootstrap "
-        "intervals of the mean difference from Meyer's frame, pair by pair.\n"
+        f"{ITERATIONS} iterations from SHOT. Mean geodesic errors x 10⁻³ √area; in parentheses the mean "
+        "paired difference from the Meyer frame with its 95 % bootstrap interval.\n"
     )
     yield comparison(measured, list(next(iter(measured.values()))[0]), seed)
     yield begun_with + "\n"
 
 
 def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path: Path) -> None:
-    """The filters of each bank, and how losses fell."""
+    """Draw the filters of each bank, and the losses over the steps."""
     figure, axes = plt.subplots(1, len(banks) + 1, figsize=(4 * len(banks) + 4, 3.2), layout="constrained")
     points = jnp.linspace(0, 1, 500)
     for axis, (name, bank) in zip(axes[:-1], banks.items(), strict=True):
@@ -190,7 +206,7 @@ def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path
         axis.set(title=name, xlabel="√(λ / λ_max)", ylim=(0, 1.05))
     for name, values in losses.items():
         axes[-1].plot(*smoothed(values), label=name)
-    axes[-1].set(title="loss, of that before learning", xlabel="step")
+    axes[-1].set(title="loss / loss before training", xlabel="step")
     axes[-1].legend()
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120)
@@ -214,7 +230,7 @@ def main() -> None:
                 steps=run.steps,
                 seed=run.seed,
                 directory=run.directory,
-                # Pairs differ more than frames do.
+                # The loss varies more between pairs than between frames.
                 unit=lambda pair, loss=loss: loss(like_meyer(), pair),
             )
             losses[name] = trained.losses
@@ -222,7 +238,7 @@ def main() -> None:
             banks[f"learned from {name}"] = load(run.directory / f"frame_{name}.npz")
         measured = measure(
             run.data,
-            lambda pair: of_pair(pair, banks, run.seed),
+            lambda pair: refinement_errors(pair, banks, run.seed),
             number_of_pairs=run.test_pairs,
             seed=run.seed,
             directory=run.directory,

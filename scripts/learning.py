@@ -1,4 +1,4 @@
-"""What the scripts that learn share: the data, training that goes on where it was, the comparison."""
+"""Common code of the training scripts: the data, training that can be resumed, and the comparison."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, m
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10
 EVALUATED_POINTS = 500
-# Steps between saves, and between looks at pairs that are not trained on.
+# The number of steps between saves, and between evaluations of the loss on watched pairs.
 _SAVED_EVERY, _WATCHED_EVERY = 10, 20
-# Shapes of nearly as many vertices are padded to the same number, so that one compiled program serves them.
+# Shapes are padded to a multiple of this number of vertices, so that shapes of similar size share one
+# compiled program.
 _SIZES = 512
 
 Model = TypeVar("Model", bound=eqx.Module)
@@ -39,7 +40,15 @@ Prepared = TypeVar("Prepared")
 
 
 class Data(NamedTuple):
-    """Pairs to learn from, and pairs to be measured on."""
+    """The pairs for training and for evaluation.
+
+    **Attributes:**
+
+    - `seen`: the listed pairs of the training people.
+    - `seen_further`: the other pairs of the training people with ground truth.
+    - `unseen`: the listed pairs of the other people, for evaluation.
+    - `animals`: the pairs of TOSCA, for evaluation.
+    """
 
     seen: list[DataPair]
     seen_further: list[DataPair]
@@ -48,16 +57,15 @@ class Data(NamedTuple):
 
 
 def person(shape: str) -> int:
-    """Whose shape it is: FAUST numbers ten poses of one person after those of another."""
+    """Return the number of the person: FAUST numbers the ten poses of each person consecutively."""
     return int(shape.rsplit("_", 1)[1]) // POSES
 
 
 def open_data(directory: Path) -> Data:
-    """FAUST's people, those who are trained on and the others, and TOSCA.
+    """Open FAUST and TOSCA, and divide the pairs of FAUST by person.
 
-    `seen_further` are pairs of the same people that are not among those to be matched; their truth is known.
-
-    **Raises:** `InputError` if a set is missing, or has none of the people.
+    **Raises:** `InputError` if a data set is missing, or if FAUST has no pairs for training or no pairs for
+    evaluation.
     """
     faust, tosca = (open_data_set(directory / name) for name in ("faust_r", "tosca_r"))
 
@@ -72,14 +80,14 @@ def open_data(directory: Path) -> Data:
     )
     if not data.seen or not data.unseen:
         raise InputError(
-            f"{faust.directory}: has no pairs of the first {TRAINING_PEOPLE} people, or of the others: "
-            "complete the copy."
+            f"{faust.directory}: has no pairs among the first {TRAINING_PEOPLE} people, or no pairs among "
+            "the other people: complete the copy."
         )
     return data
 
 
-def places(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """Vertices in units of the square root of the area."""
+def unit_area_positions(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
+    """Return the vertex positions in units of the square root of the surface area."""
     return mesh.vertices / mesh.area**0.5
 
 
@@ -88,29 +96,46 @@ def root_mean_square(
     positions: Float[Array, "s 3"],
     wanted: Float[Array, "s 3"],
 ) -> Float[Array, ""]:
-    """How far from where they should be points are carried: over a soft map, then the mean of all."""
+    """Return the mean distance between the images of points under soft maps and their wanted positions.
+
+    The distance of one point is the root of its mean squared distance over the shares of the soft map.
+
+    **Arguments:**
+
+    - `carried`: pulls functions back by one or several soft maps.
+    - `positions`: the positions of the points on the shape from which `carried` pulls back.
+    - `wanted`: the wanted position of each image.
+    """
     found = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
     squares = found[:, 3] - 2 * jnp.sum(found[:, :3] * wanted, axis=1) + jnp.sum(wanted**2, axis=1)
     return jnp.mean(jnp.sqrt(jnp.maximum(squares, 0) + 1e-6))
 
 
 class State(eqx.Module):
-    """What training goes on from."""
+    """The state of a training run, as `train` saves it."""
 
     model: eqx.Module
     optimizer: optax.OptState
     step: Int[Array, ""]
     losses: Float[Array, " steps"]
-    watched: Float[Array, " looks"]
+    watched: Float[Array, " records"]
 
 
 class Trained(NamedTuple):
-    """The model, the loss of every step, and at some `steps` that of pairs which are not trained on."""
+    """The outcome of training.
+
+    **Attributes:**
+
+    - `model`: the trained model.
+    - `losses`: the loss of every step.
+    - `steps`: the numbers of completed steps at which the loss on the watched pairs was evaluated.
+    - `watched`: the mean loss on the watched pairs after these numbers of steps.
+    """
 
     model: Any
     losses: Float[np.ndarray, " steps"]
-    steps: Int[np.ndarray, " looks"]
-    watched: Float[np.ndarray, " looks"]
+    steps: Int[np.ndarray, " records"]
+    watched: Float[np.ndarray, " records"]
 
 
 def train(
@@ -127,28 +152,38 @@ def train(
     unit: Callable[[Prepared], Float[Array, ""]] | None = None,
     watched: Sequence[DataPair] = (),
 ) -> Trained:
-    """The model after so many steps, each by another pair, drawn with a seed.
+    """Train a model; each step uses one pair, drawn at random.
 
-    Saved on the way as `training_NAME.eqx`, from which it goes on if it is there.
+    The state is saved regularly as `training_NAME.eqx` in `directory`. If that file exists, training
+    continues from it.
 
     **Arguments:**
 
-    - `prepare`: what the loss wants to know of a pair.
-    - `unit`: what losses are noted in units of, as pairs differ more than models do; nothing by default.
-    - `watched`: pairs whose mean loss is noted now and then, and serves nothing else.
+    - `name`: the name of the loss, for the file and the progress bar.
+    - `loss`: a function of the model and a prepared pair.
+    - `model`: the initial model.
+    - `pairs`: the training pairs.
+    - `prepare`: a function that prepares a pair for the loss.
+    - `optimizer`: the optimiser.
+    - `steps`: the number of steps.
+    - `seed`: the seed of the draws.
+    - `directory`: an existing directory for the saved state.
+    - `unit`: a function of a prepared pair. Each recorded loss is divided by its value, because losses vary
+      more between pairs than between models. By default losses are recorded without this division.
+    - `watched`: pairs whose mean loss is recorded at regular intervals; they do not influence training.
 
-    **Raises:** `InputError` if what was saved is damaged or of other settings; `ArithmeticError` if a loss is
-    not finite.
+    **Raises:** `InputError` if the saved state is damaged or has other settings; `ArithmeticError` if a loss
+    is not finite.
     """
 
-    looks = np.append(np.arange(0, steps, _WATCHED_EVERY), steps) if watched else np.zeros(0, int)
+    records = np.append(np.arange(0, steps, _WATCHED_EVERY), steps) if watched else np.zeros(0, int)
     dtype = jnp.result_type(float)
     state = State(
         model,
         optimizer.init(eqx.filter(model, eqx.is_inexact_array)),
         jnp.asarray(0, jnp.int32),
         jnp.zeros(steps, dtype),
-        jnp.zeros(len(looks), dtype),
+        jnp.zeros(len(records), dtype),
     )
     saved = directory / f"training_{name}.eqx"
     if saved.exists():
@@ -156,22 +191,22 @@ def train(
             state = eqx.tree_deserialise_leaves(stream, state)
 
     def watch(state: State) -> State:
-        """The loss of pairs not trained on, if this is a step at which it is noted."""
-        here = np.flatnonzero(looks == int(state.step))
+        """Record the mean loss on the watched pairs if it is due at this step."""
+        here = np.flatnonzero(records == int(state.step))
         if not len(here):
             return state
-        mean = np.mean([float(_look(loss, state.model, prepare(pair))) for pair in watched])
+        mean = np.mean([float(_evaluate(loss, state.model, prepare(pair))) for pair in watched])
         return eqx.tree_at(lambda s: s.watched, state, state.watched.at[here[0]].set(mean))
 
     order = np.random.default_rng(seed).integers(0, len(pairs), steps)
-    begun = int(state.step)
+    first_step = int(state.step)
     progress = tqdm(
-        range(begun, steps),
+        range(first_step, steps),
         desc=f"learning {name}",
         unit="step",
-        initial=begun,
+        initial=first_step,
         total=steps,
-        disable=begun == steps,
+        disable=first_step == steps,
     )
     for step in progress:
         pair = pairs[order[step]]
@@ -185,10 +220,10 @@ def train(
                 state = watch(state)
             with atomic_write(saved) as temporary, open(temporary, "wb") as stream:
                 eqx.tree_serialise_leaves(stream, state)
-    return Trained(state.model, np.asarray(state.losses), looks, np.asarray(state.watched))
+    return Trained(state.model, np.asarray(state.losses), records, np.asarray(state.watched))
 
 
-# Out here, so that they are compiled once for the same loss and optimiser.
+# These two functions are at module level so that each is compiled only once for each loss and optimiser.
 @eqx.filter_jit
 def _improve(
     state: State,
@@ -204,7 +239,7 @@ def _improve(
 
 
 @eqx.filter_jit
-def _look(
+def _evaluate(
     loss: Callable[[Model, Prepared], Float[Array, ""]], model: Model, pair: Prepared
 ) -> Float[Array, ""]:
     return loss(model, pair)
@@ -212,50 +247,51 @@ def _look(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """A file of leaves that equinox wrote, to be read to its end.
+    """Open a file of leaves that equinox wrote; the body of the `with` statement must read all of it.
 
-    **Raises:** `InputError` if that does not work.
+    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if data remain.
     """
     try:
         with open(path, "rb") as stream:
             yield stream
             if stream.read(1):
-                raise ValueError("there is more in it")
-    except Exception as error:  # NumPy's and equinox's readers raise all kinds
+                raise ValueError("the file has trailing data")
+    except Exception as error:  # the readers of NumPy and equinox raise many types
         raise InputError(
-            f"{path}: is damaged, or holds something else than was saved here: remove it, or give another."
+            f"{path}: is damaged, or was written by other code or with other settings: remove it, or give "
+            "another file."
         ) from error
 
 
 def padded(spectrum: Spectrum) -> Spectrum:
-    """The shape with masked vertices up to one of few sizes."""
+    """Pad a spectrum with masked vertices to a multiple of `_SIZES`."""
     return spectrum.pad(-(-spectrum.mask.shape[0] // _SIZES) * _SIZES)
 
 
 def refined(
     spectra: tuple[Spectrum, Spectrum],
-    start: Int[Array | np.ndarray, " m"],
+    initial: Int[Array | np.ndarray, " m"],
     refiner: WaveletPreservation = WaveletPreservation(),  # noqa: B008 (immutable)
 ) -> Int[np.ndarray, " m"]:
-    """What the paper's number of iterations makes of a start."""
-    m = len(start)
+    """Refine an initial map with `ITERATIONS` iterations, and return the pointwise map."""
+    m = len(initial)
     x, y = map(padded, spectra)
-    start = jnp.asarray(np.pad(np.asarray(start), (0, x.mask.shape[0] - m)), jnp.int32)
-    found = refine(x, y, start, refiner=refiner, iterations=ITERATIONS)
+    initial = jnp.asarray(np.pad(np.asarray(initial), (0, x.mask.shape[0] - m)), jnp.int32)
+    found = refine(x, y, initial, refiner=refiner, iterations=ITERATIONS)
     return np.asarray(found.pointwise_map)[:m].astype(np.int64)
 
 
 def errors(
     pair: DataPair, mesh_x: Mesh, mesh_y: Mesh, maps: Mapping[str, Int[np.ndarray, " m"]], seed: int
 ) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of maps, all at the same points of the truth."""
+    """Mean geodesic errors x 10³ of several maps, all at the same points of the ground truth."""
     truth = pair.ground_truth(mesh_x, mesh_y)
     options: dict[str, Any] = {"number_of_samples": EVALUATED_POINTS, "seed": seed}
     return {name: 1e3 * geodesic_error(mesh_y, found, truth, **options).mean for name, found in maps.items()}
 
 
 Measured = dict[str, list[dict[str, float]]]
-"""For each data set, for each pair, figures by name."""
+"""For each data set a list of pairs, and for each pair its errors by name."""
 
 
 def measure(
@@ -266,9 +302,19 @@ def measure(
     seed: int,
     directory: Path,
 ) -> Measured:
-    """Figures of some unseen people's pairs and of TOSCA's, kept in `errors.csv` as they come.
+    """Measure random pairs of the other people and of TOSCA.
 
-    The first pairs of a larger number are those of a smaller.
+    The errors of each pair are appended to `errors.csv` at once. Pairs that the file already
+    contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset of the
+    pairs that a larger number selects.
+
+    **Arguments:**
+
+    - `data`: the pairs.
+    - `of_pair`: a function that returns the errors of a pair by name.
+    - `number_of_pairs`: the largest number of pairs from each data set.
+    - `seed`: the seed of the draws.
+    - `directory`: the directory of `errors.csv`.
     """
     generator, journal = np.random.default_rng(seed), Journal(directory / "errors.csv", ["source", "target"])
     measured: Measured = {}
@@ -287,7 +333,7 @@ def measure(
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """A table of means, with differences from the first name pair by pair and their intervals."""
+    """Return a table of mean errors, with paired differences from the first name and their intervals."""
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}
@@ -300,26 +346,38 @@ def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
 
 
 def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarray]:
-    """Steps, and running means over a tenth of them, to be drawn."""
+    """Return steps and running means over a tenth of the values, for a plot."""
     window = max(1, len(values) // 10)
     means = np.convolve(values, np.ones(window) / window, "valid")
     return np.arange(len(means)) + window / 2, means
 
 
 def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentParser:
-    """The arguments of a script that learns."""
+    """Return the parser for the arguments of a training script."""
     made = argparse.ArgumentParser(description=description)
-    made.add_argument("data", type=Path, help="the directory with faust_r and tosca_r")
+    made.add_argument("data", type=Path, help="directory with faust_r and tosca_r")
     made.add_argument("--output", type=Path, default=Path(output), help=f"default: {output}")
-    made.add_argument("--steps", type=int, default=steps, help=f"of training (default: {steps})")
-    made.add_argument("--test-pairs", type=int, default=40, help="of each data set (default: 40)")
-    made.add_argument("--seed", type=int, default=0, help="of the draws (default: 0)")
-    made.add_argument("--quick", action="store_true", help="3 steps, 2 pairs: to see that it works")
+    made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
+    made.add_argument(
+        "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
+    )
+    made.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
+    made.add_argument(
+        "--quick", action="store_true", help="3 steps and 2 test pairs, to check that the script works"
+    )
     return made
 
 
 class Run(NamedTuple):
-    """What was asked for, where it goes, and what began it, in one line."""
+    """The settings of a run.
+
+    **Attributes:**
+
+    - `data`: the pairs.
+    - `directory`: the output directory.
+    - `steps`, `test_pairs`, `seed`: see the command-line options.
+    - `begun_with`: commit, machine and versions in one line.
+    """
 
     data: Data
     directory: Path
@@ -331,16 +389,22 @@ class Run(NamedTuple):
 
 @contextmanager
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
-    """Read the arguments, open the data, and keep other processes and other settings out of the output.
+    """Read the arguments, open the data, and reserve the output directory for this process.
 
-    `provenance.json` there says what results come from; see `jaxsmw.evaluation.journal.claimed_directory`.
-    Leaves by the parser's error, with one sentence, on bad input, and with another if interrupted.
+    The provenance of the results is written to `provenance.json` in the output directory; see
+    `jaxsmw.evaluation.journal.claimed_directory`. Bad input and interruptions end the process with one
+    sentence.
+
+    **Arguments:**
+
+    - `arguments`: the parser, made by `parser`.
+    - `settings`: further settings that all results in the output directory must share.
     """
     options = arguments.parse_args()
     steps, test_pairs = (3, 2) if options.quick else (options.steps, options.test_pairs)
     if steps < 1 or test_pairs < 1 or options.seed < 0:
         arguments.error("--steps and --test-pairs must be at least 1, --seed at least 0")
-    warnings.simplefilter("ignore")  # about meshes, of which each would tell
+    warnings.simplefilter("ignore")  # about the quality of each mesh
     script = Path(sys.argv[0])
     try:
         data, directory = open_data(options.data), make_directory(options.output)
@@ -354,11 +418,11 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
     except InputError as error:
         arguments.error(str(error))
     except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted; the same command goes on from what {options.output} holds")
+        sys.exit(f"\ninterrupted; the same command continues from the results in {options.output}")
 
 
 def _public(options: argparse.Namespace) -> list[str]:
-    """The arguments that make a difference, without where things lie on this machine."""
+    """Return the options that affect the results, without the paths on this machine."""
     numbers = [("--steps", options.steps), ("--test-pairs", options.test_pairs), ("--seed", options.seed)]
     given = ["--quick"] if options.quick else [str(part) for pair in numbers[:2] for part in pair]
     return ["DATA_DIRECTORY", *given, *map(str, numbers[2])]

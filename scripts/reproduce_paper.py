@@ -13,11 +13,12 @@ experiment uses the data sets that suit the experiment:
 - `fig9`: other meshes and resolutions of the target, and other initial maps;
 - `nonisometric`: pairs of different classes, from published initial maps if there are any, compared with
   published results;
-- `settings`: MWP and the other methods at other settings than published, on the data sets of `table1`.
+- `settings`: MWP and the other methods with settings other than the published ones, on the data sets of
+  `table1`.
 
-The output directory gets a directory for each run, as written by `jaxsmw benchmark`, and `README.md` with all
-tables. After an interruption the same command continues. `--quick` takes minutes on shapes with 5000
-vertices.
+The output directory gets a directory for each run, with the same files as from `jaxsmw benchmark`, and a
+`README.md` with all tables. After an interruption the same command continues. With `--quick` the script takes
+minutes on shapes with 5000 vertices.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# fig9 uses one of so many pairs that the other experiments use.
+# fig9 uses one in this number of the pairs that the other experiments use.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
 # These descriptors cannot distinguish left from right; SHOT can, and "functional" is computed from SHOT.
@@ -83,7 +84,7 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
         except InputError as error:
             print(f"left out: {error}")
     if not found:
-        raise InputError(f"{data}: holds no data set: give the directory that holds them.")
+        raise InputError(f"{data}: holds no data set: give the directory that holds the data sets.")
     return found
 
 
@@ -138,7 +139,7 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
             setting = same(options, init=init, mirrored=_can_mirror(init, pairs))
             yield Run("fig9", f"{data_set.name}-from-{Path(init).name}", data_set, pairs, some, setting)
         if not all(len(pair.truth) in (0, 2) for pair in pairs):
-            continue  # because `derive` needs rows of ground truth that exist for each shape
+            continue  # `derive` cannot use ground truth that is stored for each pair instead of each shape
         for name, remesh in MESHINGS.items():
             directory = options.output / "fig9" / f"meshes-{data_set.name}-{name}"
             derived = derive(directory, pairs, name, remesh)
@@ -152,7 +153,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # Results are in directories whose names extend the name of the directory with their initial maps.
+        # The name of a directory with results begins with the name of the directory with their initial maps.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -167,7 +168,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Other settings than published."""
+    """Settings other than the published ones."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
@@ -226,7 +227,7 @@ def published(data_set: DataSet) -> list[str]:
 
 
 def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
-    """Whether to use the mirrored ground truth, too, for this kind of initial map."""
+    """Whether to measure results from this kind of initial map against the mirrored ground truth, too."""
     ambiguous = init in _MIRRORED or "symm" in Path(init).name
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
@@ -244,12 +245,12 @@ def finer(mesh: Mesh) -> Remeshed:
 
 
 def coarser(mesh: Mesh) -> Remeshed:
-    """Collapses edges, the shortest first, until a quarter of the faces is left."""
+    """Collapses edges, the shortest first, until a quarter of the faces are left."""
     return _decimate(mesh, mesh.vertices, len(mesh.faces) // 4)
 
 
 def uneven(mesh: Mesh) -> Remeshed:
-    """Collapses edges until half of the faces is left, fewer towards one end of the body."""
+    """Collapses edges until half of the faces are left. Faces are smaller towards one end of the body."""
     centered = mesh.vertices - mesh.vertices.mean(axis=0)
     _, _, axes = np.linalg.svd(centered, full_matrices=False)
     along = centered @ axes[0]
@@ -266,7 +267,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """Writes a remeshed set with the sources as they are and the targets meshed again, and opens the set."""
+    """Writes a data set with the same sources and remeshed targets, and opens this data set."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")

@@ -1,1 +1,1 @@
-"""The pieces of `scripts/compare_frames.py`: what is compared, how it is measured, kept and summarised."""
+"""The parts of `scripts/compare_frames.py`: variants, measurements, summary and figures."""

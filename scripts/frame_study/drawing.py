@@ -1,4 +1,4 @@
-"""The figures of the study."""
+"""The figures of the frame study."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def draw_figures(output: Path, data: Path, study: Study, parameters: Sequence[Ro
 
 
 def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings) -> None:
-    """The filters, and one wavelet of each scale around the same point of both bodies."""
+    """Draw the filters, and one wavelet of each scale around corresponding points of both bodies."""
     mesh_x, mesh_y, truth = read_pair(data, pair)
     meshes = mesh_x, mesh_y
     spectra = [compute_spectrum(mesh, settings.number_of_eigenvectors) for mesh in meshes]
-    # The point of the source that is nearest to the viewer is not hidden.
+    # The wavelets are centred at the point of the source nearest to the viewer, because it is visible.
     standing = [stand(mesh) for mesh in meshes]
     towards = camera_axes(choose_azimuth(standing))[2]
     row = np.argmax(standing[0].vertices[truth.source_vertices] @ towards)
@@ -56,7 +56,7 @@ def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings)
 
 
 def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
-    """Paired differences from the default; ablations, which have no grid of updates, in rows of their own."""
+    """Draw paired differences from the default. Each ablation has its own row, with one interval."""
     rows = {frame: {update: (frame, update) for update in UPDATES} for frame in study.settings.frames}
     rows |= {f"{frame}, {update}": {"filtering": (frame, update)} for frame, update in ABLATIONS}
 
@@ -71,7 +71,7 @@ def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
 
 
 def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings) -> None:
-    """Eigenvectors x filters after the last iteration, and eigenvectors x iterations."""
+    """Draw the errors over eigenvectors x filters after the last iteration, and eigenvectors x iterations."""
     ks, filters = settings.parameter_eigenvectors, settings.parameter_filters
     iterations = range(1, settings.parameter_iterations + 1)
     errors = {}

@@ -1,4 +1,4 @@
-"""What is measured on one pair of shapes. Everything here runs in worker processes, on one core each."""
+"""The measurements on one pair of shapes. They run in worker processes, each on one core."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
 
 DATA_SETS = ("faust_r", "tosca_r")
-# Shapes are padded to a multiple of this, so that one compiled program serves a whole data set.
+# Shapes are padded to a multiple of this number of vertices, so that one compiled program serves a data set.
 _PADDING = 1024
 MOVE = 0.02
-"""How far a match must go, straight and in square roots of the area, to count as moved: about one edge."""
+"""A match counts as moved beyond this straight distance, in square roots of the area: about one edge."""
 INVARIANCE_FRAMES = ("Meyer", "cubic spline")
 SEARCH = DEFAULT._replace(update="nearest neighbors")
-"""What the other half of an iteration is called among the times."""
+"""The name of the nearest-neighbour search, the other half of an iteration, in `times.csv`."""
 _SERIES = "error", "changed", "moved"
 _TIMED_RUNS = 9
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that the results depend on besides data and code; every field goes into `provenance.json`."""
+    """All settings on which the results depend, besides data and code. `provenance.json` gets every field."""
 
     pairs: int = 40
     seed: int = 0
@@ -79,15 +79,16 @@ class PairName(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPair:
-    """A pair of shapes, its start and its truth, ready to be refined.
+    """A pair of shapes with initial map and ground truth, ready for refinement.
 
     **Attributes:**
 
     - `mesh_x`, `mesh_y`: source and target.
-    - `spectra`: of source and target, padded.
+    - `spectra`: the padded spectra of source and target.
     - `start`: the initial map, padded like the source.
     - `sources`, `targets`: the evaluated part of the ground truth, vertices of X and of Y (p,).
-    - `distances`: from the targets to all vertices of Y, (p, n), in square roots of its area.
+    - `distances`: the geodesic distances from the targets to all vertices of Y (p, n), in square roots of the
+      area of Y.
     """
 
     mesh_x: Mesh
@@ -99,25 +100,25 @@ class MeasuredPair:
     distances: Float64[np.ndarray, "p n"]
 
     def error(self, pointwise_map: Int[np.ndarray, " m"]) -> float:
-        """The mean geodesic error; `jaxsmw.evaluation.metrics.geodesic_error` with the distances at hand."""
+        """Return the mean geodesic error, as `jaxsmw.evaluation.metrics.geodesic_error`, from `distances`."""
         errors = self.distances[np.arange(len(self.sources)), pointwise_map[self.sources]]
         return GeodesicError(errors, self.sources, "strips").mean
 
 
 def files_of(data: Path, data_set: str, shape: str) -> tuple[Path, Path]:
-    """Where a shape's mesh and its part of the ground truth are."""
+    """Return the paths of the mesh and of the ground truth of a shape."""
     return data / data_set / "off" / f"{shape}.off", data / data_set / "corres" / f"{shape}.vts"
 
 
 def read_pair(data: Path, name: PairName) -> tuple[Mesh, Mesh, GroundTruth]:
-    """Source, target and what is true of them."""
+    """Read source, target and ground truth of a pair."""
     files = [files_of(data, name.data_set, shape) for shape in (name.source, name.target)]
     mesh_x, mesh_y = (read_mesh(mesh) for mesh, _ in files)
     return mesh_x, mesh_y, read_ground_truth([truth for _, truth in files], mesh_x, mesh_y)
 
 
 def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
-    """Read a pair and compute what all variants share."""
+    """Read a pair, and compute everything that all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=k)
@@ -131,25 +132,33 @@ def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
 
 
 def pad(spectrum: Spectrum) -> Spectrum:
-    """The shape with masked vertices up to a multiple of a common size."""
+    """Pad a spectrum with masked vertices to a multiple of `_PADDING`."""
     n = len(spectrum.mask)
     return spectrum.pad(n + -n % _PADDING)
 
 
 def pad_map(pointwise_map: Int[np.ndarray, " m"], padded: Spectrum) -> Int32[Array, " padded_m"]:
-    """A pointwise map from a padded shape, its masked vertices sent to vertex 0."""
+    """Extend a pointwise map to a padded source; the masked vertices map to vertex 0."""
     n = len(padded.mask) - len(pointwise_map)
     return jnp.pad(jnp.asarray(pointwise_map, jnp.int32), (0, n))
 
 
 def map_series(refined: Refinement) -> Int32[np.ndarray, "iterations m"]:
-    """The pointwise map of every iteration."""
+    """Return the pointwise map of every iteration."""
     assert refined.history is not None and refined.history.pointwise_maps is not None
     return np.asarray(refined.history.pointwise_maps)
 
 
 class Diagnosis(NamedTuple):
-    """The energy (5), area norm, of the last C under the last map, and the condition of the first problem."""
+    """Properties of a refinement.
+
+    **Attributes:**
+
+    - `energy`: the energy (5) in the area norm of the last functional map under the last pointwise map.
+    - `energy_of_zero`: the energy of the functional map C = 0 under the same pointwise map.
+    - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
+      none.
+    """
 
     energy: Float[Array, ""]
     energy_of_zero: Float[Array, ""]
@@ -181,7 +190,7 @@ def _frames(number_of_filters: int) -> dict[str, FilterBank]:
 def measure_variants(
     pair: MeasuredPair, name: PairName, wanted: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Refine with every variant; a row of the main table for each."""
+    """Refine a pair with every variant; return a row of `results.csv` for each variant."""
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     start = np.asarray(pair.start)
     rows = []
@@ -212,7 +221,10 @@ def measure_variants(
 
 
 def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
-    """Errors of the maps, and the shares of matches that each iteration changes and moves; or NaN."""
+    """Return the error of each map, and the shares of matches that each iteration changes and moves.
+
+    If the refinement failed, all numbers except the error of the initial map are NaN.
+    """
     m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
     row: dict[str, float] = {"error_0": pair.error(maps[0])}
     for i, (before, after) in enumerate(pairwise(maps), start=1):
@@ -228,7 +240,10 @@ def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row
 def measure_parameters(
     pair: MeasuredPair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
 ) -> list[Row]:
-    """Meyer, filtering, with other numbers of eigenvectors and filters; the error after each iteration."""
+    """Refine by filtering with the Meyer frame, for several numbers of eigenvectors and filters.
+
+    **Returns:** A row of `parameters.csv` for each combination, with the error after each iteration.
+    """
     if not wanted:
         return []
     largest = max(k for k, _ in wanted)
@@ -257,10 +272,10 @@ def measure_parameters(
 def measure_invariance(
     pair: MeasuredPair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
 ) -> list[Row]:
-    """How much wavelets at corresponding centres differ at corresponding points, per frame and scale.
+    """Compare wavelets around corresponding centres at corresponding points, for each frame and scale.
 
-    Medians over the centres of the relative difference `|a - b| / sqrt((|a|² + |b|²) / 2)` (0 for equal ones,
-    sqrt(2) for unrelated ones) and of the correlation.
+    **Returns:** Rows of `invariance.csv` with medians over the centres of two numbers: the correlation, and
+    the relative difference `|a - b| / sqrt((|a|² + |b|²) / 2)` (0 for equal, sqrt(2) for unrelated wavelets).
     """
     banks = _frames(settings.number_of_filters)
     vertices = pair.sources, pair.targets
@@ -290,7 +305,10 @@ def measure_invariance(
 def wavelets(
     bank: FilterBank, spectrum: Spectrum, scale: int, centers: Int[np.ndarray, " c"]
 ) -> Float64[np.ndarray, "c n"]:
-    """Wavelets of one scale around some vertices, on all vertices (eq. 2); 0 is the scaling function."""
+    """Return the wavelets of one scale around c vertices, at all n vertices (eq. 2).
+
+    Scale 0 is the scaling function.
+    """
     eigenvectors = np.asarray(spectrum.eigenvectors, dtype=float)
     response = np.asarray(bank(spectrum.eigenvalues, spectrum.eigenvalues)[scale], dtype=float)
     return (eigenvectors[centers] * response) @ eigenvectors.T
@@ -298,7 +316,7 @@ def wavelets(
 
 @dataclass(frozen=True)
 class Task:
-    """What is still missing of one pair."""
+    """The rows that are missing for one pair."""
 
     name: PairName
     variants: list[Variant]
@@ -307,7 +325,7 @@ class Task:
 
 
 def measure(data: Path, task: Task, settings: Settings) -> tuple[list[Row], list[Row], list[Row]]:
-    """Rows of the three tables."""
+    """Return the missing rows of `results.csv`, `parameters.csv` and `invariance.csv` for one pair."""
     pair = load_pair(data, task.name, settings)
     return (
         measure_variants(pair, task.name, task.variants, settings),
@@ -337,7 +355,10 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
-    """Median milliseconds of the second update, and of one search, of every variant, measured in turns."""
+    """Measure, in turns, the second update of every variant and one nearest-neighbour search.
+
+    **Returns:** Rows of `times.csv`, with median milliseconds.
+    """
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     candidates: dict[Variant, Callable[[], Array]] = {}
     rows = []

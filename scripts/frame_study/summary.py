@@ -1,4 +1,4 @@
-"""Paired differences with confidence intervals, and the tables made of them."""
+"""Paired differences between variants with confidence intervals, and the tables of the study."""
 
 from __future__ import annotations
 
@@ -16,13 +16,21 @@ from jaxsmw.evaluation.intervals import CONFIDENCE, RESAMPLES, Interval, mean_in
 from jaxsmw.evaluation.journal import Row
 
 SETTLED = 0.05
-"""An iteration in which fewer matches than this share move is the one in which a map settles."""
+"""A map settles in the first iteration in which less than this share of the matches moves."""
 
 
 class Comparison(NamedTuple):
-    """One variant against the default on the same pairs; errors x 10^-3 of the square root of the area.
+    """A comparison of one variant with the default on the same pairs.
 
-    Means and medians are over the pairs on which it did not fail, which is why failures stand beside them.
+    Errors are in thousandths of the square root of the area. Read means and medians together with the number
+    of failures, because failed pairs are left out.
+
+    **Attributes:**
+
+    - `mean`, `median`: the mean and the median error of the variant over the pairs on which it did not fail.
+    - `difference`: the mean of the error of the variant minus the error of the default, with its interval.
+    - `better`: the share of all pairs on which the error of the variant is smaller.
+    - `failures`: the number of pairs on which the variant failed.
     """
 
     mean: float
@@ -33,9 +41,9 @@ class Comparison(NamedTuple):
 
 
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
-    """A variant's errors against the default's, pair by pair; NaN where a variant failed.
+    """Compare the errors of a variant with the errors of the default, pair by pair.
 
-    A pair on which it failed counts as one on which it is not better.
+    An error of NaN means that the variant failed on the pair. The variant counts as not better on this pair.
     """
     succeeded = np.isfinite(errors)
     differences = (errors - reference)[succeeded & np.isfinite(reference)]
@@ -49,7 +57,7 @@ def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " 
 
 
 class Study:
-    """The main table in memory, by variant and pair."""
+    """The results of a study, by variant and pair."""
 
     def __init__(
         self,
@@ -86,11 +94,11 @@ class Study:
         return np.array([float(text) for text in self.column(variant, data_set, name)])
 
     def errors(self, variant: Variant, data_set: str) -> Float64[np.ndarray, " p"]:
-        """After the last iteration, x 10^-3."""
+        """Return the errors after the last iteration, in thousandths of the square root of the area."""
         return 1e3 * self.numbers(variant, data_set, f"error_{self.settings.iterations}")
 
     def median_settling(self, variant: Variant, data_set: str) -> float:
-        """The median iteration in which the map settles; infinite where half of the pairs or more did not."""
+        """The median iteration in which the map settles; infinite if at least half of the maps never do."""
         last = self.settings.iterations
         moved = np.array([self.numbers(variant, data_set, f"moved_{i}") for i in range(1, last + 1)])
         still = moved < SETTLED
@@ -99,19 +107,22 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """The difference from the default, NaN for a variant that there is not."""
+        """Return the difference from the default; NaN for None and for a variant that was not measured."""
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
-        """One variant minus another on the pairs on which neither failed, and on how many one did."""
+        """Return the mean difference between two variants over the pairs on which neither failed.
+
+        The text also gives the number of pairs on which one of the variants failed.
+        """
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
         both = np.isfinite(differences)
         text = str(mean_interval(differences[both], self.settings.seed))
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """The mean of E(C) / E(0), which makes frames of different height comparable."""
+        """Return the mean of E(C) / E(0), a ratio that makes frames of different heights comparable."""
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")
@@ -122,7 +133,7 @@ class Study:
         return float(np.median(self._times[self.twins.get(variant, variant)]))
 
     def failures(self) -> Counter[tuple[Variant, str]]:
-        """How often each variant ended with which sentence."""
+        """Return, for each variant and each message of failure, the number of pairs."""
         counts: Counter[tuple[Variant, str]] = Counter()
         for variant in self.variants:
             if variant not in self.twins:
@@ -136,38 +147,42 @@ def _variant(row: Row) -> Variant:
 
 
 def write_summary(study: Study, invariance: Sequence[Row]) -> str:
-    """All tables as Markdown."""
+    """Return all tables as Markdown."""
     settings = study.settings
     counts = ", ".join(f"{len(pairs)} of {name}" for name, pairs in study.pairs.items() if name != "both")
     search = study.milliseconds(SEARCH)
     start = {name: 1e3 * study.numbers(DEFAULT, name, "error_0").mean() for name in study.pairs}
     parts = [
         "# Frames compared",
-        f"Pairs: {counts}, evenly spread over their lists. All start from the same SHOT matches (mean error "
+        f"Pairs: {counts}, evenly spread over their lists. All variants start from the same SHOT matches "
+        "(mean error "
         + ", ".join(f"{error:.1f} on {name}" for name, error in start.items())
         + f"), with {settings.number_of_eigenvectors} eigenvectors per shape, {settings.number_of_filters} "
-        f"filters where the bank leaves the choice, and {settings.iterations} iterations. Made by "
-        "`scripts/compare_frames.py`; versions, seeds and settings stand in `provenance.json`, the numbers "
-        "of every pair in `results.csv`.",
+        f"filters if the bank allows any number, and {settings.iterations} iterations. Made by "
+        "`scripts/compare_frames.py`; `provenance.json` has versions, seeds and settings, and `results.csv` "
+        "has the numbers of every pair.",
         _list(
             "**error**: mean geodesic error x 10⁻³ of the square root of the target's area, at "
             f"{settings.evaluated_points} points of the ground truth, the same for all variants.",
             "**difference**: mean over the pairs of the error minus that of the default (Meyer, filtering, "
             f"pullback) on the same pair, with its {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} "
-            "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow; and of so "
-            "many intervals one in twenty would miss zero by chance alone.",
-            "**better**: the share of pairs with a smaller error than the default's; a failure is none.",
-            "**energy**: E(C) / E(0), eq. (5) of the last C under the last map, in the area norm and in the "
-            "variant's own frame (for the band mask in the Meyer frame).",
+            "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow. Without any "
+            "true difference, one in twenty intervals would miss zero by chance.",
+            "**better**: the share of pairs with a smaller error than the default's; a failure counts as not "
+            "better.",
+            "**energy**: E(C) / E(0) for the last C, where E is the energy (5) under the last pointwise map, "
+            "in the area norm and with the variant's own frame (for the band mask, the Meyer frame).",
             f"**settles**: the first iteration in which fewer than {SETTLED:.0%} of the matches move by more "
-            f"than {MOVE} square roots of the area (about an edge), median over the pairs.",
+            f"than {MOVE} square roots of the area (about the length of an edge); median over the pairs.",
             "**update**: milliseconds for one functional map from a pointwise map, without the search "
             f"({search:.0f} ms); median of runs in turns, one core, one pair per data set.",
-            "**condition**: condition number of the first least-squares problem (for the regularized update "
-            "of its wavelet term), median over the pairs; in float32 anything above 10⁵ means singular.",
-            "**failed**: pairs on which the update reported that it failed; errors are over the others.",
-            "`=`: provably the same as filtering, so not computed again: in the pushforward convention and "
-            "the area norm least squares divides columns by the frame function, 1 for a Parseval frame.",
+            "**condition**: condition number of the first least-squares problem (for the regularized update, "
+            "of its wavelet term); median over the pairs. In float32, a number above 10⁵ means singular.",
+            "**failed**: pairs on which the update reported a failure; means and medians leave these pairs "
+            "out.",
+            "`=`: provably the same as filtering, so not computed again. In the pushforward convention and "
+            "the area norm, least squares divides columns by the frame function, which is 1 for a Parseval "
+            "frame.",
         ),
     ]
     for convention in CONVENTIONS:
@@ -182,11 +197,12 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "Paired differences of the error, one update minus another.",
         _updates_within_frames(study),
         "## What scaling and tightening change, pullback",
-        "Paired differences of the error. Scaled: the bank times one number, so that its frame function is "
-        "one in the mean; tightened: its canonical tight frame, the frame function one everywhere.",
+        "Paired differences of the error. A scaled bank is multiplied by one number, so that its frame "
+        "function is one in the mean. A tightened bank is replaced by its canonical tight frame, whose frame "
+        "function is one everywhere.",
         _tightening(study),
         "## The height of C",
-        "Mean error of Meyer, filtering, with C times a number in every iteration.",
+        "Mean error of filtering with the Meyer frame if C is multiplied by a number in every iteration.",
         _gains(study),
     ]
     for convention in CONVENTIONS:
@@ -199,8 +215,8 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "## Invariance of wavelets under near-isometry",
         "Wavelets around corresponding vertices of the two shapes, compared at corresponding vertices. "
         f"Medians over {settings.wavelet_centers} centres, and over the pairs, of the relative difference "
-        "(0: equal, 1.41: unrelated) and of the correlation. Scale 0 is the scaling function, the last one "
-        "the finest.",
+        "(0: equal, 1.41: unrelated) and of the correlation. Scale 0 is the scaling function; the last scale "
+        "is the finest.",
         _invariance(study, invariance),
         "## Failures",
         _failures(study),
@@ -230,7 +246,7 @@ def _failing(text: str, found: Comparison) -> str:
 
 
 def _ablations(study: Study) -> str:
-    asked = (
+    labelled = (
         ("default", DEFAULT),
         ("no filter", Variant("no filter", "filtering", "pullback")),
         ("one low-pass filter", Variant("low-pass (1 filter)", "filtering", "pullback")),
@@ -244,7 +260,7 @@ def _ablations(study: Study) -> str:
     )
     data_sets = [name for name in study.pairs if name != "both"]
     rows = []
-    for label, variant in asked:
+    for label, variant in labelled:
         if variant in study.variants:
             least = np.min(study.numbers(variant, "both", "least_kernel_eigenvalue"))
             cells = [f"{label} ({variant.frame}, {variant.update})"]
@@ -254,8 +270,9 @@ def _ablations(study: Study) -> str:
             rows.append([*cells, f"−{-least:.2g}" if least < -1e-4 else "≥ 0"])
     header = ["", *(title for name in [*data_sets, "both"] for title in (name, "difference"))]
     return _table([*header, "least eigenvalue of the kernel"], rows) + (
-        "\n\nThe last column: smallest over largest eigenvalue of what C₀ is multiplied with, for X with "
-        "itself, the least of all pairs; a frame's cannot be negative."
+        "\n\nThe last column is the smallest over the largest eigenvalue of the kernel by which C₀ is "
+        "multiplied, for X with itself: the minimum over all pairs. The kernel of a frame has no negative "
+        "eigenvalue."
     )
 
 
@@ -296,7 +313,7 @@ def _tightening(study: Study) -> str:
         f"{kind}, {update} − {reference_kind or 'plain'}" + (f", {reference}" if reference != update else "")
         for kind, update, reference_kind, reference in contrasts
     ]
-    # A row for each contrast: there are more of them than banks.
+    # The table has one row for each contrast, because there are more contrasts than banks.
     return _table(["", *(row[0] for row in rows)], zip(header, *(row[1:] for row in rows), strict=True))
 
 
@@ -364,7 +381,7 @@ def _failures(study: Study) -> str:
         return "None."
     total = len(study.pairs["both"])
     return _table(
-        ["frame", "update", "convention", "failed", "what it reported"],
+        ["frame", "update", "convention", "failed", "message"],
         [[*variant, f"{count} of {total}", sentence] for (variant, sentence), count in counts.items()],
     )
 
@@ -374,7 +391,7 @@ def _number(value: float, digits: int = 1) -> str:
 
 
 def _significant(value: float) -> str:
-    """Three digits, without an exponent as far as possible."""
+    """Format a number with at least three significant digits, without an exponent if possible."""
     if not np.isfinite(value):
         return "—" if np.isnan(value) else "∞"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}" if abs(value) < 1e5 else f"{value:.0e}"

@@ -1,4 +1,4 @@
-"""What is compared: frames, ways to a functional map, conventions, and ablations that separate causes."""
+"""The variants that the study compares: frames, updates of the functional map, conventions, and ablations."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ CONVENTIONS: tuple[Convention, ...] = ("pullback", "pushforward")
 
 
 class Variant(NamedTuple):
-    """One row of the comparison."""
+    """A frame, an update (a way to compute the functional map) and a convention."""
 
     frame: str
     update: str
@@ -71,11 +71,11 @@ UPDATES: dict[str, Solution] = {
 
 
 def frames(number_of_filters: int) -> dict[str, FilterBank]:
-    """All frames and controls; so many filters where a bank leaves the choice."""
+    """Return all frames and controls by name, with `number_of_filters` filters if the number is free."""
     not_tight = {
         "cubic spline": CubicSpline(number_of_filters),
         "Mexican hat": MexicanHat(number_of_filters),
-        # Octaves, as those of the Meyer frame.
+        # Octave scales, as in the Meyer frame.
         "heat": Heat(jnp.asarray(2.0 ** np.arange(number_of_filters))),
         "Gabor": Gabor(number_of_filters),
     }
@@ -109,8 +109,8 @@ QUICK_FRAMES = (
     "no filter",
 )
 
-# Not in the grid of frames and updates: (frame, update), in both conventions.
-# The search compares what C maps with what it does not, so the height of C matters, too.
+# Variants outside the grid of frames and updates: pairs of frame and update, measured in both conventions.
+# The search compares points that C has mapped with points that it has not, so the scale of C matters, too.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -121,16 +121,16 @@ ABLATIONS = (
 
 
 def variants(frame_names: Iterable[str]) -> list[Variant]:
-    """Every frame with every update in both conventions, and the ablations."""
+    """Return all variants: every frame with every update in both conventions, and the ablations."""
     grid = [(frame, update) for frame in frame_names for update in UPDATES]
     return [Variant(*cell, convention) for convention in CONVENTIONS for cell in (*grid, *ABLATIONS)]
 
 
 def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
-    """Variants that provably equal another one, with that one.
+    """Return the variants that provably equal another variant, with this other variant.
 
-    Least squares in the pushforward convention and the area norm divides the columns of the filtered map by
-    the frame function, which is one for a Parseval frame.
+    In the pushforward convention and the area norm, least squares divides the columns of the filtered map by
+    the frame function. The frame function of a Parseval frame is one, so the variant equals filtering.
     """
     return {
         name: name._replace(update="filtering")
@@ -148,9 +148,9 @@ def is_parseval(bank: FilterBank) -> bool:
 
 
 class TabulatedPreservation(WaveletPreservation):
-    """`WaveletPreservation` with the bank's responses on both shapes computed beforehand.
+    """`WaveletPreservation` with tabulated responses of the bank on both shapes.
 
-    So all banks run the same compiled program.
+    With tabulated responses, all banks run the same compiled program.
     """
 
     responses_x: Float[Array, "filters k_x"] = eqx.field(kw_only=True)
@@ -163,7 +163,7 @@ class TabulatedPreservation(WaveletPreservation):
 
 
 class BandMask(Filtering):
-    """`Filtering` with a given mask in the place of the frame's kernel."""
+    """`Filtering` with a given mask instead of the multiscale kernel of the frame."""
 
     mask: Float[Array, "k_out k_in"] = eqx.field(kw_only=True)
 
@@ -174,7 +174,7 @@ class BandMask(Filtering):
 class Scaled(FilterBank):
     """A bank times one number, so that its frame function is one in the mean over a shape's eigenvalues.
 
-    What tightening does to the height of a bank, without what it does to its shape.
+    Scaling changes the height of the bank as tightening does, but not the shapes of the filters.
     """
 
     bank: FilterBank
@@ -187,7 +187,7 @@ class Scaled(FilterBank):
 
 
 class Amplified(Solution):
-    """Another solution times a number."""
+    """A solution whose functional map is multiplied by a number."""
 
     solution: Solution
     gain: Float[Array, ""]
@@ -214,7 +214,7 @@ def refiner(
     *,
     number_of_filters: int,
 ) -> TabulatedPreservation:
-    """The refiner of a variant on a pair; filters that a bank has less than `number_of_filters` are zero."""
+    """Return the refiner of a variant for a pair; zero filters fill up the bank to `number_of_filters`."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = NearestOrthogonal(Filtering())
@@ -244,13 +244,13 @@ _sample_bank: Callable[[FilterBank, Array], Array] = eqx.filter_jit(
 
 
 def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Float[Array, "filters k"]:
-    """The responses of a bank on a shape, with zero filters up to the given number."""
+    """Return the responses of a bank on a shape, filled up with zero filters to `number_of_filters`."""
     responses = _sample_bank(bank, spectrum.eigenvalues)
     return jnp.pad(responses, ((0, number_of_filters - len(responses)), (0, 0)))
 
 
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
-    """How many octaves eigenvalues lie above the scaling function's edge of the Meyer frame, at least 0."""
+    """Return how many octaves each eigenvalue is above the edge of the Meyer scaling function, at least 0."""
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
 
@@ -258,10 +258,11 @@ def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Flo
 def band_mask(
     octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], half_width: float
 ) -> Float64[np.ndarray, "k_out k_in"]:
-    """A smooth mask around the diagonal that comes from no frame.
+    """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
 
-    One up to half the half-width (in octaves), one half at the half-width, zero from one and a half times the
-    half-width on, a cosine in between. Its flat top makes it indefinite, which no `G^T G` is.
+    The mask is 1 up to half the half-width (in octaves), 1/2 at the half-width, and 0 from one and a half
+    times the half-width on, with a cosine in between. The flat top makes the mask indefinite. The kernel
+    `G^T G` of a filter bank is never indefinite.
     """
     distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
     return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))
@@ -270,16 +271,18 @@ def band_mask(
 def matching_half_width(
     octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], total: float
 ) -> float:
-    """The half-width, in octaves, at which the entries of the mask have a given sum."""
+    """Return the half-width, in octaves, at which the entries of `band_mask` have a given sum."""
     return brentq(lambda width: band_mask(octaves_out, octaves_in, width).sum() - total, 1e-3, 100)
 
 
 def least_kernel_eigenvalue(
     variant: Variant, bank: FilterBank, spectrum: Spectrum, *, number_of_filters: int
 ) -> float:
-    """Smallest over largest eigenvalue of what a variant multiplies C_0 with, from a shape to itself.
+    """Return the ratio of the smallest to the largest eigenvalue of the kernel of a variant.
 
-    Not negative, up to rounding, for every filter bank; `band_mask` is indefinite.
+    The kernel of a map from the shape to itself is the matrix by which the variant multiplies the unfiltered
+    map C_0 elementwise. The ratio is not negative, up to rounding, for every filter bank. It is negative for
+    `band_mask`.
     """
     method = refiner(variant, bank, spectrum, spectrum, number_of_filters=number_of_filters)
     kernel = multiscale_kernel(method.responses_x, method.responses_y)
