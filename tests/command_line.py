@@ -1,4 +1,4 @@
-"""What the tests of the command line share."""
+"""Helpers that the tests of the command line share."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
 
 COMMANDS = ("demo", "match", "evaluate", "benchmark", "spectrum", "render")
-# Small settings of the paper's method, for speed.
+# Options that make the paper's method fast.
 SMALL = ("--eigenvectors", "20", "--filters", "4")
 
 
@@ -26,7 +26,7 @@ class Outcome(NamedTuple):
 
 
 def runner(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """A function that runs the command line in this process."""
+    """Return a function that runs the command line in this process."""
 
     def run(*arguments: object) -> Outcome:
         code = run_command([str(argument) for argument in arguments])
@@ -36,7 +36,7 @@ def runner(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
 
 
 def assert_refused(outcome: Outcome, *, naming: str) -> None:
-    """The command ended with exit code 2 and one sentence that names the culprit."""
+    """Check that the command ended with exit code 2 and one sentence that contains `naming`."""
     assert outcome.code == 2, outcome.errors
     assert outcome.output == ""
     assert outcome.errors.count("\n") == 1 and len(outcome.errors) > 40
@@ -44,7 +44,7 @@ def assert_refused(outcome: Outcome, *, naming: str) -> None:
 
 
 def write_pair(directory: Path) -> Path:
-    """Write a body, a renumbered and noisy copy, and the truth in several forms, to a directory."""
+    """Write a body, a renumbered noisy copy and their ground truth in several formats to a directory."""
     mesh = bumpy_mesh(3)
     order = np.random.default_rng(0).permutation(len(mesh.vertices))
     truth = np.argsort(order)

@@ -1,4 +1,4 @@
-"""What every test shares: double precision and strict promotion on, and where the real shapes lie."""
+"""Settings and fixtures of all tests: double precision, strict type promotion, and the real shapes."""
 
 import os
 from collections.abc import Iterator
@@ -10,18 +10,19 @@ import jaxtyping
 import pytest
 from threadpoolctl import threadpool_limits
 
-# Most of the time goes into compiling small programs that run once. XLA's older way to emit loops compiles them
-# three times as fast. Asked for only where it is known: a flag that XLA does not know ends the process.
+# The tests spend most of their time compiling small programs that run once. XLA's older loop emitters compile
+# these programs three times as fast. The flag is set only for versions of JAX that have it, because XLA ends
+# the process at an unknown flag.
 if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
-# Nor is it worth a tenth of the time to note for every operation in which line of which function it was called.
+# Recording the call stack of every operation would take a tenth of the time.
 jax.config.update("jax_include_full_tracebacks_in_locations", False)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Compiling is slow the first time, which is no failure.
+# An example may compile a program, which can take longer than Hypothesis's default deadline.
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
 
@@ -30,8 +31,9 @@ hypothesis.settings.load_profile("default")
 def shared() -> Path:
     """The directory with real shapes (`data/`) and reference results (`oracle/`).
 
-    `JAXSMW_SHARED` names it; by default it is `shared/` beside the checkout. Without it the tests on real
-    shapes skip, except where `CI` is set: there a silent skip would hide that nothing was tested.
+    `JAXSMW_SHARED` names the directory. The default is `shared/` next to the checkout. If the directory is
+    missing, the tests on real shapes are skipped. If `CI` is also set, these tests fail instead, because a
+    skip would hide that nothing was tested.
     """
     default = Path(__file__).resolve().parents[2] / "shared"
     directory = Path(os.environ.get("JAXSMW_SHARED", default))
@@ -45,7 +47,10 @@ def shared() -> Path:
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread_each() -> Iterator[None]:
-    """Test processes side by side do not wait for each other's threads; nor do the commands they start."""
+    """Limit each pytest-xdist worker, and the commands that it starts, to one thread.
+
+    Otherwise the threads of parallel workers would wait for each other.
+    """
     alone = "PYTEST_XDIST_WORKER" not in os.environ
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(None if alone else 1):
         if not alone:
@@ -55,7 +60,7 @@ def one_thread_each() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Commands that tests start, again and again, share their compiled programs, also between workers."""
+    """Give all commands that tests start, in all workers, one common cache of compiled programs."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:
@@ -66,7 +71,7 @@ def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests neither read nor fill the user's cache."""
+    """Keep tests from reading or filling the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAXSMW_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -74,12 +79,15 @@ def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
-    """Compiled programs go when their tests are done: those of the whole suite would take gigabytes."""
+    """Release compiled programs after each module: the programs of all tests would take gigabytes."""
     yield
     jax.clear_caches()
 
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs the library as users do: without run-time checks of types, which would pre-empt its own messages."""
+    """Disable the run-time type checks, as for users.
+
+    The type checks would raise before the library raises its own messages.
+    """
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -1,4 +1,4 @@
-"""Meshes and readers of pages that the tests of figures and pages share."""
+"""Meshes and page parsers that the tests of figures and pages share."""
 
 import base64
 import json
@@ -26,7 +26,7 @@ def renumbered(mesh: Mesh, seed: int = 0) -> tuple[Mesh, np.ndarray]:
     return replace(mesh, vertices=mesh.vertices[order], faces=faces), number
 
 
-TALL = ellipsoid(0.6, 1.2, 0.3)  # a y-up standing body
+TALL = ellipsoid(0.6, 1.2, 0.3)  # a standing body whose up axis is y
 
 
 def uniform(mesh: Mesh, *color: float) -> np.ndarray:

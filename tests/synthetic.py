@@ -8,7 +8,11 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 
 
 def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) -> Spectrum:
-    """A Spectrum of no shape at all: orthonormal in random areas, eigenvalues growing as Weyl's law says."""
+    """A random spectrum that belongs to no mesh.
+
+    The eigenvectors are orthonormal with respect to random vertex areas. The eigenvalues grow as Weyl's law
+    predicts.
+    """
     generator = np.random.default_rng(seed)
     areas = generator.uniform(0.5, 1.5, n)
     areas /= areas.sum()
@@ -23,7 +27,7 @@ def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) 
 
 
 def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the unit square, triangulated."""
+    """Vertices and faces of a triangulated unit square."""
     y, x = np.mgrid[0 : 1 : rows * 1j, 0 : 1 : columns * 1j]
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -33,7 +37,7 @@ def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the unit sphere, from an icosahedron: 10 * 4^subdivisions + 2 vertices."""
+    """The unit sphere as a subdivided icosahedron: 10 * 4^subdivisions + 2 vertices, and their faces."""
     golden = (1 + np.sqrt(5)) / 2
     vertices = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
     vertices = np.array(
@@ -64,14 +68,14 @@ def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bumpy_mesh(subdivisions: int = 4) -> Mesh:
-    """A sphere with waves of no symmetry at all."""
+    """A sphere with waves that have no symmetry."""
     vertices, faces = sphere_mesh(subdivisions)
     waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
     return make_mesh(vertices * (1 + waves)[:, None], faces)
 
 
 def body_with_arms() -> Mesh:
-    """That sphere with an arm to the left and one to the right."""
+    """The sphere of `bumpy_mesh` with an arm on the left and an arm on the right."""
     sphere = bumpy_mesh(4)
     directions = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
     length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))

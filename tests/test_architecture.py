@@ -1,4 +1,4 @@
-"""The layers of the library import only from lower layers, imports have no cycle, and public names stay few."""
+"""Layers import only from lower layers, imports have no cycle, and the package exports few names."""
 
 import ast
 import graphlib
@@ -39,7 +39,8 @@ def test_layers_import_only_from_lower_layers():
         f"{module} imports {other}"
         for module, others in imported_modules().items()
         for other in others
-        if (layer := module.split(".")[0]) in LAYERS and LAYERS.index(other.split(".")[0]) > LAYERS.index(layer)
+        if (layer := module.split(".")[0]) in LAYERS
+        and LAYERS.index(other.split(".")[0]) > LAYERS.index(layer)
     ]
     assert not upwards
 
@@ -48,8 +49,8 @@ def test_every_module_belongs_to_a_layer_or_a_namespace():
     assert {module.split(".")[0] for module in imported_modules()} <= {*LAYERS, *NAMESPACES}
 
 
-def test_public_names_stay_few():
-    """More names belong in `jaxsmw.banks`, `jaxsmw.io`, `jaxsmw.evaluation` and the like."""
+def test_the_package_exports_at_most_50_names():
+    """Further names belong in subpackages such as `jaxsmw.banks`, `jaxsmw.io` and `jaxsmw.evaluation`."""
     assert len(jaxsmw.__all__) <= 50
 
 

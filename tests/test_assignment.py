@@ -1,4 +1,4 @@
-"""One-to-one maps: the constraint, and the least sum by brute force."""
+"""One-to-one maps use no target twice and have the lowest cost, compared with a search by brute force."""
 
 from itertools import permutations
 
@@ -21,7 +21,7 @@ def cost(x, y, found):
 
 
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 6), (3, 6), (6, 6)])
-def test_the_map_is_the_best_of_all_permutations(generator, m, n):
+def test_the_map_has_the_lowest_cost_of_all_permutations(generator, m, n):
     x, y = generator.normal(size=(m, 4)), generator.normal(size=(n, 4))
     found = one_to_one_map(x, y)
     assert found.dtype == np.int64 and len(set(found)) == m
@@ -40,7 +40,7 @@ def test_no_target_is_used_twice_among_5000(generator, dtype):
 def test_a_renumbering_is_recovered(generator):
     x, order = generator.normal(size=(400, 5)), generator.permutation(400)
     np.testing.assert_array_equal(one_to_one_map(x, x[order]), np.argsort(order))
-    # The same holds far from the origin, and with other signs.
+    # A translation of both embeddings and a change of their signs have no effect.
     np.testing.assert_array_equal(one_to_one_map(x + 1e3, x[order] + 1e3), np.argsort(order))
     signs = np.array([1, -1, -1, 1, -1])
     np.testing.assert_array_equal(one_to_one_map(signs * x, signs * x[order]), np.argsort(order))

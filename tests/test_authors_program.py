@@ -1,4 +1,4 @@
-"""Agreement with what the MWP authors' own program computed on real pairs."""
+"""Agreement with the results of the MWP authors' program on real pairs."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,7 +52,7 @@ def run(reference: dict, setting: str, iterations: int, dtype: type = np.float64
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_every_iteration(reference, setting):
+def test_every_iteration_agrees_with_the_reference(reference, setting):
     for iteration in range(1, 6):
         t, c = run(reference, setting, iteration)
         assert np.mean(t == reference[f"{setting}_T"][:, iteration - 1]) >= 0.999
@@ -60,7 +60,7 @@ def test_every_iteration(reference, setting):
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_sampled_variant(reference, setting):
+def test_the_sampled_variant_agrees_with_the_reference(reference, setting):
     samples_x, samples_y = (
         jnp.asarray(reference[f"{setting}_samples{number}"].astype(np.int32)) for number in (1, 2)
     )
@@ -77,7 +77,7 @@ def test_float32_agrees_at_nearly_all_vertices(reference, setting):
 
 @pytest.fixture
 def mean_error(shared, name):
-    """The mean geodesic error of a map of the pair, at 1000 vertices."""
+    """Return a function that computes the mean geodesic error of a map at 1000 vertices."""
     directory = shared / "data" / "faust_r"
     mesh_x, mesh_y = (read_mesh(directory / "off" / f"{shape}.off") for shape in PAIRS[name])
     truth = read_ground_truth(
@@ -91,16 +91,16 @@ def test_float32_is_as_accurate(reference, mean_error):
     assert single == pytest.approx(double, rel=0.01)
 
 
-def test_pushforward_fails_for_the_reason_given(reference, mean_error):
-    """Shrunken queries run to few targets: the map covers less of Y, and is wrong."""
+def test_pushforward_reaches_fewer_targets_with_larger_errors(reference, mean_error):
+    """With the pushforward, C shrinks the queries, so few targets of small norm attract most queries."""
     pullback, _ = run(reference, "paper", 5)
     pushforward, _ = run(reference, "paper", 5, convention="pushforward")
     assert mean_error(pushforward) > 2 * mean_error(pullback)
     assert len(np.unique(pushforward)) < 0.8 * len(np.unique(pullback))
 
 
-def test_common_lambda_max_changes_little_here(reference, mean_error):
-    """These bodies are of one size, so that one common end of the bank is nearly each one's own."""
+def test_common_lambda_max_changes_little_for_bodies_of_the_same_size(reference, mean_error):
+    """Both bodies have the same size, so their largest eigenvalues are nearly equal."""
     own, _ = run(reference, "paper", 3)
     common, _ = run(reference, "paper", 3, lambda_max="common")
     assert not np.array_equal(own, common)

@@ -1,4 +1,4 @@
-"""Batches of pairs give the result of each pair alone: padded, on several devices, in several processes."""
+"""Batched pairs get the results of single pairs: with padding, on several devices, in several processes."""
 
 import os
 import socket
@@ -40,7 +40,7 @@ def test_padding_is_small_and_sizes_are_few(n):
     assert padded_size(padded) == padded
 
 
-def test_seventeen_sizes_serve_a_range_of_four():
+def test_at_most_17_padded_sizes_cover_4001_to_16000_vertices():
     assert len({padded_size(n) for n in range(4001, 16001)}) <= 17
 
 
@@ -54,7 +54,7 @@ def test_seventeen_sizes_serve_a_range_of_four():
     ],
     ids=["filtering", "least squares", "regularized"],
 )
-def test_every_pair_gets_the_result_that_it_gets_alone(refiner, pairs, batch_size):
+def test_batched_pairs_get_the_results_of_single_pairs(refiner, pairs, batch_size):
     spectra, starts = make_problem()
     options = dict(refiner=refiner, iterations=3, history=True)
     found = dict(refine_pairs(spectra, PAIRS[:pairs], starts[:pairs], batch_size=batch_size, **options))
@@ -69,7 +69,7 @@ def test_every_pair_gets_the_result_that_it_gets_alone(refiner, pairs, batch_siz
         np.testing.assert_allclose(refined.history.energy, alone.history.energy, rtol=1e-9)
 
 
-def test_samples_and_early_stop():
+def test_samples_and_early_stops_give_the_results_of_single_pairs():
     spectra, starts = make_problem()
     samples = [jnp.asarray(np.random.default_rng(n).choice(n, 60, replace=False)) for n in SIZES]
     some, its_starts = PAIRS[:3], starts[:3]
@@ -98,7 +98,7 @@ def test_a_failing_pair_does_not_affect_other_pairs():
         assert result == bad.get(position, RESULTS.successful)
 
 
-def test_different_numbers_of_eigenvectors():
+def test_both_shapes_may_have_different_numbers_of_eigenvectors():
     x, y = random_spectrum(150, 10), random_spectrum(170, 12, seed=1)
     start = jnp.asarray(np.random.default_rng(0).integers(0, 170, 150))
     ((_, refined),) = refine_pairs([x, y], [(0, 1)], [start])
@@ -160,7 +160,7 @@ def test_the_estimated_memory_of_a_pair_agrees_with_the_compiler(m, n, k):
 
 
 def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
-    # Without the type checks of the tests, as for users, so that the sentences of the library appear.
+    # Type checks are disabled, as for users, because they would raise before the library raises its messages.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     spectra, starts = make_problem()
     with pytest.raises(ValueError, match="shape 0 is a str, but a Spectrum is needed"):
@@ -208,7 +208,7 @@ np.savez(
 
 
 def run_processes(output, count: int) -> None:
-    """Runs the program in several processes that share four devices."""
+    """Run the program in several processes that together have four devices."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
@@ -234,7 +234,7 @@ def run_processes(output, count: int) -> None:
 @pytest.mark.parametrize("processes", [1, 2])
 @pytest.mark.cluster
 def test_four_devices_give_the_results_of_one(tmp_path, processes):
-    """The host devices belong to one process, or to two processes connected by the network."""
+    """The devices belong to one process, or to two processes that communicate over the network."""
     spectra, starts = make_problem()
     one = dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))
     run_processes(tmp_path / "results", processes)

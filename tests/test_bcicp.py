@@ -1,4 +1,4 @@
-"""BCICP: each step equals a plain NumPy program, and the method solves cases with a known result."""
+"""BCICP: each step agrees with a plain NumPy implementation, and the method recovers known maps."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ def permuted(mesh: Mesh, seed: int = 0) -> tuple[Mesh, Spectrum, np.ndarray]:
 
 
 def scrambled(truth: np.ndarray, mesh: Mesh, seed: int = 1) -> np.ndarray:
-    """An initial map with a tenth of random images, and a connected cap mapped to the opposite side."""
+    """An initial map with a tenth of random matches, and a connected cap matched to the opposite side."""
     generator = np.random.default_rng(seed)
     initial_map = np.where(generator.random(len(truth)) < 0.1, generator.permutation(truth), truth)
     cap = mesh.vertices @ [0.6, 0.0, 0.8] > 0.8
@@ -66,7 +66,7 @@ def dense_adjacency(mesh: Mesh) -> np.ndarray:
 
 
 def with_wrong_disc(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The true map, except for a small disc mapped to the opposite side, and a mask of the disc."""
+    """The true map with a small disc matched to the opposite side, and a mask of this disc."""
     disc = np.linalg.norm(x.positions - x.positions[7], axis=1) < 0.12
     assert 3 < disc.sum() < 30
     t = truth.copy()
@@ -74,7 +74,7 @@ def with_wrong_disc(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t, disc
 
 
-def test_the_bijective_step_is_one_search_over_four_conditions(surfaces):
+def test_the_bijective_step_minimizes_the_sum_of_four_distances(surfaces):
     x, y = surfaces
     t, u = random_maps(surfaces)
     phi, psi = x.eigenvectors, y.eigenvectors
@@ -105,12 +105,12 @@ def test_coverage_improves_and_covered_vertices_stay_covered(surfaces):
     assert len(set(improved)) > len(set(t)) + 50
     changed = improved != t
     np.testing.assert_array_equal(u[improved[changed]], np.flatnonzero(changed))
-    # A vertex stays uncovered only if its preimage would have to leave another vertex uncovered.
+    # A vertex stays uncovered only if a new match to this vertex would leave another vertex uncovered.
     for uncovered in set(range(len(u))) - set(improved):
         assert np.sum(improved == improved[u[uncovered]]) == 1
 
 
-def test_smoothing_averages_in_space(surfaces, copy):
+def test_smoothing_averages_positions_of_matches(surfaces, copy):
     x, y = surfaces
     t, _ = random_maps(surfaces)
     averaging = dense_adjacency(copy[0]) + np.eye(len(t))
@@ -120,7 +120,7 @@ def test_smoothing_averages_in_space(surfaces, copy):
     np.testing.assert_array_equal(steps._smooth(x, y, t, 0), t)
 
 
-def test_discontinuous_edges_have_distant_images(surfaces, body):
+def test_discontinuous_edges_have_distant_matches(surfaces, body):
     x, y = surfaces
     t, _ = random_maps(surfaces)
     mesh = body[0]
@@ -134,14 +134,14 @@ def test_discontinuous_edges_have_distant_images(surfaces, body):
     assert 0.5 < found.mean() < 1
 
 
-def test_outliers_are_the_small_regions(surfaces, copy):
+def test_a_small_region_with_wrong_matches_is_an_outlier(surfaces, copy):
     x, y = surfaces
     t, disc = with_wrong_disc(x, y, copy[2])
     np.testing.assert_array_equal(steps._outliers(x, y, t), disc)
     assert not steps._outliers(x, y, copy[2]).any()
 
 
-def test_repair_interpolates_harmonically(surfaces, copy):
+def test_outliers_are_repaired_by_harmonic_interpolation(surfaces, copy):
     x, y = surfaces
     t, disc = with_wrong_disc(x, y, copy[2])
     adjacency = dense_adjacency(copy[0])
@@ -157,7 +157,7 @@ def test_repair_interpolates_harmonically(surfaces, copy):
 
 
 def errors_after_bcicp(body, copy, initial_map: np.ndarray, reverse: np.ndarray, **options) -> np.ndarray:
-    """Returns the Euclidean error of each vertex after BCICP, in edges of average length."""
+    """Return the Euclidean error of each vertex after BCICP, in units of the mean edge length of Y."""
     (mesh_y, spectrum_y), (mesh_x, spectrum_x, truth) = body, copy
     found, _ = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, initial_map, reverse, **options)
     edge = np.linalg.norm(np.diff(mesh_y.vertices[mesh_y.edges], axis=1), axis=2).mean()
@@ -173,7 +173,7 @@ def test_scrambled_initial_maps_are_repaired(body, copy):
 
 
 @pytest.mark.parametrize("change", [{"iterations": 1}, {"smoothing": 0}])
-def test_every_option_matters(body, copy, surfaces, change):
+def test_every_option_changes_the_result(body, copy, surfaces, change):
     options = {"iterations": 2, "smoothing": 5}
     initial_maps = random_maps(surfaces)
     plain, changed = (
@@ -182,7 +182,7 @@ def test_every_option_matters(body, copy, surfaces, change):
     assert (plain != changed).any()
 
 
-def test_padding_and_signs_do_not_matter(body, copy):
+def test_padding_and_signs_have_no_effect(body, copy):
     (mesh_y, spectrum_y), (mesh_x, spectrum_x, truth) = body, copy
     initial_map, reverse = scrambled(truth, mesh_x), scrambled(np.argsort(truth), mesh_y, seed=3)
     plain = bcicp(mesh_x, mesh_y, spectrum_x, spectrum_y, initial_map, reverse, iterations=3)
@@ -207,8 +207,8 @@ def test_padding_and_signs_do_not_matter(body, copy):
         np.testing.assert_array_equal(found, expected)
 
 
-def hostile_mesh() -> Mesh:
-    """A body, an open sheet, a third sheet at one of its edges, and an unreferenced vertex in between."""
+def nonmanifold_mesh() -> Mesh:
+    """A mesh of a closed body, an open sheet with nonmanifold edges, and an unreferenced vertex."""
     body = bumpy_mesh(2)
     sheet, faces = grid_mesh(6, 6)
     n = len(body.vertices)
@@ -219,8 +219,8 @@ def hostile_mesh() -> Mesh:
     return make_mesh(vertices, np.concatenate([body.faces, faces + n + 1, third, [[n + 2, n + 7, n + 37]]]))
 
 
-def test_hostile_meshes():
-    mesh = hostile_mesh()
+def test_nonmanifold_meshes_with_unreferenced_vertices_get_valid_maps():
+    mesh = nonmanifold_mesh()
     assert len(mesh.nonmanifold_edges) and len(mesh.boundary_edges) and not mesh.referenced_vertices.all()
     spectrum, n = jaxsmw.compute_spectrum(mesh, K), len(mesh.vertices)
     used = np.flatnonzero(mesh.referenced_vertices)
@@ -229,7 +229,8 @@ def test_hostile_meshes():
     initial_map = np.where(generator.random(n) < 0.2, generator.choice(used, n), np.arange(n))
     initial_map[unreferenced] = unreferenced
     surface = steps._Surface.of(mesh, spectrum)
-    assert surface.areas[surface.component > 0].sum() < 0.05  # a small component, which is no outlier
+    # The mesh has a small connected component, which is not an outlier.
+    assert surface.areas[surface.component > 0].sum() < 0.05
     assert not steps._outliers(surface, surface, np.arange(len(used))).any()
     for found in bcicp(mesh, mesh, spectrum, spectrum, initial_map, initial_map, iterations=2, smoothing=5):
         assert found.dtype == np.int64 and found.shape == (n,)
@@ -257,8 +258,8 @@ def test_impossible_arguments_are_refused(body, copy):
         bcicp(*good, iterations=0)
 
 
-def test_the_error_comes_close_to_that_of_a_published_map(shared):
-    """Gorilla to man, from the published initial maps, compared with the published result."""
+def test_the_error_is_close_to_the_error_of_the_published_map(shared):
+    """The pair is a gorilla and a man, with published initial maps and a published result."""
     directory = shared / "data" / "tosca_nonisometric"
     data_set = open_data_set(directory)
     (pair,) = [p for p in data_set.pairs if (p.source, p.target) == ("8_gorilla_02", "8_man_02")]

@@ -222,7 +222,7 @@ def test_functions_refuse_names_longer_than_the_file_system_allows(scape):
             call()
 
 
-class ImmediateExecutor(Executor):
+class LocalExecutor(Executor):
     """Run each task immediately, in this process."""
 
     def submit(self, function, /, *arguments, **options):
@@ -238,7 +238,7 @@ def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
     """Run some methods on some pairs, in this process."""
     data_set = open_data_set(data)
     chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
-    return run_benchmark(data_set, chosen, output, find_methods(names), every, ImmediateExecutor())
+    return run_benchmark(data_set, chosen, output, find_methods(names), every, LocalExecutor())
 
 
 @pytest.fixture
@@ -273,7 +273,8 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
         ["initial", "mwp", str(tmp_path / "perfect")], output=output, init=str(tmp_path / "rough")
     ).rows
     means = {
-        name: [float(r["mean"]) for r in rows if r["method"] == name] for name in ("initial", "mwp", "perfect")
+        name: [float(r["mean"]) for r in rows if r["method"] == name]
+        for name in ("initial", "mwp", "perfect")
     }
     assert means["perfect"] == [0, 0]
     assert min(means["initial"]) > 0.1 and max(means["mwp"]) < 0.02
@@ -291,7 +292,7 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
 
 
 def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(measure, tmp_path):
-    """The ground truth of the sphere is the identity. The mirrored ground truth and the map are a reflection."""
+    """The ground truth is the identity. The mirrored ground truth and the map are a reflection."""
     vertices, faces = sphere_mesh(3)
     reflected = KDTree(vertices).query(vertices * [-1, 1, 1])[1]
     data = tmp_path / "data"
@@ -408,7 +409,7 @@ def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
 
 
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(ImmediateExecutor()))
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
     call = ["benchmark", str(scape), "--methods", "initial", "--pairs", "1", "--output", str(tmp_path)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 0
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
@@ -446,7 +447,7 @@ def test_tables_are_written_although_a_shape_cannot_be_read(scape, tmp_path, mon
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     (data / "mesh002.off").write_text("OFF\n1")
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(ImmediateExecutor()))
+    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
     call = ["benchmark", str(data), "--methods", "initial", "--output", str(output)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 2
     printed = capsys.readouterr()

@@ -46,7 +46,7 @@ def assert_same(arrays, expected=RESULT):
         assert array.tobytes() == expected[name].tobytes()
 
 
-def test_computed_once_and_returned_bit_for_bit(directory):
+def test_results_are_computed_once_and_returned_bit_for_bit(directory):
     compute = Computation()
     for _ in range(3):
         assert_same(cached("test", [INPUT, 7], compute))
@@ -54,7 +54,7 @@ def test_computed_once_and_returned_bit_for_bit(directory):
     assert [entry.suffix for entry in directory.iterdir()] == [".npz"]
 
 
-def test_equal_inputs_are_equal_however_they_lie_in_memory(directory):
+def test_the_memory_layout_of_inputs_has_no_effect(directory):
     compute = Computation()
     cached("test", [INPUT], compute)
     cached("test", [np.asfortranarray(INPUT)], compute)
@@ -93,7 +93,7 @@ def test_every_property_of_the_inputs_is_part_of_the_key(directory):
 
 
 @pytest.mark.parametrize("setting", ["", "off"])
-def test_switched_off(setting, tmp_path, monkeypatch):
+def test_a_disabled_cache_writes_nothing(setting, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSMW_CACHE", setting)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -103,7 +103,7 @@ def test_switched_off(setting, tmp_path, monkeypatch):
     assert compute.runs == 2 and not list(tmp_path.iterdir())
 
 
-def test_by_default_in_the_users_cache_directory(tmp_path, monkeypatch):
+def test_the_default_is_the_users_cache_directory(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXSMW_CACHE", raising=False)
     monkeypatch.setattr("platformdirs.user_cache_dir", lambda name, **_: str(tmp_path / name))
     cached("test", [INPUT], Computation())
@@ -160,7 +160,7 @@ def test_an_unwritable_directory_causes_one_warning(tmp_path, monkeypatch):
     assert str(tmp_path / "file") in str(caught[0].message) and "JAXSMW_CACHE" in str(caught[0].message)
 
 
-def test_a_full_disk_leaves_nothing_behind(directory, monkeypatch):
+def test_a_full_disk_leaves_no_unfinished_file(directory, monkeypatch):
     def full(path, **_):
         path.write_bytes(b"half an ent")
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -171,7 +171,7 @@ def test_a_full_disk_leaves_nothing_behind(directory, monkeypatch):
     assert not list(directory.iterdir())
 
 
-def test_a_directory_in_place_of_an_entry(directory):
+def test_a_directory_in_place_of_an_entry_causes_a_warning(directory):
     cached("test", [INPUT], Computation())
     (entry,) = directory.iterdir()
     entry.unlink()
@@ -180,7 +180,7 @@ def test_a_directory_in_place_of_an_entry(directory):
         assert_same(cached("test", [INPUT], Computation()))
 
 
-def test_the_least_recently_used_go_first_and_nothing_else_goes(directory, monkeypatch):
+def test_the_limit_removes_the_least_recently_used_entries_but_no_foreign_files(directory, monkeypatch):
     def entry(number):
         compute = Computation({"values": np.full(1000, float(number))})
         assert cached("test", [number], compute)["values"][0] == number
@@ -190,7 +190,8 @@ def test_the_least_recently_used_go_first_and_nothing_else_goes(directory, monke
     (directory / "thesis.npz").write_bytes(b"0" * 100_000)
     (directory / f".{'0' * 32}.npz").write_bytes(b"left by a killed process")
     os.utime(directory / f".{'0' * 32}.npz", (0, 0))
-    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", str(30_000 / 2**30))  # three entries of 8000 bytes and a little
+    # The limit has room for three entries of 8000 bytes and their overhead.
+    monkeypatch.setenv("JAXSMW_CACHE_LIMIT", str(30_000 / 2**30))
     now = 1_000_000
     for number in range(3):
         assert entry(number) == 1
@@ -228,7 +229,10 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
 
 
 def test_commands_cache_compiled_programs(tmp_path):
-    """The next process finds the programs in a directory for its processor; a disabled cache stays empty."""
+    """The next process loads the programs from a directory for its processor.
+
+    A disabled cache stays empty.
+    """
     mesh = tmp_path / "mesh.off"
     write_mesh(mesh, make_mesh(*sphere_mesh(2)))
     command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), "--eigenvectors", "20"]
@@ -248,7 +252,7 @@ def test_commands_cache_compiled_programs(tmp_path):
     assert len(compiled(str(cache))) > 5
 
 
-def test_the_users_settings_are_respected(monkeypatch, tmp_path):
+def test_the_users_compilation_cache_is_respected(monkeypatch, tmp_path):
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
     before = dict(os.environ)

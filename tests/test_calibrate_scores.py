@@ -1,4 +1,4 @@
-"""The study of scores: its tables are right for pairs with known figures."""
+"""The script `calibrate_scores`: its tables are correct for known measurements."""
 
 import sys
 from pathlib import Path
@@ -29,7 +29,7 @@ def test_tables_summarise_the_measurements():
     assert shares[2] == ["a", "1", "100.0", "100.0", "1.00", "50.00%", "20%"]
     assert shares[3] == ["b", "2", "100.0", "100.0", "-1.00", "50.00%", "0%"]
     assert len(tenths) == 12 and tenths[-1][0] == "180.0 to 200.0"
-    # The last tenth has the ten largest errors of the first pair, and the ten smallest of each other pair.
+    # The last tenth has the ten largest errors of the first pair and the ten smallest of both other pairs.
     assert float(tenths[-1][1]) == round(1e3 * (true[-10:].mean() + 2 * true[:10].mean()) / 3, 1)
     assert scores[2:] == [["a", "1 of 1"], ["b", "0 of 2"]]
 

@@ -1,4 +1,4 @@
-"""The commands of `jaxsmw` as a user meets them."""
+"""The commands of `jaxsmw`: help texts, results, output files and notes."""
 
 import base64
 import inspect
@@ -46,7 +46,7 @@ def mean_error(line: str) -> float:
     return float(re.search(r"mean ([\d.]+)", line)[1])
 
 
-def test_no_help_loads_a_heavy_module():
+def test_help_loads_no_heavy_module():
     code = (
         "import sys\n"
         "from jaxsmw.cli.run import run_command\n"
@@ -63,7 +63,7 @@ def test_no_help_loads_a_heavy_module():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_a_command(run, command):
+def test_every_command_has_a_help_text(run, command):
     outcome = run(command, "--help")
     assert outcome.code == 0 and outcome.output.startswith(f"usage: jaxsmw {command}")
 
@@ -91,17 +91,17 @@ def test_the_help_states_the_defaults_of_the_library(run):
     assert f"--evaluation-samples (default: {geodesics['seed'].default})" in words["evaluate"]
 
 
-def test_version(run):
+def test_the_version_is_printed(run):
     assert re.fullmatch(r"jaxsmw \d+\.\d+\.\d+\S*\n", run("--version").output)
     assert run("--version").output == f"jaxsmw {jaxsmw.__version__}\n"
 
 
-def test_runs_as_a_module():
+def test_the_package_runs_as_a_module():
     result = subprocess.run([sys.executable, "-m", "jaxsmw", "--version"], capture_output=True, check=True)
     assert result.stdout.startswith(b"jaxsmw ")
 
 
-def test_match_and_evaluate(run, pair, tmp_path):
+def test_evaluate_confirms_the_error_that_match_prints(run, pair, tmp_path):
     output = tmp_path / "map.txt"
     outcome = run(
         "match",
@@ -125,7 +125,7 @@ def test_match_and_evaluate(run, pair, tmp_path):
         [pair / "x.vts", pair / "y.vts"],
         [pair / "truth1.txt", "--index-base", "1"],
     ):
-        if "--index-base" in truth:  # --index-base holds for all files of the call
+        if "--index-base" in truth:  # --index-base applies to all files of the call
             np.savetxt(tmp_path / "map1.txt", np.loadtxt(output, int) + 1, fmt="%d")
             maps = [tmp_path / "map1.txt"]
         else:
@@ -154,7 +154,7 @@ def test_a_bank_that_is_not_tight_gets_a_note(run, pair, tmp_path):
         assert (f"{bank} is not a tight frame" in outcome.errors) == noted
 
 
-def test_quiet_is_quiet(run, pair, tmp_path):
+def test_quiet_prints_nothing_on_standard_error(run, pair, tmp_path):
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet", *SMALL)
     assert outcome.code == 0 and outcome.errors == ""
 
@@ -207,7 +207,7 @@ def test_options_reach_the_method(run, pair, tmp_path, options, monkeypatch):
     assert changed.functional_map.dtype == (np.float64 if "float64" in options else np.float32)
 
 
-def test_report(run, pair, tmp_path):
+def test_the_report_has_all_files_settings_and_maps(run, pair, tmp_path):
     report = tmp_path / "deep" / "report"
     outcome = run(
         "match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", "--report", report, *SMALL,
@@ -229,8 +229,8 @@ def test_report(run, pair, tmp_path):
     assert refined["functional"] != initial["functional"] and refined["map"] != initial["map"]
 
 
-def test_presets(run, pair, tmp_path):
-    """The default is accurate. Options that change the paper's method need the preset paper."""
+def test_the_default_preset_is_accurate_and_options_select_paper(run, pair, tmp_path):
+    """The default preset is accurate. Options that change the paper's method need the preset paper."""
     maps = {}
     for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100"),
                     ("--preset", "fast"), ("--samples", "500")):  # fmt: skip
@@ -280,7 +280,7 @@ def test_a_page_compares_maps(run, pair, tmp_path):
     means = [mean_error(line) for line in outcome.output.splitlines()]
     assert [name for name, _ in rows] == ["truth", "zero"]
     assert [float(mean) for _, mean in rows] == pytest.approx(means, abs=1e-4)
-    # Two files with the same name are called by their paths.
+    # Two maps from files with the same name are shown under their paths.
     (tmp_path / "other").mkdir()
     np.savetxt(tmp_path / "other" / "zero.txt", np.ones(642), fmt="%d")
     two = tmp_path / "zero.txt", tmp_path / "other" / "zero.txt"
@@ -289,8 +289,8 @@ def test_a_page_compares_maps(run, pair, tmp_path):
 
 
 @pytest.mark.filterwarnings("default:the page has no wavelets")
-def test_a_page_of_a_partial_shape(run, pair, tmp_path):
-    """The spectra cover the same range of eigenvalues. Without a common range the page has no wavelets."""
+def test_a_page_of_a_partial_shape_uses_a_common_range_of_eigenvalues(run, pair, tmp_path):
+    """Both spectra cover the same range of eigenvalues. Without a common range the page has no wavelets."""
     call = ["render", pair / "x.off", pair / "y.ply", pair / "truth.txt", "--output", tmp_path / "p.html"]
     assert run(*call, "--partial").code == 0
     # The smaller shape has fewer eigenvalues in the common range.
@@ -304,7 +304,7 @@ def test_a_page_of_a_partial_shape(run, pair, tmp_path):
     assert shown_maps(tmp_path / "p.html")[0]["functional"] is None
 
 
-def test_spectrum(run, pair, tmp_path):
+def test_spectrum_writes_an_orthonormal_eigenbasis(run, pair, tmp_path):
     outcome = run(
         "spectrum", pair / "x.off", "--eigenvectors", 12, "--output", tmp_path / "s.npz", "--figure", tmp_path / "s.png"
     )  # fmt: skip
@@ -316,7 +316,7 @@ def test_spectrum(run, pair, tmp_path):
     assert (tmp_path / "s.png").stat().st_size > 1000
 
 
-def test_spectrum_for_matlab(run, pair, tmp_path):
+def test_spectrum_writes_a_shape_for_matlab(run, pair, tmp_path):
     outcome = run("spectrum", pair / "y.ply", "--eigenvectors", 12, "--output", tmp_path / "s.mat")
     assert outcome.code == 0, outcome.errors
     shape = scipy.io.loadmat(tmp_path / "s.mat")["S"][0, 0]
@@ -324,7 +324,7 @@ def test_spectrum_for_matlab(run, pair, tmp_path):
     assert len(read_mesh(tmp_path / "s.mat").faces) == len(read_mesh(pair / "y.ply").faces)
 
 
-def test_maps_for_and_from_matlab(run, pair, tmp_path):
+def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
     meshes = pair / "x.off", pair / "y.ply"
     truth = np.loadtxt(pair / "truth.txt", dtype=int)
     scipy.io.savemat(tmp_path / "truth.mat", {"T12": truth + 1})
@@ -347,7 +347,7 @@ def test_maps_for_and_from_matlab(run, pair, tmp_path):
     assert outcome.code == 0 and mean_error(outcome.output) == 0 and not outcome.errors
 
 
-def test_render(run, pair, tmp_path):
+def test_render_writes_figures_and_pages(run, pair, tmp_path):
     for name, inputs in {
         "one.png": ["x.off"],
         "two.png": ["x.off", "y.ply", "truth.txt"],
@@ -358,7 +358,7 @@ def test_render(run, pair, tmp_path):
         assert (tmp_path / name).stat().st_size > 5000
 
 
-def test_seams_are_named_and_welded(run, tmp_path):
+def test_seams_are_reported_and_welded(run, tmp_path):
     vertices, faces = grid_mesh(12, 12)
     soup = make_mesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
     write_mesh(tmp_path / "soup.off", soup)
@@ -370,7 +370,7 @@ def test_seams_are_named_and_welded(run, tmp_path):
     )
 
 
-def test_demo(run, tmp_path):
+def test_demo_writes_a_pair_and_a_better_map(run, tmp_path):
     small = ["--vertices", "1000", "--preset", "paper", "--eigenvectors", "40"]
     outcome = run("demo", "--output", tmp_path / "demo", *small)
     assert outcome.code == 0, outcome.errors
@@ -400,7 +400,7 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
     assert outcome.code == 0, outcome.errors
     initial, surface, refined = (line for line in outcome.output.splitlines() if "map:" in line)
     assert surface.startswith("surface map:")
-    # The truth consists of vertices, so only the refined map, also of vertices, can be exactly right.
+    # The ground truth consists of vertices, so only a map to vertices can have matches without any error.
     assert mean_error(refined) < mean_error(surface) < 0.02 < mean_error(initial)
 
     mesh_y = read_mesh(y)
@@ -418,7 +418,7 @@ def test_the_expected_error_is_written(run, pair, tmp_path):
     assert_refused(run(*call, "--expected-error", tmp_path / "map.txt"), naming="two outputs have this name")
 
 
-def test_the_report_is_no_place_for_the_map(run, pair, tmp_path):
+def test_the_map_cannot_be_written_to_the_place_of_the_report(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--quiet", *SMALL]
     (tmp_path / "r").mkdir()
     for output in (tmp_path / "r" / "report.html", tmp_path / "new"):
@@ -464,7 +464,7 @@ def test_a_failed_computation_exits_with_1(run, pair, tmp_path, failing_match):
 
 @pytest.fixture
 def failing_match(monkeypatch) -> str:
-    """Let every match fail at once; the message of the failure."""
+    """Make every match fail at once, and return the message of the failure."""
     message = "x to y: the functional map became NaN."
 
     def fail(*_, **__):
@@ -489,7 +489,7 @@ def failing_match(monkeypatch) -> str:
     ids=" ".join,
 )
 @pytest.mark.usefixtures("failing_match")
-def test_a_line_says_that_an_option_replaces_the_preset(run, pair, tmp_path, change):
+def test_a_note_says_that_an_option_replaces_the_preset(run, pair, tmp_path, change):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m"]
     note = f"note: preset paper replaces accurate, because {change[0]} changes the paper's method.\n"
     assert note in run(*call, *change).errors.splitlines(keepends=True)
@@ -498,7 +498,7 @@ def test_a_line_says_that_an_option_replaces_the_preset(run, pair, tmp_path, cha
 
 
 @pytest.mark.usefixtures("failing_match")
-def test_several_options_replace_the_preset(run, tmp_path):
+def test_a_note_names_all_options_that_replace_the_preset(run, tmp_path):
     outcome = run(
         "demo", "--vertices", "500", "--output", tmp_path / "d", "--iterations", "1", "--bank", "held"
     )
@@ -506,7 +506,7 @@ def test_several_options_replace_the_preset(run, tmp_path):
 
 
 def test_written_files_are_named(run, pair, tmp_path):
-    """Every file that a command writes has a line on standard error."""
+    """Standard error has a line for every file that a command writes."""
     meshes, truth = (pair / "x.off", pair / "y.ply"), pair / "truth.txt"
     for arguments in (
         ["match", *meshes, *SMALL, "--output", tmp_path / "m.txt", "--surface-points", tmp_path / "p.baryc_gt",
@@ -555,7 +555,7 @@ def test_the_times_account_for_the_whole_run(run, pair, tmp_path):
     "arguments", [["--help"], ["match", "--help"], ["--version"], ["spectrum", "{pair}/x.off"]], ids=" ".join
 )
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_output_that_cannot_be_written(pair, arguments, unbuffered):
+def test_output_that_cannot_be_written_is_reported(pair, arguments, unbuffered):
     call = [sys.executable, "-m", "jaxsmw", *(argument.format(pair=pair) for argument in arguments)]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
@@ -567,7 +567,7 @@ def test_output_that_cannot_be_written(pair, arguments, unbuffered):
     )
 
 
-def test_whoever_closes_the_pipe_gets_no_complaint(pair):
+def test_a_closed_pipe_causes_no_error_message(pair):
     call = [sys.executable, "-m", "jaxsmw", "spectrum", pair / "x.off"]
     process = subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
@@ -583,14 +583,14 @@ def test_the_readme_names_existing_options(run):
         assert option in helps, option
 
 
-def test_read_mesh_is_exported():
+def test_every_exported_name_exists():
     assert jaxsmw.read_mesh is read_mesh
     assert set(jaxsmw.__all__) <= set(dir(jaxsmw))
     for name in jaxsmw.__all__:
         assert getattr(jaxsmw, name) is not None
 
 
-def test_every_bank_has_a_name(run, pair, tmp_path):
+def test_every_bank_has_a_different_figure(run, pair, tmp_path):
     pictures = set()
     for name in BANKS:
         path = tmp_path / f"{name}.png"

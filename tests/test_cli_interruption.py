@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: one line, death of the signal, no unfinished files."""
+"""Ctrl-C at any moment: the process prints one line, is killed by the signal, and leaves no unfinished file."""
 
 import os
 import shlex
@@ -17,7 +17,7 @@ from jaxsmw.io.mesh_files import write_mesh
 from jaxsmw.runtime.files import atomic_write, remove_unfinished
 
 LINE = "jaxsmw: interrupted; output files are complete or were not written.\n"
-# Tests that run in the background ignore the signal, and so would the processes that they start.
+# If the tests run in the background, SIGINT may be ignored, and child processes inherit this setting.
 PROLOGUE = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -33,7 +33,7 @@ def pair(tmp_path_factory) -> Path:
 
 
 def started(program: str, *arguments: object, start_new_session: bool = False) -> subprocess.Popen[str]:
-    """A process with `program` before the command line."""
+    """Start a process that runs `program` and then the command line."""
     return subprocess.Popen(
         [sys.executable, "-c", PROLOGUE + textwrap.dedent(program) + RUN, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -44,7 +44,7 @@ def started(program: str, *arguments: object, start_new_session: bool = False) -
 
 
 def assert_interrupted(process: subprocess.Popen[str], directory: Path | None, *, line: str = LINE) -> None:
-    """The process dies of the signal with one line, and leaves no file in the directory."""
+    """Check that the process prints one line, is killed by the signal, and leaves no file in the directory."""
     try:
         output, errors = process.communicate(timeout=60)
     finally:
@@ -61,7 +61,7 @@ def assert_interrupted(process: subprocess.Popen[str], directory: Path | None, *
     "module",
     ["argparse", "jaxsmw.cli.match", "numpy", "jax", "jaxlib._jax", "equinox", "scipy.sparse", "igl"],
 )
-def test_interrupted_imports(pair, tmp_path, module):
+def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
     program = f"""
     class Interrupting:
         def find_spec(name, *_):
@@ -73,11 +73,11 @@ def test_interrupted_imports(pair, tmp_path, module):
     assert_interrupted(started(program, *call), tmp_path)
 
 
-# Python swallows exceptions in functions that run at a garbage collection, as one of JAX does.
+# Python discards exceptions in functions that run at a garbage collection. JAX registers such a function.
 IN_GARBAGE_COLLECTION = """
     import gc
     def interrupt_late(phase, _):
-        if phase == "initial" and "jaxsmw.matching" in sys.modules:
+        if phase == "start" and "jaxsmw.matching" in sys.modules:
             gc.callbacks.clear()
             interrupt()
     gc.callbacks.append(interrupt_late)
@@ -96,7 +96,7 @@ IN_COMPILED_CODE = """
     import jaxsmw.matching
     from jaxsmw.runtime.files import atomic_write
     def match_forever(*_, **__):
-        # This thread waits for itself, without the signal, as if in code that never returns to Python.
+        # This thread blocks the signal and deadlocks, like compiled code that never returns to Python.
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         with atomic_write(sys.argv[5]) as temporary:
             temporary.write_text("half")
@@ -109,18 +109,18 @@ IN_COMPILED_CODE = """
 
 
 @pytest.mark.parametrize("program", [IN_GARBAGE_COLLECTION, IN_A_WRITE, IN_COMPILED_CODE])
-def test_interrupted_work(pair, tmp_path, program):
+def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
     call += ("--expected-error", tmp_path / "e") if program == IN_A_WRITE else ()
     process = started(program, *call)
-    if program == IN_A_WRITE:  # the map is complete by then
+    if program == IN_A_WRITE:  # the interruption follows after the map is complete
         process.wait(timeout=60)
         (tmp_path / "m").unlink()
     assert_interrupted(process, tmp_path)
 
 
-def test_interrupted_refinement(pair, tmp_path):
-    """Compiled code that runs for hours ends at once."""
+def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
+    """The signal ends compiled code that would run for hours."""
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--iterations", "10000000")
     process = started("", *call)
     for line in process.stderr:
@@ -131,8 +131,8 @@ def test_interrupted_refinement(pair, tmp_path):
     assert_interrupted(process, tmp_path)
 
 
-def test_an_interrupted_benchmark(tmp_path):
-    """A terminal sends the signal to the workers as well, and all processes are silent but one."""
+def test_an_interrupted_benchmark_prints_one_line(tmp_path):
+    """A terminal sends the signal to the workers as well, but only the main process prints a line."""
     data, output = tmp_path / "data", tmp_path / "output"
     data.mkdir()
     for number in range(3):
@@ -147,7 +147,7 @@ def test_an_interrupted_benchmark(tmp_path):
     assert_interrupted(process, None, line=f"\njaxsmw: interrupted; {kept}.\n")
 
 
-def test_a_second_interruption_changes_nothing(pair, tmp_path):
+def test_a_second_interruption_has_no_effect(pair, tmp_path):
     program = """
     import jaxsmw.matching
     def match_forever(*_, **__):
@@ -159,15 +159,15 @@ def test_a_second_interruption_changes_nothing(pair, tmp_path):
 
 
 def test_an_ignored_signal_stays_ignored(pair):
-    """As in a script's background job, and under nohup."""
+    """Shell scripts start background jobs with SIGINT ignored."""
     program = "signal.signal(signal.SIGINT, signal.SIG_IGN); import atexit; atexit.register(interrupt)\n"
     process = started(program, "spectrum", pair / "x.off", "--eigenvectors", "5")
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 0 and not errors and "area" in output
 
 
-def test_a_shell_ends_its_loop(pair, tmp_path):
-    """A shell goes on with its loop where an interrupted command exits instead of dying of the signal."""
+def test_a_shell_ends_its_loop_at_an_interruption(pair, tmp_path):
+    """A shell continues its loop if an interrupted command exits instead of being killed by the signal."""
     call = (
         sys.executable,
         "-m",

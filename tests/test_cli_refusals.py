@@ -1,4 +1,4 @@
-"""What the command line refuses: bad files, bad arguments, and outputs that cannot be written."""
+"""The command line refuses bad files, bad arguments, and outputs that cannot be written."""
 
 import sys
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_benchmarks_without_their_libraries_are_refused(run, tmp_path, monkeypat
         ("start.baryc_gt", "is an input"),
     ],
 )
-def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault):
+def test_surface_points_that_cannot_be_written_are_refused(run, pair, tmp_path, name, fault):
     (tmp_path / "truth.baryc_gt").write_text("1 1 0 0\n" * 642)
     (tmp_path / "start.baryc_gt").write_text("0\n" * 642)
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL, "--quiet"]
@@ -77,7 +77,7 @@ def test_surface_points_that_cannot_be_written(run, pair, tmp_path, name, fault)
     assert (tmp_path / "start.baryc_gt").read_text() == "0\n" * 642
 
 
-def test_one_to_one_map_that_does_not_exist_is_refused_at_once(run, pair, tmp_path):
+def test_an_impossible_one_to_one_map_is_refused_before_the_work(run, pair, tmp_path):
     write_mesh(tmp_path / "small.off", bumpy_mesh(2))
     call = ["match", pair / "x.off", tmp_path / "small.off", "--output", tmp_path / "map.txt", *SMALL]
     outcome = run(*call, "--quiet", "--one-to-one", tmp_path / "one.txt")
@@ -85,7 +85,7 @@ def test_one_to_one_map_that_does_not_exist_is_refused_at_once(run, pair, tmp_pa
     assert not (tmp_path / "map.txt").exists()
 
 
-def test_outputs_of_one_name_are_refused(run, pair, tmp_path):
+def test_outputs_with_the_same_name_are_refused(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "source.obj", *SMALL]
     assert_refused(run(*call, "--one-to-one", tmp_path / "source.obj"), naming="two outputs have this name")
     assert_refused(run(*call, "--texture", tmp_path), naming="two outputs have this name")
@@ -126,7 +126,7 @@ HOSTILE_MESHES = {
     "short.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
     b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n1234",
     "no_z.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-    "lying.stl": b"\0" * 80 + (10**9).to_bytes(4, "little") + b"\0" * 50,
+    "wrong_count.stl": b"\0" * 80 + (10**9).to_bytes(4, "little") + b"\0" * 50,
     "points.obj": b"v 0 0 0\nv 1 0 0\n",
     "zero.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n",
     "mesh.xyz": b"0 0 0\n",
@@ -135,7 +135,7 @@ HOSTILE_MESHES = {
 
 
 @pytest.mark.parametrize("name", HOSTILE_MESHES)
-def test_hostile_meshes(run, pair, tmp_path, name):
+def test_hostile_mesh_files_are_refused(run, pair, tmp_path, name):
     (tmp_path / name).write_bytes(HOSTILE_MESHES[name])
     for meshes in ([tmp_path / name, pair / "y.ply"], [pair / "x.off", tmp_path / name]):
         outcome = run("match", *meshes, "--output", tmp_path / "map.txt", "--quiet", *SMALL)
@@ -161,7 +161,7 @@ HOSTILE_MAPS = {
 
 @pytest.mark.parametrize("use", ["init", "truth", "evaluate", "render"])
 @pytest.mark.parametrize("name", HOSTILE_MAPS)
-def test_hostile_maps(run, pair, tmp_path, name, use):
+def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
     if (name, use) == ("two columns", "truth"):
         pytest.skip("two columns are a legal form of ground truth")
     path = tmp_path / "hostile.txt"
@@ -197,8 +197,8 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
             "--geodesics: has no effect without --ground-truth",
         ),
         ("match {x} {y} --output {t}/m --seed 3", "--seed: has no effect without --evaluation-samples"),
-        ("match {x} {y} --output {t}/m.npz", "m.npz: a map is written"),
-        ("match {x} {y} --output {t}/m --one-to-one {t}/o.baryc_gt", "o.baryc_gt: a map is written"),
+        ("match {x} {y} --output {t}/m.npz", "m.npz: maps are written"),
+        ("match {x} {y} --output {t}/m --one-to-one {t}/o.baryc_gt", "o.baryc_gt: maps are written"),
         (
             "evaluate {x} {y} {t}/m --ground-truth {t}/m --seed 3",
             "--seed: has no effect without --evaluation-samples",
@@ -268,7 +268,7 @@ def test_hostile_maps(run, pair, tmp_path, name, use):
         ("", "COMMAND"),
     ],
 )
-def test_hostile_arguments(run, pair, tmp_path, arguments, fault):
+def test_hostile_arguments_are_refused(run, pair, tmp_path, arguments, fault):
     words = arguments.format(x=pair / "x.off", y=pair / "y.ply", p=pair, t=tmp_path).split()
     outcome = run(*words, *(["--quiet"] if len(words) > 1 else []))
     assert_refused(outcome, naming=fault)
@@ -300,12 +300,12 @@ def test_two_outputs_of_evaluate_in_one_file_are_refused(run, pair, tmp_path, ou
     ("arguments", "fault"),
     [
         ("spectrum {x} --output {t}/s.npz --figure {t}/../{t.name}/s.npz", "two outputs have this name"),
-        ("match {x} {y} --output {t}/m --report {t}/m/r", "lies in {t}/m, which is an output file"),
+        ("match {x} {y} --output {t}/m --report {t}/m/r", "is a path in {t}/m, which is an output file"),
         ("demo --output {t}/d --init map:{t}/d/map.txt", "d/map.txt: is an input and would be overwritten"),
         ("benchmark {t} --pairs {t} --output {t}", "cannot be read as text"),
     ],
 )
-def test_clashes_of_other_commands(run, pair, tmp_path, arguments, fault):
+def test_clashing_paths_of_other_commands_are_refused(run, pair, tmp_path, arguments, fault):
     if "benchmark" in arguments:
         scape = [tmp_path / f"mesh00{number}.off" for number in range(2)]
         for path in scape:
@@ -314,7 +314,7 @@ def test_clashes_of_other_commands(run, pair, tmp_path, arguments, fault):
     assert_refused(run(*words, "--quiet"), naming=fault.format(t=tmp_path))
 
 
-# For each option that takes a path, a call in which only this path is missing.
+# One call for each option that takes a path. `{path}` is the path under test.
 PATHS = {
     "SOURCE": "match {path} {y} --output {t}/m",
     "TARGET": "match {x} {path} --output {t}/m",
@@ -343,9 +343,9 @@ PATHS = {
 
 @pytest.mark.parametrize("name", PATHS)
 @pytest.mark.parametrize("kind", ["empty", "too long"])
-def test_names_that_no_file_can_have(run, pair, tmp_path, name, kind):
+def test_names_that_no_file_can_have_are_refused(run, pair, tmp_path, name, kind):
     if (name, kind) == ("--init", "empty"):
-        pytest.skip("map: without a file is not an initial map, which has a test of its own")
+        pytest.skip("an empty path in --init is tested in test_hostile_arguments_are_refused")
     path = "" if kind == "empty" else "n" * 300
     words = PATHS[name].split()
     values = {"x": pair / "x.off", "y": pair / "y.ply", "p": pair, "t": tmp_path, "path": path}
@@ -373,7 +373,7 @@ def test_names_that_no_file_can_have(run, pair, tmp_path, name, kind):
     ],
 )
 @pytest.mark.parametrize("number", [2**31, 10**30, 10**5000], ids=["2^31", "10^30", "10^5000"])
-def test_huge_numbers(run, pair, tmp_path, arguments, number):
+def test_huge_numbers_are_refused(run, pair, tmp_path, arguments, number):
     words = arguments.format(x=pair / "x.off", y=pair / "y.ply", p=pair, t=tmp_path).split()
     text = "1" + "0" * 5000 if number > 10**40 else str(number)
     outcome = run(*words, text)
@@ -383,7 +383,7 @@ def test_huge_numbers(run, pair, tmp_path, arguments, number):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_largest_numbers_get_a_sentence_of_the_library(run, pair, tmp_path):
+def test_the_largest_accepted_numbers_get_a_message_of_the_library(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet"]
     largest = 2**31 - 1
     assert_refused(run(*call, "--eigenvectors", largest), naming="choose a number from 1 to 641")
@@ -391,7 +391,7 @@ def test_the_largest_numbers_get_a_sentence_of_the_library(run, pair, tmp_path):
 
 
 def test_functions_refuse_names_that_are_too_long(tmp_path):
-    """The library itself, without the command line, gives the same kind of sentence."""
+    """The functions of the library, called without the command line, give the same kind of message."""
     path = tmp_path / ("n" * 300)
     for check in (check_writable, check_directory, make_directory):
         with pytest.raises(InputError, match=r"cannot be .*File name too long"):
@@ -401,7 +401,7 @@ def test_functions_refuse_names_that_are_too_long(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_too_little_memory_is_a_sentence(run, pair, tmp_path, monkeypatch):
+def test_too_little_memory_is_reported_in_one_sentence(run, pair, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise MemoryError("Unable to allocate 75.0 GiB")
 

@@ -1,4 +1,4 @@
-"""Colours: they show positions, errors and signs, and depend on nothing else."""
+"""Colours show positions, errors and signs, and depend on nothing else."""
 
 from dataclasses import replace
 
@@ -24,13 +24,13 @@ def test_srgb_round_trip(color: list[float]) -> None:
     assert np.allclose(colors.linear_to_srgb(colors.srgb_to_linear(np.array(color))), color, atol=1e-5)
 
 
-def test_position_colors_tell_places_apart_smoothly() -> None:
+def test_position_colors_vary_smoothly_and_differ_between_opposite_ends() -> None:
     mesh = stand(TALL)
     color = colors.position_colors(mesh)
     assert color.min() >= 0 and color.max() <= 1
     edges = mesh.edges
     assert np.abs(color[edges[:, 0]] - color[edges[:, 1]]).max() < 0.2
-    # The ends of each axis differ, above all right from left.
+    # The two ends of each axis have different colours. The difference is larger on the first two axes.
     ends = [(mesh.vertices[:, axis].argmin(), mesh.vertices[:, axis].argmax()) for axis in range(3)]
     difference = [np.abs(color[low] - color[high]).max() for low, high in ends]
     assert min(difference) > 0.15 and min(difference[:2]) > 0.4
@@ -67,7 +67,7 @@ def test_error_colors_darken_with_the_error() -> None:
     assert np.array_equal(color[7], colors.PLAIN)
 
 
-def test_signed_colors_are_as_blue_below_zero_as_red_above() -> None:
+def test_signed_colors_are_blue_below_zero_and_red_above() -> None:
     values = np.array([-2, -1, -0.5, 0, 0.5, 1, 2])
     for on_dark in (False, True):
         color = colors.signed_colors(values, 1.0, on_dark=on_dark)

@@ -1,4 +1,4 @@
-"""The study script: what it keeps, refuses, measures and summarises."""
+"""The script `compare_frames`: stored results, refusals, measurements, summaries and figures."""
 
 import csv
 import os
@@ -41,14 +41,14 @@ SCRIPTS = Path(compare_frames.__file__).parent
 FILTERS = 4
 
 
-# Keeping results
+# Stored results
 
 
 def row(name: str, value: float) -> dict[str, object]:
     return {"name": name, "value": value}
 
 
-def test_journal_keeps_whole_rows_only(tmp_path):
+def test_journal_keeps_only_complete_rows(tmp_path):
     path = tmp_path / "table.csv"
     journal = Journal(path, ["name"])
     journal.append([row("a, with a comma", 1), row("b", 2)])
@@ -62,7 +62,7 @@ def test_journal_keeps_whole_rows_only(tmp_path):
         assert [r["value"] for r in Journal(path, ["name"]).rows] == ["1", "2", "3.5"]
 
 
-def test_journal_survives_a_torn_header_and_rows_written_twice(tmp_path):
+def test_journal_survives_an_incomplete_header_and_repeated_rows(tmp_path):
     path = tmp_path / "table.csv"
     path.write_bytes(b"name,val")
     Journal(path, ["name"]).append([row("a", 1)])
@@ -102,7 +102,7 @@ def claim(directory, origin):
         pass
 
 
-def test_code_digest_heeds_what_code_does_and_nothing_else(tmp_path):
+def test_code_digest_depends_on_code_but_not_on_comments_or_layout(tmp_path):
     path = tmp_path / "code.py"
 
     def digest(text: str) -> str:
@@ -148,7 +148,7 @@ def measure(data, task, settings):
 """
 
 
-def test_after_a_kill_only_what_is_missing_is_measured(tmp_path):
+def test_only_missing_measurements_run_after_a_kill(tmp_path):
     log, results = tmp_path / "log", tmp_path / "results.csv"
     (tmp_path / "study.py").write_text(STUDY.format(scripts=str(SCRIPTS), here=str(tmp_path)))
     (tmp_path / "slow.py").write_text(SLOW.format(log=str(log)))
@@ -161,11 +161,11 @@ def test_after_a_kill_only_what_is_missing_is_measured(tmp_path):
     first.send_signal(signal.SIGKILL)
     first.wait()
     begun = [line.split() for line in log.read_text().splitlines()]
-    # The workers go, too.
+    # The workers must end, too.
     while any(is_alive(int(pid)) for pid, *_ in begun):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    # One row is lost, another one torn.
+    # One row is missing, and the row before is incomplete.
     lines = results.read_bytes().splitlines(keepends=True)
     kept = [*lines[:-2], lines[-2][:-4]]
     results.write_bytes(b"".join(kept))
@@ -192,7 +192,7 @@ def is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # An orphan that nobody waited for is as good as gone.
+    # A zombie process has ended, although its parent has not waited for it.
     status = Path(f"/proc/{pid}/stat")
     return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
@@ -216,7 +216,7 @@ def test_pairs_are_evenly_spread(tmp_path):
         compare_frames.select_pairs(tmp_path / "faust_r", 3)
 
 
-# What is compared
+# Compared variants
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_pairs_are_evenly_spread(tmp_path):
         ("pushforward", "least squares (Frobenius)"),
     ],
 )
-def test_padding_and_tabulating_change_nothing(convention, update):
+def test_padding_and_tabulated_filters_have_no_effect(convention, update):
     x, y = (random_spectrum(n, 10, seed=n) for n in (150, 170))
     start = np.random.default_rng(0).integers(0, 170, 150)
     bank = CubicSpline(FILTERS)
@@ -246,7 +246,7 @@ def test_padding_and_tabulating_change_nothing(convention, update):
     np.testing.assert_array_equal(start, measurement.pad_map(start, padded_x)[:150])
 
 
-def test_band_mask_is_as_wide_as_the_kernel_and_comes_from_no_frame():
+def test_band_mask_is_as_wide_as_the_kernel_but_belongs_to_no_frame():
     x, y = (random_spectrum(300, 60, seed=seed) for seed in (1, 2))
     bank = Meyer(6)
     for convention, (out, into) in {"pullback": (x, y), "pushforward": (y, x)}.items():
@@ -263,7 +263,7 @@ def test_band_mask_is_as_wide_as_the_kernel_and_comes_from_no_frame():
     mask = variants.band_mask(octaves, octaves, 0.8)
     np.testing.assert_array_equal(mask, mask.T)
     np.testing.assert_allclose(mask[0, [0, 4, 8, 12, 13]], [1, 1, 0.5, 0, 0], atol=1e-12)
-    # Below the scaling function's edge there is nothing to tell eigenvalues apart.
+    # All eigenvalues up to the edge of the scaling function have the octave 0.
     np.testing.assert_allclose(variants.octaves(np.array([0, 1, 2, 4, 32.0]), 5), [0, 0, 0, 1, 4])
 
 
@@ -284,7 +284,7 @@ def test_projection_gives_the_nearest_orthogonal_matrix():
         assert np.linalg.norm(other - found["filtering"]) > nearest
 
 
-def test_only_what_is_provably_equal_is_not_measured():
+def test_only_provably_equal_variants_are_not_measured():
     every = variants.variants(variants.frames(FILTERS))
     banks = variants.frames(FILTERS)
     twins = variants.twins(every, banks)
@@ -318,7 +318,7 @@ def test_tightened_gabor_is_parseval_and_gabor_is_not():
     assert variants.is_parseval(tighten(Gabor(FILTERS))) and not variants.is_parseval(Gabor(FILTERS))
 
 
-def test_one_real_pair(shared):
+def test_measurements_of_a_real_pair_are_consistent(shared):
     name = PairName("faust_r", "tr_reg_000", "tr_reg_004")
     settings = Settings(
         number_of_eigenvectors=30,
@@ -341,7 +341,7 @@ def test_one_real_pair(shared):
     assert float(found["error_2"]) < 0.3 * expected
     assert 0 < float(found["moved_2"]) < float(found["changed_2"]) < 1
     assert 0 < float(found["energy"]) < float(found["energy_of_zero"]) == pytest.approx(30, rel=1e-5)
-    # The same by the other way.
+    # `measure_parameters` and `measure_variants` give nearly the same error.
     parameters = measurement.measure_parameters(pair, name, [(30, 6), (20, 6)], settings)
     assert float(parameters[0]["error_2"]) == pytest.approx(float(found["error_2"]), rel=0.02)
     assert parameters[1]["error_2"] != parameters[0]["error_2"]
@@ -357,7 +357,7 @@ def test_one_real_pair(shared):
 # Summaries
 
 
-def test_interval_is_that_of_a_mean():
+def test_interval_is_a_confidence_interval_of_the_mean():
     sample = np.random.default_rng(3).normal(2, 1, 400)
     mean, low, high = summary.mean_interval(sample, seed=0)
     half = 1.96 * sample.std() / 20
@@ -392,7 +392,11 @@ def test_comparison_is_paired_and_counts_failures():
 
 @pytest.fixture(scope="module")
 def made_up() -> summary.Study:
-    """Every variant is ten times worse than the default on every second pair; one always fails."""
+    """A study with invented numbers.
+
+    On every second pair, every variant has ten times the error of the default. Low-pass variants without
+    filtering always fail.
+    """
     settings = replace(compare_frames.QUICK, pairs=4, iterations=3)
     every = variants.variants(settings.frames)
     twins = variants.twins(every, variants.frames(6))
@@ -421,12 +425,12 @@ def made_up() -> summary.Study:
     return summary.Study(rows, times, pairs, every, twins, settings)
 
 
-def test_study_numbers(made_up):
+def test_study_summarises_known_numbers(made_up):
     spline = Variant("cubic spline", "filtering", "pullback")
     found = made_up.comparisons[spline, "both"]
     assert found.mean == pytest.approx(55) and found.difference.mean == pytest.approx(45)
     assert found.better == 0 and found.failures == 0
-    # Settled in iteration 1 on pairs 0, 2, …, and in iteration 2 on pairs 1, 3, ….
+    # The map settles in iteration 1 on pairs 0, 2, …, and in iteration 2 on pairs 1, 3, ….
     assert made_up.median_settling(spline, "both") == 1.5
     assert made_up.relative_energy(spline, "faust_r") == pytest.approx(0.2)
     twin = Variant("Meyer", "least squares (area)", "pushforward")
@@ -434,7 +438,7 @@ def test_study_numbers(made_up):
     assert np.isnan(made_up.interval(None, "both")).all()
 
 
-def test_summary_says_it_all(made_up):
+def test_summary_shows_all_results(made_up):
     scales = [
         {"data_set": d, "frame": f, "scale": str(s), "relative_difference": f"0.{s}1", "correlation": "0.5"}
         for d in measurement.DATA_SETS
@@ -473,7 +477,7 @@ def test_forest_plot_shows_every_estimate():
         draw_forest({"one": {"a": intervals}}, rows=["p", "q"], xlabel="difference")
 
 
-def test_heat_maps_write_their_numbers():
+def test_heat_maps_show_their_numbers():
     tables = {"one": np.array([[1.0, 20.0], [3.0, 400.0]]), "two": np.full((2, 2), 5.0)}
     figure = draw_heat_maps(tables, rows=("k", [20, 40]), columns=("filters", [2, 3]), label="error")
     written = [text.get_text() for axes in figure.axes for text in axes.texts]

@@ -21,18 +21,18 @@ def points():
     return tuple(jnp.asarray(generator.normal(size=(size, 12)).astype(np.float32)) for size in (300, 400))
 
 
-def test_the_options_remove_the_library_for_products(points):
+def test_the_options_disable_the_library_for_matrix_products(points):
     plain, ours = (
         jax.jit(nearest_neighbor, compiler_options=options).lower(*points).compile().as_text()
         for options in ({}, compiler_options())
     )
     assert "__ynn_fusion" not in ours or not compiler_options()
     if jax.default_backend() == "cpu" and jax.__version_info__[:2] == (0, 10):
-        # The option was measured with this version.
+        # The effect of the option is known for this version of JAX.
         assert "__ynn_fusion" in plain and compiler_options()
 
 
-def test_sums_are_one_loop_and_nearly_as_exact():
+def test_sums_compile_to_one_loop_and_stay_accurate():
     values = np.random.default_rng(0).random((50_000, 3), np.float32)
 
     def total(values):
@@ -46,7 +46,7 @@ def test_sums_are_one_loop_and_nearly_as_exact():
     np.testing.assert_allclose(program(values), values.astype(np.float64).sum(axis=0), rtol=1e-5)
 
 
-def test_compiled_functions_are_traced_once_and_give_the_same(points):
+def test_compiled_functions_are_traced_once_and_return_the_same_results(points):
     traced = []
 
     def search(queries, database, *, reverse):

@@ -1,4 +1,4 @@
-"""Coherent Point Drift: equal to a dense NumPy program, and right on cases with a known result."""
+"""Coherent Point Drift agrees with a dense NumPy implementation and solves cases with a known result."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ from jaxsmw.evaluation.opponents.cpd import (
 
 
 def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
-    """The method as printed by Myronenko and Song (figure 4), with all matrices stored."""
+    """The method of Myronenko and Song (figure 4) with dense matrices."""
     (m, d), n = x.shape, len(y)
     mean, (x, y) = x.mean(0), (p - p.mean(0) for p in (x, y))
     scale, (x, y) = np.sqrt((x**2).sum() / m), (p / np.sqrt((p**2).sum() / len(p)) for p in (x, y))
@@ -37,15 +37,15 @@ def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
     return mean + scale * moved, variance
 
 
+# The tests share these sizes and ranks, because every other size, rank or dtype needs another compilation.
 M, N, RANK, LOW_RANK = 140, 150, 150, 40
 ORDER = np.random.default_rng(1).permutation(N)[:M]
-# Programs are compiled for sizes, rank and dtype, so the tests share these.
 
 
 def deformed(d=3, noise=0.0, seed=0):
-    """Returns data (M, d) and centroids (N, d): a smooth deformation takes M of the centroids to the data.
+    """Return data (M, d) and centroids (N, d). The data are M of the centroids after a smooth deformation.
 
-    Data and centroids are in different frames and units.
+    Data and centroids are in different coordinate frames and units.
     """
     generator = np.random.default_rng(seed)
     y = generator.uniform(-1, 1, size=(N, d))
@@ -69,7 +69,7 @@ def test_equals_the_dense_method(settings):
     assert not settings or np.abs(moved - plain).max() > 1e-4
 
 
-def test_low_rank_comes_close():
+def test_low_rank_is_close_to_the_dense_method():
     x, y = deformed(noise=0.2)
     exact, _ = dense_drift(x, y, 8)
     drift = coherent_point_drift(jnp.asarray(x), jnp.asarray(y), rank=LOW_RANK, iterations=8, tolerance=0.0)
@@ -78,7 +78,7 @@ def test_low_rank_comes_close():
 
 
 def test_float32_in_many_dimensions_does_not_underflow():
-    """Likelihoods near exp(-d/2) are below the smallest float32, and the noise is below the smallest float64."""
+    """Likelihoods near exp(-d/2) underflow in float32, and the noise term underflows even in float64."""
     x, y = deformed(d=300, noise=0.5)
     exact, variance = dense_drift(x, y, 4, stiffness=1e3)
     scale = np.sqrt(((x - x.mean(0)) ** 2).sum() / M)
@@ -102,8 +102,8 @@ def test_kernel_factor_of_full_rank_is_exact():
     assert (np.asarray(factor)[:, 40:] == 0).all()
 
 
-def test_known_displacement():
-    """The deformation is too strong for nearest neighbours."""
+def test_a_known_displacement_is_recovered():
+    """The deformation is too large for a nearest-neighbour search."""
     x, y = deformed()
     drift = coherent_point_drift(jnp.asarray(x), jnp.asarray(y), rank=RANK)
     assert drift.iterations < 150
@@ -113,7 +113,7 @@ def test_known_displacement():
     assert np.abs(x - np.asarray(drift.centroids)[ORDER]).mean() < 0.05 * displacement
 
 
-def test_iterations_and_tolerance_stop_it():
+def test_iterations_and_tolerance_stop_the_drift():
     x, y = (jnp.asarray(points) for points in deformed())
     assert coherent_point_drift(x, y, iterations=3, rank=RANK).iterations == 3
     loose, tight = (coherent_point_drift(x, y, tolerance=t, rank=RANK).iterations for t in (1e-2, 1e-5))
@@ -131,7 +131,7 @@ def test_numbers_out_of_range_raise(wrong):
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[jax.Array, Spectrum, Spectrum]:
-    """Two embeddings that no C aligns: the embedding of X is a deformed embedding of Y."""
+    """Spectra that no functional map C aligns, because the embedding of X is a deformed embedding of Y."""
     x, y = (
         Spectrum(jnp.arange(3.0), jnp.asarray(points), jnp.full(n, 1 / n), jnp.ones(n, bool))
         for points, n in zip(deformed(), (M, N), strict=True)
@@ -148,7 +148,7 @@ def test_recovery_succeeds_where_nearest_neighbours_fail(pair):
     np.testing.assert_array_equal(recover_by_drift(*pair, rank=RANK), ORDER)
 
 
-def test_signs_change_nothing(pair):
+def test_signs_of_eigenvectors_have_no_effect(pair):
     functional_map, x, y = pair
     generator = np.random.default_rng(0)
     signs_x, signs_y = (jnp.asarray(generator.permutation([-1.0, -1.0, 1.0])) for _ in range(2))
@@ -159,14 +159,14 @@ def test_signs_change_nothing(pair):
     )
 
 
-def test_padding_changes_nothing(pair):
+def test_padding_has_no_effect(pair):
     functional_map, x, y = pair
     padded = recover_by_drift(functional_map, x.pad(210), y.pad(200), rank=RANK)
     np.testing.assert_array_equal(padded[:M], ORDER)
     assert (padded < N).all()
 
 
-def test_masked_points_change_nothing_wherever_they_lie():
+def test_masked_points_have_no_effect_at_the_start_or_at_the_end():
     x, y = (jnp.asarray(points) for points in deformed(noise=0.2))
     masked = coherent_point_drift(
         jnp.pad(x, ((0, 70), (0, 0)), constant_values=9.0),
@@ -181,7 +181,7 @@ def test_masked_points_change_nothing_wherever_they_lie():
 
 
 def test_refiner_recovers_by_drift(pair):
-    """`DriftRecovery` encodes by least squares and recovers by drift."""
+    """`DriftRecovery` computes functional maps by least squares, and pointwise maps by drift."""
     _, x, y = pair
     refiner = DriftRecovery(rank=LOW_RANK, drift_iterations=4)
     prepared = refiner.prepare(Problem(x, y))
@@ -198,8 +198,8 @@ def test_refiner_recovers_by_drift(pair):
         DriftRecovery(convention="pushforward")
 
 
-def test_never_stores_all_probabilities_or_kernels():
-    """50 000 x 50 000 numbers take 10 GB in float32; the compiled program needs less than 1/20."""
+def test_the_drift_stores_no_dense_matrix():
+    """A dense float32 matrix of 50 000 x 50 000 takes 10 GB. The program needs less than 1/20 of that."""
     points = jax.ShapeDtypeStruct((50_000, 30), jnp.float32)
     compiled = jax.jit(lambda x, y: coherent_point_drift(x, y, rank=100)).lower(points, points).compile()
     assert compiled.memory_analysis().temp_size_in_bytes < 500e6

@@ -1,4 +1,4 @@
-"""Creatures: symmetric bodies, sound triangles, natural poses, and exact ground truth."""
+"""Creatures have symmetric bodies, well-shaped triangles, natural poses and exact ground truth."""
 
 import igl
 import numpy as np
@@ -80,7 +80,7 @@ def test_right_joints_mirror_left_joints(kind, rest):
     np.testing.assert_allclose(body.posed(rest.vertices * _MIRROR, right), moved * _MIRROR, atol=1e-12)
 
 
-def test_triangles_are_sound(kind, pair, rest):
+def test_triangles_are_well_shaped(kind, pair, rest):
     assert len(pair.source.vertices) == 1200
     assert 0.95 * 1200 <= len(pair.target.vertices) <= 0.99 * 1200
     for mesh in (pair.source, pair.target):
@@ -93,12 +93,12 @@ def test_triangles_are_sound(kind, pair, rest):
     assert lengths.max() < 4 * np.median(lengths)
 
 
-def test_vertices_lie_on_the_skin(kind, rest):
+def test_vertices_lie_on_the_zero_set_of_the_signed_distance(kind, rest):
     assert np.abs(_grown(kind, 4).signed_distance(rest.vertices)).max() < 1e-3
 
 
 @pytest.mark.parametrize(("vertices", "seed"), [(500, 123456789), (733, 2**40)])
-def test_any_size_and_any_seed(kind, vertices, seed):
+def test_any_size_and_any_seed_give_a_topological_sphere(kind, vertices, seed):
     mesh = creature(kind, vertices=vertices, seed=seed)
     assert len(mesh.vertices) == vertices
     assert_sphere(mesh)
@@ -112,7 +112,7 @@ def test_a_body_with_a_handle_is_refused():
         _triangulated(body, 500, random)
 
 
-def test_the_same_seed_gives_the_same_bits():
+def test_the_same_seed_gives_identical_pairs():
     first, again = (creature_pair("biped", vertices=600, seed=7) for _ in range(2))
     for mesh, same in ((first.source, again.source), (first.target, again.target)):
         assert np.array_equal(mesh.vertices, same.vertices) and np.array_equal(mesh.faces, same.faces)
@@ -122,7 +122,7 @@ def test_the_same_seed_gives_the_same_bits():
 
 
 def test_another_seed_gives_another_individual(kind, rest):
-    """The proportions and the variation of the pose differ."""
+    """Another seed changes the proportions of the body and the variation of the pose."""
     assert np.abs(_grown(kind, 5).signed_distance(rest.vertices)).mean() > 0.005
     stand = _KINDS[kind][1]["stand"]
     angles = [_grown(kind, 4).angles(stand, _random(seed, "stand")) for seed in (4, 5)]
@@ -141,7 +141,7 @@ def test_poses_deform_the_body_without_stretching_it(kind, rest):
         assert 0.005 < change.mean() < 0.08 and np.quantile(change, 0.95) < 0.45
         area = igl.doublearea(vertices, rest.faces).sum() / igl.doublearea(rest.vertices, rest.faces).sum()
         assert 0.95 < area < 1.05
-        # Just outside the skin, the winding number is 0 unless the body intersects itself there.
+        # Just outside the surface, the winding number is 0 unless the body intersects itself there.
         outside = vertices + 1e-3 * igl.per_vertex_normals(vertices, rest.faces)
         assert (igl.fast_winding_number(vertices, rest.faces, outside) > 0.6).mean() < 0.01
 
@@ -154,8 +154,8 @@ def test_a_vertex_is_the_same_point_in_every_pose(kind, pair, rest):
     assert np.array_equal(stand.vertices, pair.source.vertices)
 
 
-def test_the_truth_is_true(kind, pair):
-    """The source vertices, deformed into the pose of the target, lie at the true points."""
+def test_the_ground_truth_follows_the_deformation(kind, pair):
+    """The source vertices in the pose of the target lie at the points of the ground truth."""
     m, size = len(pair.source.vertices), np.sqrt(pair.target.area)
     assert pair.truth.faces.shape == (m,) and pair.truth.weights.shape == (m, 3)
     assert pair.truth.faces.min() >= 0 and pair.truth.faces.max() < len(pair.target.faces)
@@ -174,7 +174,7 @@ def test_the_truth_is_true(kind, pair):
     assert (agreement < 0).mean() < 0.02 and np.median(agreement) > 0.95
 
 
-def test_the_truth_as_vertices(pair):
+def test_the_true_map_consists_of_the_nearest_corners(pair):
     corners = pair.target.faces[pair.truth.faces]
     assert (pair.true_map[:, None] == corners).any(axis=1).all()
     offsets = np.linalg.norm(
@@ -204,13 +204,13 @@ def test_the_two_meshes_have_nearly_the_same_spectrum(pair):
         ({"seed": -1}, "seed of a creature is -1: choose 0 or more"),
     ],
 )
-def test_bad_arguments(arguments, fault):
+def test_bad_arguments_are_refused(arguments, fault):
     with pytest.raises(InputError, match=fault):
         creature(**arguments)
     with pytest.raises(InputError, match=fault):
         creature_pair(**arguments)
 
 
-def test_unknown_pose():
+def test_an_unknown_pose_is_refused():
     with pytest.raises(InputError, match="'wave' of a quadruped is unknown: choose one of rest, stand"):
         creature("quadruped", pose="wave")

@@ -19,7 +19,7 @@ VERTICES, FACES = grid_mesh(4, 5)
 
 
 def put(path: Path, contents: str | None = None) -> None:
-    """Writes a file with the given contents, or a mesh with twenty vertices."""
+    """Write a file with the given contents, or a mesh with twenty vertices."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if contents is not None:
         path.write_text(contents)
@@ -126,7 +126,7 @@ def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout)
             pair.ground_truth(*meshes, mirrored=True)
 
 
-def test_lists_of_pairs_come_first(tmp_path):
+def test_lists_of_pairs_replace_the_pairs_of_the_layout(tmp_path):
     remeshed(tmp_path)
     put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
     data_set = open_data_set(tmp_path)
@@ -206,7 +206,7 @@ def test_unreadable_directories_are_named(tmp_path, monkeypatch):
         open_data_set(tmp_path)
 
 
-def test_the_mesh_folder_is_not_the_data_set(tmp_path):
+def test_the_mesh_folder_of_a_data_set_is_refused(tmp_path):
     remeshed(tmp_path)
     shutil.copytree(tmp_path / "off", tmp_path / "shapes")
     assert len(open_data_set(tmp_path).pairs) == 6
@@ -216,7 +216,7 @@ def test_the_mesh_folder_is_not_the_data_set(tmp_path):
         open_data_set(tmp_path / "off")
 
 
-def test_shapes_that_should_have_the_same_vertices(tmp_path):
+def test_shapes_with_different_numbers_of_vertices_are_refused(tmp_path):
     put(tmp_path / "cat0.off")
     write_mesh(tmp_path / "cat1.off", make_mesh(*grid_mesh(5, 5)))
     pair = open_data_set(tmp_path).pairs[0]
@@ -224,7 +224,7 @@ def test_shapes_that_should_have_the_same_vertices(tmp_path):
         pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
 
 
-def test_tosca_in_matlab_files(tmp_path):
+def test_shapes_of_tosca_are_read_from_matlab_files(tmp_path):
     put(tmp_path / "cat0.mat")
     mesh = read_mesh(tmp_path / "cat0.mat")
     np.testing.assert_array_equal(mesh.vertices, VERTICES)
@@ -233,7 +233,7 @@ def test_tosca_in_matlab_files(tmp_path):
     (tmp_path / "damaged.mat").write_bytes((tmp_path / "cat0.mat").read_bytes()[:200])
     (tmp_path / "text.mat").write_text("no MATLAB at all")
     for name, fault in (
-        ("other", "holds no struct 'surface'"),
+        ("other", "contains no struct 'surface'"),
         ("damaged", "is damaged"),
         ("text", "is damaged or not a .mat file"),
     ):
@@ -252,7 +252,7 @@ REAL = {
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_sets(shared, name):
+def test_real_data_sets_are_recognised(shared, name):
     layout, pairs = REAL[name]
     data_set = open_data_set(shared / "data" / name)
     assert data_set.layout == layout

@@ -1,6 +1,6 @@
 """README and docs: code blocks run from top to bottom, and commands and their options exist.
 
-Notebooks run when the site is built (`.ci/run`). That build also checks names, and links within the site.
+Notebooks run when the site is built (`.ci/run`). That build also checks names and links within the site.
 """
 
 import argparse
@@ -23,12 +23,12 @@ from jaxsmw.cli.parser import make_parser
 from jaxsmw.evaluation import GroundTruth
 
 ROOT = Path(__file__).parents[1]
-# The pages that people write. Scripts write the others.
+# The handwritten pages. Scripts generate all other pages.
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
 )
-# The smallest number of refinements that a page shows.
+# The smallest number of refinements that the code of a page computes.
 REFINEMENTS = {
     "README.md": 1,
     "docs/frames.md": 3,
@@ -110,7 +110,7 @@ def test_every_page_with_code_is_found():
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
-def test_commands_are_understood(page, monkeypatch):
+def test_commands_can_be_parsed(page, monkeypatch):
     def refuse(parser: argparse.ArgumentParser, message: str) -> None:
         raise ValueError(f"{page}: {parser.prog}: {message}")
 
@@ -122,7 +122,8 @@ def test_commands_are_understood(page, monkeypatch):
         elif arguments[0].startswith("scripts/"):
             script = ROOT / arguments[0]
             source = script.read_text("utf-8")
-            for module in re.findall(r"^from (\w+) import", source, flags=re.MULTILINE):  # scripts share code
+            # A script may import the options from a module that several scripts share.
+            for module in re.findall(r"^from (\w+) import", source, flags=re.MULTILINE):
                 if (shared := script.with_name(f"{module}.py")).exists():
                     source += shared.read_text("utf-8")
             for option in re.findall(r"--[\w-]+", command):
@@ -146,7 +147,7 @@ def test_links_lead_to_files(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         path = target.partition("#")[0]
         if path and not re.match(r"\w+:", path):
-            assert ((ROOT / page).parent / path).exists(), f"{page} leads to {target}, which is not there"
+            assert ((ROOT / page).parent / path).exists(), f"{page} links to {target}, which does not exist"
 
 
 def anchors(page: str) -> set[str]:
@@ -177,8 +178,8 @@ def test_the_research_log_has_the_tables_that_code_names():
         assert named <= tables, f"{path.name}: the research log has no {', '.join(sorted(named - tables))}"
 
 
-def test_annotations_mean_something():
-    """Every name in an annotation is imported, except types of matplotlib, for type checkers only."""
+def test_annotations_can_be_resolved():
+    """Every name in an annotation can be looked up, except types that only type checkers import."""
     resolved = 0
     for module in pkgutil.walk_packages(jaxsmw.__path__, "jaxsmw."):
         if module.name.startswith(("jaxsmw.report", "jaxsmw.cli", "jaxsmw.__main__")):

@@ -1,4 +1,4 @@
-"""Eigenbases: closed forms, an independent program, difficult meshes, and the approximate solver."""
+"""Eigenbases: known eigenvalues, results of an independent program, bad meshes, the approximate solver."""
 
 import warnings
 
@@ -36,8 +36,8 @@ def joined(*meshes: Mesh) -> Mesh:
     )
 
 
-def test_the_sphere_has_its_closed_form():
-    """Eigenvalues 4 pi l (l + 1) with multiplicity 2 l + 1 on the sphere of area 1, up to discretization."""
+def test_the_sphere_has_the_known_eigenvalues():
+    """The sphere of area 1 has eigenvalues 4 pi l (l + 1) with multiplicity 2 l + 1, up to discretization."""
     mesh = make_mesh(*sphere_mesh(4))
     spectrum = compute_spectrum(mesh, 49)
     exact = 4 * np.pi * np.concatenate([np.full(2 * l + 1, l * (l + 1)) for l in range(7)])  # noqa: E741
@@ -48,8 +48,8 @@ def test_the_sphere_has_its_closed_form():
     assert orthonormality(spectrum) < 1e-10
 
 
-def test_the_square_has_its_closed_form():
-    """Eigenvalues pi^2 (i^2 + j^2) on the unit square with a free boundary."""
+def test_the_square_has_the_known_eigenvalues():
+    """The unit square with a free boundary has the eigenvalues pi^2 (i^2 + j^2)."""
     spectrum = compute_spectrum(make_mesh(*grid_mesh(60, 60)), 20)
     i, j = np.mgrid[:8, :8]
     exact = np.sort((np.pi**2 * (i**2 + j**2)).ravel())[:20]
@@ -84,7 +84,7 @@ def test_results_are_reproducible_with_canonical_signs():
 
 
 def test_components_keep_all_multiplicities():
-    """Two spheres and a triangle: every eigenvalue of the sphere occurs twice, and zero three times."""
+    """With two spheres and a triangle, eigenvalues of the sphere occur twice, and zero occurs three times."""
     sphere = make_mesh(*sphere_mesh(3))
     triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
     mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
@@ -112,7 +112,7 @@ def test_unreferenced_vertices_are_masked():
 
 
 @pytest.mark.parametrize("k", [1, 2, 60, 160, 161])
-def test_few_and_nearly_all_eigenvectors(k):
+def test_few_and_nearly_all_eigenvectors_are_orthonormal(k):
     mesh = make_mesh(*sphere_mesh(2))
     assert orthonormality(compute_spectrum(mesh, k)) < 1e-9
 
@@ -132,7 +132,7 @@ def test_spectra_are_cached_by_content(monkeypatch, tmp_path):
         eigenpairs(make_mesh(vertices * 1.01, faces), 12)
 
 
-def test_tiny_mesh():
+def test_a_single_triangle_has_a_spectrum():
     spectrum = compute_spectrum(make_mesh(np.eye(3), [[0, 1, 2]]), 2)
     assert spectrum.eigenvalues[0] == 0 < spectrum.eigenvalues[1]
 
@@ -168,7 +168,7 @@ def test_nonmanifold_meshes_use_the_robust_laplacian():
     np.testing.assert_allclose(cotangent, robust, rtol=0.2, atol=1e-8)
 
 
-def test_zero_area_faces():
+def test_zero_area_faces_need_the_robust_laplacian():
     vertices, faces = grid_mesh(12, 12)
     # A triangle without area along a boundary edge, with its third corner on that edge.
     sliver = make_mesh(
@@ -179,7 +179,7 @@ def test_zero_area_faces():
         compute_spectrum(sliver, 20, laplacian="cotangent")
 
 
-def test_robust_laplacian_with_unreferenced_vertices():
+def test_the_robust_laplacian_ignores_unreferenced_vertices():
     vertices, faces = sphere_mesh(2)
     plain = compute_spectrum(make_mesh(vertices, faces), 10, laplacian="robust")
     gap = make_mesh(np.insert(vertices, 3, 9.0, axis=0), faces + (faces >= 3))
@@ -212,8 +212,11 @@ def test_inaccurate_solutions_are_retried_then_refused(monkeypatch):
 
 @pytest.mark.parametrize("k", [1, 2, 5, 30, 50])
 def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
-    """An icosahedral sphere has eigenvalues of multiplicity up to five; a single Krylov space has one copy."""
-    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
+    """An icosahedral sphere has eigenvalues of multiplicity up to five.
+
+    A single Krylov space contains only one copy of each eigenvalue.
+    """
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
     stiffness, areas = assemble_laplacian(make_mesh(*sphere_mesh(3)))
     mass = sp.diags(areas / areas.sum()).tocsc()
     exact = scipy.linalg.eigh(stiffness.toarray(), mass.toarray(), eigvals_only=True)
@@ -226,9 +229,9 @@ def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
 
 
 @pytest.mark.parametrize("length", [0.01, 1, 1000])
-def test_shapes_far_from_weyls_law(length, monkeypatch):
-    """On a thin strip, eigenvalues grow with the square of their index, and the shift must be corrected."""
-    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
+def test_eigenvalues_are_exact_on_shapes_far_from_weyls_law(length, monkeypatch):
+    """On a thin strip, eigenvalues grow with the square of their index, so the solver corrects the shift."""
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
     vertices, faces = grid_mesh(12, 60)
     vertices = (vertices + 0.003 * np.random.default_rng(0).normal(size=vertices.shape)) * [1, length, 1]
     mesh = make_mesh(vertices, faces)
@@ -239,7 +242,7 @@ def test_shapes_far_from_weyls_law(length, monkeypatch):
 
 
 def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
-    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("was needed"))
+    monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
     stiffness, areas = assemble_laplacian(bumpy_mesh(4))
     eigenvalues, _, _ = eigenpairs(bumpy_mesh(4), 100)
     exact = scipy.linalg.eigh(
@@ -250,7 +253,10 @@ def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
 
 @pytest.mark.parametrize("numbering", ["as subdivided", "at random"])
 def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
-    """Eigenvalues are up to 0.6 % too large; eigenvectors are orthonormal, reproducible, and span nearly the same."""
+    """Approximate eigenvalues are at most 0.6 % too large.
+
+    The approximate eigenvectors are orthonormal and reproducible, and they span nearly the same space.
+    """
     mesh = bumpy_mesh(5)
     if numbering == "at random":
         order = np.random.default_rng(1).permutation(len(mesh.vertices))
@@ -262,15 +268,15 @@ def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
     assert excess.min() > 0 and excess.max() < 0.006
     weighted = exact[2][:, None] * approximate[1]
     np.testing.assert_allclose(approximate[1].T @ weighted, np.eye(k), atol=1e-10)
-    # The last eigenvectors mix with those beyond the end.
+    # The last eigenvectors mix with eigenvectors beyond the end of the basis.
     inside = weighted.T @ exact[1][:, : k - 5]
     assert np.sqrt(1 - np.sum(inside**2, axis=0)).max() < 0.05
     np.testing.assert_array_equal(approximate[1], eigenpairs(mesh, k, eigensolver="approximate")[1])
 
 
 @pytest.mark.parametrize("subdivisions", [4, 5])
-def test_larger_cells_are_smoothed_more(subdivisions):
-    """Four times the vertices in the same number of dimensions give errors of the same size."""
+def test_the_approximation_error_does_not_grow_with_the_mesh(subdivisions):
+    """Errors do not grow with four times as many vertices in a subspace of the same dimension."""
     mesh = bumpy_mesh(subdivisions)
     exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
     np.testing.assert_allclose(approximate, exact, rtol=0.006)
@@ -284,7 +290,7 @@ def test_all_copies_of_a_multiple_eigenvalue_are_approximated():
 
 
 def graded_sphere(subdivisions):
-    """A sphere whose triangles are a hundred times as long at one end as at the other."""
+    """A sphere whose triangles are about twenty times as long at one end as at the other."""
     vertices, faces = sphere_mesh(subdivisions)
     vertices = vertices + np.array([0, 0, 0.9])
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
@@ -309,7 +315,7 @@ def stretched(factor):
     ids=["hubs", "graded", "stretched"],
 )
 def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
-    """The meshes have vertices with too many neighbors, triangles of very different sizes, or long triangles."""
+    """The meshes have vertices with many neighbors, triangles of very different sizes, or long triangles."""
     mesh = make_mesh(*shape)
     with pytest.warns(RuntimeWarning, match="cannot be approximated"):
         found = eigenpairs(mesh, 20, eigensolver="approximate")
@@ -317,8 +323,8 @@ def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
         np.testing.assert_array_equal(a, b)
 
 
-def refused(mesh, k):
-    """Whether the exact solver takes over; if it does not, the approximation must be accurate."""
+def falls_back(mesh, k):
+    """Return whether the exact solver takes over. If not, check that the approximation is accurate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
         approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
@@ -327,7 +333,7 @@ def refused(mesh, k):
     return bool(caught)
 
 
-# The radius of the cells is one edge, and three edges.
+# The radius of the cells is one edge in the first case, and three edges in the second case.
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])
 @pytest.mark.parametrize("factor", [1, 2, 4, 6, 20])
@@ -336,32 +342,32 @@ def test_an_approximation_is_accurate_or_refused(size, k, factor, noise):
     vertices = vertices * [1, factor, 1]
     edge = 1 / (size - 1)
     vertices = vertices + noise * edge * np.random.default_rng(0).normal(size=vertices.shape)
-    verdict = refused(make_mesh(vertices, faces), k)
+    verdict = falls_back(make_mesh(vertices, faces), k)
     if factor <= 2 or factor == 20:
         assert verdict == (factor == 20)
 
 
 @pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
 def test_a_region_of_bad_triangles_is_detected(factor):
-    """A sheet of even triangles, except that ten columns are longer by the factor."""
+    """The mesh is an even grid, except that ten columns of triangles are longer by `factor`."""
     (width, height), part = (100, 100), 10
     vertices, faces = grid_mesh(width, height)
     column = np.arange(len(vertices)) % width
     steps = np.where(np.arange(1, width) <= width - 1 - part, 1.0, factor)
     places = np.concatenate([[0], np.cumsum(steps)]) / (height - 1)
     stretched_sheet = np.stack([places[column], vertices[:, 1], vertices[:, 2]], axis=1)
-    assert not refused(make_mesh(stretched_sheet, faces), 40) or factor > 3
+    assert not falls_back(make_mesh(stretched_sheet, faces), 40) or factor > 3
 
 
 @pytest.mark.parametrize("k", [1, 2])
-def test_approximation_of_one_or_two_eigenvalues(k):
+def test_one_or_two_eigenvalues_are_approximated(k):
     mesh = bumpy_mesh(4)
     approximate, exact = (eigenpairs(mesh, k, eigensolver=s)[0] for s in ("approximate", "exact"))
     np.testing.assert_allclose(approximate, exact, rtol=0.01)
 
 
 @pytest.mark.parametrize("vertices", [(700, 3), (40, 40)])
-def test_the_shift_belongs_to_the_factors(vertices):
+def test_the_returned_shift_is_the_shift_of_the_factors(vertices):
     positions, faces = grid_mesh(*vertices)
     stiffness, areas = assemble_laplacian(make_mesh(positions * [1, 1000, 1], faces), laplacian="cotangent")
     mass = sp.diags(areas / areas.sum()).tocsc()
@@ -372,7 +378,7 @@ def test_the_shift_belongs_to_the_factors(vertices):
     )
 
 
-def test_the_choice_of_the_eigensolver(monkeypatch):
+def test_the_eigensolver_depends_on_the_option_and_the_size_of_the_mesh(monkeypatch):
     used = []
 
     def spy(name):
@@ -395,7 +401,7 @@ def test_the_choice_of_the_eigensolver(monkeypatch):
     assert used == ["_lanczos", "_lanczos", "_lanczos"]
     eigenpairs(mesh, 20)
     assert used[3:] == ["_approximate", "_lanczos"]
-    # In tests, the type checker raises first.
+    # In tests, the type checker raises before the library does.
     with pytest.raises(Exception, match="fast"):
         eigenpairs(mesh, 20, eigensolver="fast")
 

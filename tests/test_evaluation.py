@@ -1,4 +1,4 @@
-"""Ground truth in all formats, wrong files, and the errors and curves computed from ground truth."""
+"""Ground truth in all formats, bad files, and the errors and curves computed from ground truth."""
 
 import json
 
@@ -18,7 +18,7 @@ from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.io.map_files import read_landmarks, read_pointwise_map, write_pointwise_map
 
-# 4 and 9 vertices; 2 and 8 faces.
+# X has 4 vertices and 2 faces. Y has 9 vertices and 8 faces.
 X = make_mesh(*grid_mesh(2, 2), name="mesh_x")
 Y = make_mesh(*grid_mesh(3, 3), name="mesh_y")
 
@@ -30,7 +30,7 @@ def no_cache(monkeypatch):
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes a file and returns its path."""
+    """Return a function that writes a file and returns its path."""
 
     def write(name, content):
         path = tmp_path / name
@@ -41,7 +41,7 @@ def write(tmp_path):
 
 
 class TestReading:
-    def test_vts_pair(self, write):
+    def test_a_pair_of_vts_files_counts_from_1(self, write):
         paths = write("x.vts", "4\n1\n1\n"), write("y.vts", "9\r\n2\r\n3\r\n\r\n")
         truth = read_ground_truth(paths, X, Y)
         assert truth.source_vertices.tolist() == [3, 0, 0] and truth.targets.tolist() == [8, 1, 2]
@@ -51,7 +51,7 @@ class TestReading:
         truth = read_ground_truth(paths, X, Y)
         assert truth.source_vertices.tolist() == [3, 0, 0] and truth.targets.tolist() == [8, 1, 2]
 
-    def test_one_column(self, write):
+    def test_one_column_has_a_match_for_each_vertex(self, write):
         path = write("truth.txt", "  8\n 1 \n1e0\n2.0")
         truth = read_ground_truth(path, X, Y)
         assert truth.source_vertices.tolist() == [0, 1, 2, 3] and truth.targets.tolist() == [8, 1, 1, 2]
@@ -71,7 +71,7 @@ class TestReading:
         ):
             read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
 
-    def test_two_columns(self, write):
+    def test_two_columns_are_pairs_of_vertices(self, write):
         path = write("kid01_ref.txt", "\ufeff     1      9 \n     4      1 \n")
         truth = read_ground_truth(path, X, Y)
         assert truth.source_vertices.tolist() == [0, 3] and truth.targets.tolist() == [8, 0]
@@ -80,7 +80,7 @@ class TestReading:
         assert truth.source_vertices.tolist() == [0, 3] and truth.targets.tolist() == [8, 0]
 
     @pytest.mark.parametrize("suffix", ["baryc_gt", "baryc_gt_sym"])
-    def test_barycentric(self, write, suffix):
+    def test_barycentric_files_give_surface_points(self, write, suffix):
         lines = "   8.0000000e+00   -1.4e-16  2.5e-01   7.5e-01\n1 1 0 0\n2 .25 .5 .25\n1 0.33333 0.33333 0.33333\n"
         truth = read_ground_truth(write(f"part.{suffix}", lines), X, Y)
         assert truth.source_vertices.tolist() == [0, 1, 2, 3]
@@ -89,7 +89,7 @@ class TestReading:
         np.testing.assert_allclose(truth.targets.weights, expected, rtol=1e-12)
         assert (truth.targets.weights >= 0).all()
 
-    def test_barycentric_where_cleaning_dropped_faces(self, write):
+    def test_barycentric_files_also_count_dropped_faces(self, write):
         vertices, faces = grid_mesh(3, 3)
         doubled = np.concatenate([faces[:3], faces[2:3, ::-1], faces[3:], faces[:1]])
         mesh = make_mesh(vertices, doubled, name="doubled")
@@ -144,20 +144,20 @@ class TestReading:
         assert [line.split()[0] for line in path.read_text().splitlines()] == ["1", "4", "10", "5"]
         assert (read_ground_truth(path, X, repeated).targets.faces == points.faces).all()
 
-    def test_landmarks(self, write):
+    def test_landmarks_are_pairs_of_vertices(self, write):
         path = write("landmarks.txt", "0 8\n3 0\n")
         assert read_landmarks(path, X, Y).tolist() == [[0, 8], [3, 0]]
         assert read_landmarks(write("l.txt", "4 1"), X, Y, index_base=1).tolist() == [[3, 0]]
         for content, message in (
-            ("0\n", "has 1 number where 2"),
+            ("0\n", "has 1 number instead of 2"),
             ("4 0\n", "4 is not one .* of mesh_x"),
-            ("0 8\n3,0\n", "line 2: '3,0' is not a number: separate numbers by spaces, not by ','"),
+            ("0 8\n3,0\n", "line 2: '3,0' is not a number: separate numbers with spaces, not with ','"),
             ("1_0 8\n", "line 1: '1_0' is not a number: correct the line"),
         ):
             with pytest.raises(InputError, match=message):
                 read_landmarks(write("l.txt", content), X, Y)
 
-    def test_real_files(self, shared):
+    def test_real_files_are_read(self, shared):
         data = shared / "data"
 
         def mesh(path):
@@ -199,13 +199,13 @@ class TestBadFiles:
             (b"\x89PNG\r\n\x1a\n\xff\xfe", "is not a text file"),
             ("1\n2\n3\n", "has 3 lines, but one is needed for each of the 4 vertices"),
             ("1\n2\n3\n4\n5\n", "has 5 lines"),
-            ("1\n\n3\n4\n", "line 2: has 0 numbers where 1 should be"),
-            ("1\n2 3\n3\n4\n", "line 2: has 2 numbers where 1"),
+            ("1\n\n3\n4\n", "line 2: has 0 numbers instead of 1"),
+            ("1\n2 3\n3\n4\n", "line 2: has 2 numbers instead of 1"),
             ("1\n2\n3.5\n4\n", "line 3: 3.5 is not one of the vertices of"),
             ("1\n2\n-3\n4\n", "line 3: -3 is not one of"),
             ("1\n9\n3\n4\n", "line 2: 9 is not one of .*looks 1-based: pass index_base=1 .--index-base 1."),
-            ("0\n9\n3\n4\n", "line 2: 9 is not one of .*0 to 8: correct it"),
-            ("1\n2\n3\n12\n", "line 4: 12 is not one of .*0 to 8: correct it"),
+            ("0\n9\n3\n4\n", "line 2: 9 is not one of .*0 to 8: correct the number"),
+            ("1\n2\n3\n12\n", "line 4: 12 is not one of .*0 to 8: correct the number"),
             ("1\n2\n3\n99999999999999999999999999\n", "line 4: 9999999999.* is not one of"),
             ("1\n2\n3\n1e999\n", "line 4: 1e999 is not one of"),
             ("1\n2\nnan\n4\n", "line 3: 'nan' is not a number"),
@@ -213,17 +213,17 @@ class TestBadFiles:
             ("1\n2\n0x3\n4\n", "line 3: '0x3' is not a number"),
             ("1\n2\n1_0\n4\n", "line 3: '1_0' is not a number"),
             ("1\n2\n٣\n4\n", "line 3: '.u0663' is not a number"),
-            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number: separate numbers by spaces, not by ','"),
-            ("1;2\n2\n3\n4\n", "line 1: '1;2' is not a number: separate numbers by spaces, not by ';'"),
+            ("1,\n2,\n3,\n4\n", "line 1: '1,' is not a number: separate numbers with spaces, not with ','"),
+            ("1;2\n2\n3\n4\n", "line 1: '1;2' is not a number: separate numbers with spaces, not with ';'"),
             ("vertex\n1\n2\n3\n4", "line 1: 'vertex' is not a number"),
         ],
     )
-    def test_pointwise_maps(self, write, content, message):
+    def test_bad_pointwise_maps_are_refused(self, write, content, message):
         path = write("bad.map", content)
         with pytest.raises(InputError, match=message) as raised:
             read_pointwise_map(path, X, Y)
         assert str(raised.value).startswith(str(path))
-        with pytest.raises(InputError, match=message if "numbers where" not in message else None):
+        with pytest.raises(InputError, match=message if "numbers instead" not in message else None):
             read_ground_truth(path, X, Y)
 
     @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ class TestBadFiles:
         [
             ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
             ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a file with one per line"),
-            ("t.txt", "1 2\n3\n", "line 2: has 1 number where 2 should be"),
+            ("t.txt", "1 2\n3\n", "line 2: has 1 number instead of 2"),
             (
                 "t.txt",
                 "1 9\n5 1\n",
@@ -240,7 +240,7 @@ class TestBadFiles:
             ("t.txt", "1 9\n4 10\n", "line 2: 10 is not one of the vertices of mesh_y, .* 1 to 9: correct"),
             ("t.txt", "0 8\n3 1\n", "line 1: 0 is not one of .*looks 0-based: pass index_base=0"),
             ("t.baryc_gt", "1 1 0 0\n" * 3, "has 3 lines, but one is needed for each of the 4 .*of mesh_x"),
-            ("t.baryc_gt", "1 1 0\n" * 4, "line 1: has 3 numbers where 4 should be"),
+            ("t.baryc_gt", "1 1 0\n" * 4, "line 1: has 3 numbers instead of 4"),
             ("t.baryc_gt", "1 1 0 0\n" * 3 + "9 1 0 0\n", "line 4: 9 is not one of the faces of mesh_y"),
             (
                 "t.baryc_gt",
@@ -248,28 +248,28 @@ class TestBadFiles:
                 "line 4: 0 is not one of the faces .*looks 0-based",
             ),
             ("t.baryc_gt", "1 1 0 0\n" * 3 + "1.5 1 0 0\n", "line 4: 1.5 is not one of the faces"),
-            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 .5 .4 0\n", "line 4: .5 .4 0 are no barycentric weights"),
-            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 2 -1 0\n", "line 4: 2 -1 0 are no barycentric weights"),
-            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 1e999 0 0\n", "line 4: 1e999 0 0 are no barycentric"),
+            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 .5 .4 0\n", "line 4: .5 .4 0 are not barycentric weights"),
+            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 2 -1 0\n", "line 4: 2 -1 0 are not barycentric weights"),
+            ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 1e999 0 0\n", "line 4: 1e999 0 0 are not barycentric"),
             ("t.baryc_gt", "1 1 0 0\n" * 3 + "1 NaN 0 1\n", "line 4: 'NaN' is not a number"),
         ],
     )
-    def test_ground_truth(self, write, name, content, message):
+    def test_bad_ground_truth_is_refused(self, write, name, content, message):
         with pytest.raises(InputError, match=message):
             read_ground_truth(write(name, content), X, Y)
 
-    def test_pairs(self, write):
+    def test_bad_pairs_of_files_are_refused(self, write):
         one, two = write("x.vts", "1\n2\n"), write("y.vts", "1\n2\n3\n")
         with pytest.raises(InputError, match=r"y.vts: has 3 lines where .*x.vts has 2"):
             read_ground_truth([one, two], X, Y)
-        with pytest.raises(InputError, match=r"x.vts, line 1: has 2 numbers where 1"):
+        with pytest.raises(InputError, match=r"x.vts, line 1: has 2 numbers instead of 1"):
             read_ground_truth([write("x.vts", "1 2\n2 3\n"), one], X, Y)
         with pytest.raises(InputError, match="3 files were given"):
             read_ground_truth([one, two, two], X, Y)
         with pytest.raises(InputError, match=r"y.vts, line 1: 9 is not one of the vertices of mesh_x"):
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
-    def test_files_that_cannot_be_read_or_written(self, tmp_path):
+    def test_files_that_cannot_be_read_or_written_are_refused(self, tmp_path):
         with pytest.raises(InputError, match="missing: does not exist"):
             read_pointwise_map(tmp_path / "missing", X, Y)
         with pytest.raises(InputError, match="is not a regular file"):
@@ -302,7 +302,7 @@ class TestGeodesicError:
         vertices = generator.integers(0, 9, 4)
         assert geodesic_error(Y, vertices, GroundTruth.of_all_vertices(vertices)).mean == 0
 
-    def test_points_on_faces(self):
+    def test_errors_are_measured_between_points_on_faces(self):
         centre = SurfacePoints(np.array([0, 7]), np.full((2, 3), 1 / 3))
         where = centre.positions(Y)
         truth = GroundTruth(np.array([1, 0]), centre)
@@ -312,7 +312,7 @@ class TestGeodesicError:
         swapped = geodesic_error(Y, centre, GroundTruth(np.array([0, 1]), np.array([0, 8])))
         np.testing.assert_allclose(swapped.errors, expected, rtol=0.01)
 
-    def test_methods(self, shared):
+    def test_both_methods_agree_with_reference_distances(self, shared):
         mesh = read_mesh(shared / "data/faust_r/off/tr_reg_007.off")
         reference = np.load(shared / "oracle/faust_r_007_geodesics.npz")
         targets = reference["source_vertices"][:6]
@@ -325,7 +325,7 @@ class TestGeodesicError:
         np.testing.assert_allclose(strips.errors, expected, rtol=0.005)
         assert exact.method == "exact" and (strips.errors != exact.errors).any()
 
-    def test_other_components_are_told_apart(self):
+    def test_matches_on_another_component_are_unreachable(self):
         vertices, faces = grid_mesh(3, 3)
         twins = make_mesh(np.concatenate([vertices, vertices + 5]), np.concatenate([faces, faces + 9]))
         truth = GroundTruth.of_all_vertices(np.array([0, 0, 9, 9]))
@@ -338,7 +338,7 @@ class TestGeodesicError:
         assert nowhere.unreachable == 1 and nowhere.mean == nowhere.median == np.inf
         assert nowhere.area_under_curve() == 0
 
-    def test_samples(self):
+    def test_samples_are_reproducible_rows_without_replacement(self):
         truth = GroundTruth(np.arange(9).repeat(10), np.tile(np.arange(9), 10))
         pointwise_map = np.arange(9)
         everything = geodesic_error(Y, pointwise_map, truth)
@@ -365,7 +365,8 @@ class TestGeodesicError:
         expected = geodesic_error(
             make_mesh(vertices, faces), pointwise_map, GroundTruth.of_all_vertices(targets)
         )
-        x, y = generator.permutation(20), generator.permutation(36)  # vertex i becomes x[i], y[i]
+        # Vertex i of X gets the number x[i], and vertex i of Y gets the number y[i].
+        x, y = generator.permutation(20), generator.permutation(36)
         renumbered_map, moved = np.empty(20, dtype=np.int64), np.empty_like(vertices)
         renumbered_map[x], moved[y] = y[pointwise_map], vertices
         result = geodesic_error(make_mesh(moved, y[faces]), renumbered_map, GroundTruth(x, y[targets]))
@@ -397,7 +398,7 @@ class TestStatistics:
     def error(self, values) -> GeodesicError:
         return GeodesicError(np.array(values, dtype=np.float64), np.arange(len(values)), "strips")
 
-    def test_curve_by_hand(self):
+    def test_curve_of_a_small_example(self):
         error = self.error([0.3, 0.0, 0.1, 0.1, np.inf])
         curve = error.correspondence_quality_curve([0.0, 0.05, 0.1, 0.2, 0.3, 1e9])
         np.testing.assert_array_equal(curve, [0.2, 0.2, 0.6, 0.6, 0.8, 0.8])
@@ -411,7 +412,7 @@ class TestStatistics:
         heights = error.correspondence_quality_curve(steps[:-1])
         assert error.area_under_curve(largest) == pytest.approx((heights * np.diff(steps)).sum() / largest)
 
-    def test_as_text_and_as_json(self):
+    def test_text_and_json_contain_all_figures(self):
         error = self.error([0.1, 0.2, np.inf, 0.0])
         assert str(error) == (
             "mean 0.10000, median 0.15000, 25.0% within 0.02, 25.0% within 0.05, 50.0% within 0.1, area under the "
@@ -433,14 +434,14 @@ class TestStatistics:
         nothing = self.error([np.inf]).as_dictionary()
         assert nothing["mean"] is None and nothing["median"] is None
 
-    def test_bounds_of_the_area(self):
+    def test_area_under_curve_lies_between_0_and_1(self):
         assert self.error([0, 0]).area_under_curve() == 1
         assert self.error([0.25, 3]).area_under_curve() == 0
         assert self.error([0.125]).area_under_curve() == 0.5
         with pytest.raises(InputError, match="largest threshold"):
             self.error([0]).area_under_curve(0.0)
 
-    def test_coverage(self):
+    def test_coverage_is_the_area_of_matched_vertices(self):
         assert coverage(Y, np.arange(9)) == pytest.approx(1)
         np.testing.assert_allclose(coverage(Y, [4, 4, 4]), Y.vertex_areas[4])
         np.testing.assert_allclose(coverage(Y, [0, 8, 0]), Y.vertex_areas[[0, 8]].sum())
@@ -449,8 +450,8 @@ class TestStatistics:
 
 
 def test_errors_agree_with_published_errors_of_the_same_maps(shared):
-    # The published means are over 1000 chosen vertices, with exact distances. Our means are over other rows of the
-    # same ground truth, so only the sampling differs.
+    # The published means are over 1000 selected vertices, with exact distances. Here the means are over other
+    # rows of the same ground truth, so the difference is mainly a sampling error.
     published = {
         ("002", "007"): {
             "T0": 362,
@@ -480,7 +481,7 @@ def test_errors_agree_with_published_errors_of_the_same_maps(shared):
                 assert abs(errors.mean() - mean) < 3.5 * standard_error, (a, b, name)
 
 
-def test_vertices_without_ground_truth_take_that_of_the_nearest_vertex():
+def test_vertices_without_ground_truth_take_the_match_of_the_nearest_vertex():
     mesh = bumpy_mesh(2)
     known = np.arange(0, 162, 2)
     found = GroundTruth(known, known + 1).everywhere(mesh)

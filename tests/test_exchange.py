@@ -1,6 +1,7 @@
 """Exchange with other libraries and with MATLAB: results agree on both sides, and bad input is refused.
 
-Stand-ins replace packages that are not installed; `pip install '.[peers]' pyvista` installs all packages.
+Tests of packages that are not installed are skipped. Stand-ins for pyvista and geomfum are always tested.
+`pip install '.[peers]' pyvista` installs all packages.
 """
 
 import subprocess
@@ -46,7 +47,7 @@ def pointwise_map(bodies) -> np.ndarray:
 
 
 def same_spectrum(a: Spectrum, b: Spectrum, *, tolerance: float = 1e-6) -> None:
-    """Equal up to eigenvectors' signs."""
+    """Check that two spectra are equal up to the signs of eigenvectors."""
     np.testing.assert_allclose(a.eigenvalues, b.eigenvalues, rtol=tolerance, atol=tolerance)
     np.testing.assert_allclose(a.vertex_areas, b.vertex_areas, rtol=tolerance, atol=1e-12)
     signs = np.sign(np.sum(np.asarray(a.eigenvectors * b.eigenvectors), axis=0))
@@ -169,14 +170,14 @@ def test_vertices_without_area_are_masked(spectra):
     same_spectrum(found, padded, tolerance=1e-12)
 
 
-def test_spectra_are_of_the_default_float_type():
+def test_spectra_have_the_default_float_type():
     given = random_spectrum(30, 5)
     arrays = map(np.asarray, (given.eigenvalues, given.eigenvectors, given.vertex_areas))
     with jax.enable_x64(False):
         assert make_spectrum(*arrays).eigenvectors.dtype == jnp.float32
 
 
-def test_spectrum_of_pyfm(bodies, spectra):
+def test_the_spectrum_of_pyfm_equals_ours(bodies, spectra):
     for body, ours in zip(bodies, spectra, strict=True):
         theirs = as_pyfm(body)
         with pytest.raises(InputError, match="no eigenvectors yet"):
@@ -187,7 +188,7 @@ def test_spectrum_of_pyfm(bodies, spectra):
 
 
 @pytest.mark.parametrize("use_k", [K, 5])
-def test_spectrum_of_geomfum(bodies, spectra, use_k):
+def test_the_spectrum_of_geomfum_equals_ours(bodies, spectra, use_k):
     laplacian = pytest.importorskip("geomfum.laplacian", reason="pip install geomfum")
     for body, ours in zip(bodies, spectra, strict=True):
         theirs = as_geomfum(body)
@@ -197,7 +198,7 @@ def test_spectrum_of_geomfum(bodies, spectra, use_k):
         same_spectrum(make_spectrum(theirs), ours.truncate(use_k))
 
 
-def test_spectrum_of_a_stand_in_for_geomfum(spectra):
+def test_the_spectrum_of_a_stand_in_for_geomfum_is_read(spectra):
     ours = spectra[0].scale(9.0)
     shape = SimpleNamespace(
         basis=SimpleNamespace(vals=np.asarray(ours.eigenvalues), vecs=np.asarray(ours.eigenvectors)),
@@ -208,7 +209,7 @@ def test_spectrum_of_a_stand_in_for_geomfum(spectra):
 
 @pytest.mark.filterwarnings("ignore:Sparse CSC tensor support")
 @pytest.mark.parametrize("layout", ["sparse_csc", "sparse_coo", "strided", "gradient"])
-def test_tensors_of_pytorch(bodies, spectra, layout):
+def test_tensors_of_pytorch_are_accepted(bodies, spectra, layout):
     torch = pytest.importorskip("torch", reason="pip install geomfum")
     ours = spectra[0].scale(4.0)
     values, vectors, areas = (
@@ -246,8 +247,8 @@ BAD_SPECTRA = {
     "complex": ((VALUES * 1j, VECTORS, AREAS), "eigenvalues are not an array of real numbers"),
     "words": ((["a", "b", "c"], VECTORS, AREAS), "eigenvalues are not an array of real numbers"),
     "not finite": ((VALUES, VECTORS * np.nan, AREAS), "eigenvectors are not all finite"),
-    "negative areas": ((VALUES, VECTORS, -AREAS), "vertex areas are negative"),
-    "no area": ((VALUES, VECTORS, 0 * AREAS), "or all zero"),
+    "negative areas": ((VALUES, VECTORS, -AREAS), "some vertex areas are negative"),
+    "no area": ((VALUES, VECTORS, 0 * AREAS), "or all are zero"),
     "negative semi-definite": ((-VALUES[::-1], VECTORS, AREAS), "change its sign"),
     "descending": ((VALUES[::-1], VECTORS, AREAS), "do not ascend"),
     "areas of another unit": ((VALUES, VECTORS, 100 * AREAS), "not orthonormal"),
@@ -286,7 +287,7 @@ def test_maps_of_pyfm_equal_ours(spectra, pointwise_map):
     )
 
 
-def test_zoomout_of_pyfm_in_our_basis(spectra, pointwise_map):
+def test_zoomout_of_pyfm_equals_ours_in_our_basis(spectra, pointwise_map):
     refine = pytest.importorskip("pyFM.refine", reason="pip install pyfmaps")
     x, y = spectra
     first = encode(jnp.asarray(pointwise_map), x.truncate(4), y.truncate(4))
@@ -306,8 +307,8 @@ def test_zoomout_of_pyfm_in_our_basis(spectra, pointwise_map):
     np.testing.assert_array_equal(points, decode(ours, x, y))
 
 
-def test_maps_between_pyfm_meshes_in_any_unit(bodies, pointwise_map):
-    """A factor, given by `make_spectrum`, converts such a map into a map between spectra of area 1."""
+def test_maps_between_pyfm_meshes_differ_from_ours_by_a_known_factor(bodies, pointwise_map):
+    """The factor sqrt(a_Y / a_X) converts a map of pyFM into a map between spectra of area 1."""
     functional = pytest.importorskip("pyFM.functional", reason="pip install pyfmaps")
     convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
     x, y = (as_pyfm(body).process(K) for body in bodies)
@@ -315,7 +316,7 @@ def test_maps_between_pyfm_meshes_in_any_unit(bodies, pointwise_map):
     ours = encode(jnp.asarray(pointwise_map), make_spectrum(x), make_spectrum(y))
     np.testing.assert_allclose(theirs * np.sqrt(y.area / x.area), ours, atol=1e-10)
     assert abs(y.area / x.area - 1) > 1
-    # Between meshes of area 1, the maps are equal, and so are the pointwise maps of both libraries.
+    # Between meshes of area 1, both libraries have equal functional maps and equal pointwise maps.
     x, y = x.area_normalize(), y.area_normalize()
     model = functional.FunctionalMapping(y, x)
     model.FM_12 = np.asarray(ours)
@@ -340,7 +341,7 @@ def test_maps_of_geomfum_equal_ours(spectra, pointwise_map):
 # --------------------------------------------------------------------------------------- .npy files
 
 
-def test_maps_in_npy_files(tmp_path, bodies):
+def test_maps_are_written_and_read_as_npy_files(tmp_path, bodies):
     x, y = bodies
     pointwise_map = np.random.default_rng(0).integers(0, len(y.vertices), len(x.vertices))
     path = tmp_path / "map.npy"
@@ -359,17 +360,20 @@ def test_maps_in_npy_files(tmp_path, bodies):
 @pytest.mark.parametrize(
     ("contents", "fault"),
     [
-        (np.zeros((3, 2), int), "holds int64 of shape .3, 2.: give the file with a list of numbers"),
-        (np.zeros(0, int), "holds int64 of shape .0,.: give"),
-        (np.zeros((1, 0), int), "holds int64 of shape .1, 0.: give"),
-        (np.array(["a", "b"]), "holds <U1 of shape"),
-        (np.array([None, 1]), "is not an array that NumPy saved"),
-        (np.zeros(3, complex), "holds complex128 of shape"),
+        (
+            np.zeros((3, 2), int),
+            "contains an array of type int64 and shape .3, 2.: give a file with a list of numbers",
+        ),
+        (np.zeros(0, int), "contains an array of type int64 and shape .0,.: give"),
+        (np.zeros((1, 0), int), "contains an array of type int64 and shape .1, 0.: give"),
+        (np.array(["a", "b"]), "contains an array of type <U1 and shape"),
+        (np.array([None, 1]), "is not an array saved by NumPy"),
+        (np.zeros(3, complex), "contains an array of type complex128 and shape"),
         (np.zeros(3), "has 3 rows, but one is needed"),
-        (None, "is not an array that NumPy saved"),
+        (None, "is not an array saved by NumPy"),
     ],
 )
-def test_hostile_arrays(tmp_path, bodies, contents, fault):
+def test_hostile_arrays_are_refused(tmp_path, bodies, contents, fault):
     path = tmp_path / "map.npy"
     if contents is None:
         path.write_text("0\n1\n")
@@ -379,7 +383,7 @@ def test_hostile_arrays(tmp_path, bodies, contents, fault):
         jaxsmw.read_pointwise_map(path, *bodies)
 
 
-def test_hostile_headers_of_arrays(tmp_path, bodies):
+def test_hostile_headers_of_arrays_are_refused(tmp_path, bodies):
     path = tmp_path / "map.npy"
     huge = b"{'descr': '<i8', 'fortran_order': False, 'shape': (10000000000000,)}\n"
     np.savez(tmp_path / "maps.npz", np.zeros(3))
@@ -387,7 +391,7 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
     started = b"\x93NUMPY\x01\x00"
     for data in (archive, *(started + len(h).to_bytes(2, "little") + h for h in (huge, b"(" * 3000, b""))):
         path.write_bytes(data)
-        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is not an array that NumPy saved"):
+        with pytest.raises(jaxsmw.InputError, match=r"map\.npy: is not an array saved by NumPy"):
             jaxsmw.read_pointwise_map(path, *bodies)
     path.unlink()
     with pytest.raises(jaxsmw.InputError, match=r"map\.npy: does not exist: check the path"):
@@ -398,14 +402,14 @@ def test_hostile_headers_of_arrays(tmp_path, bodies):
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".npz"])
-def test_spectra_survive_files(bodies, spectra, tmp_path, suffix):
+def test_spectra_survive_a_round_trip_through_files(bodies, spectra, tmp_path, suffix):
     for body, spectrum in zip(bodies, spectra, strict=True):
         path = tmp_path / f"body{suffix}"
         jaxsmw.io.write_spectrum(path, spectrum.scale(4.0), body)
         same_spectrum(jaxsmw.io.read_spectrum(path), spectrum, tolerance=1e-12)
 
 
-def test_a_shape_for_matlab(bodies, spectra, tmp_path):
+def test_a_shape_for_matlab_has_consistent_fields(bodies, spectra, tmp_path):
     body, spectrum = bodies[0], spectra[0]
     jaxsmw.io.write_spectrum(tmp_path / "x.mat", spectrum, body)
     shape = scipy.io.loadmat(tmp_path / "x.mat", squeeze_me=False)["S"][0, 0]
@@ -416,7 +420,7 @@ def test_a_shape_for_matlab(bodies, spectra, tmp_path):
     surface = shape["surface"][0, 0]
     assert surface["X"].shape == (n, 1) and surface["TRIV"].dtype == np.float64
     np.testing.assert_array_equal(surface["TRIV"], body.faces + 1)
-    # All fields describe the surface of the spectrum.
+    # All fields describe the surface that was scaled to area 1, like the spectrum.
     mesh = jaxsmw.read_mesh(tmp_path / "x.mat")
     np.testing.assert_allclose(mesh.area, shape["area"].item(), rtol=1e-12)
     np.testing.assert_allclose(mesh.vertex_areas, shape["A"].diagonal(), rtol=1e-9)
@@ -430,7 +434,7 @@ def mat_file(path: Path, **variables: object) -> Path:
 
 @pytest.mark.parametrize("form", ["sparse", "diagonal", "row"])
 @pytest.mark.parametrize("nested", [False, True])
-def test_shapes_of_other_matlab_code(spectra, tmp_path, form, nested):
+def test_shapes_of_other_matlab_code_are_read(spectra, tmp_path, form, nested):
     spectrum = spectra[0].scale(30.0)
     areas = np.asarray(spectrum.vertex_areas)
     field = {"sparse": {"A": sp.diags_array(areas)}, "diagonal": {"A": areas}, "row": {"area": areas[None]}}[
@@ -465,7 +469,7 @@ def test_matlab_code_can_use_our_files(bodies, spectra, pointwise_map, tmp_path)
 
 
 @pytest.mark.parametrize("shape", ["column", "row"])
-def test_pointwise_maps_of_other_matlab_code(bodies, pointwise_map, tmp_path, shape):
+def test_pointwise_maps_of_other_matlab_code_are_read(bodies, pointwise_map, tmp_path, shape):
     table = (pointwise_map + 1)[:, None] if shape == "column" else (pointwise_map + 1)[None]
     x, y = bodies
     for variables in (
@@ -482,7 +486,7 @@ def test_pointwise_maps_of_other_matlab_code(bodies, pointwise_map, tmp_path, sh
     np.testing.assert_array_equal(read, pointwise_map)
 
 
-def test_pairs_of_vertices_in_mat_files(bodies, pointwise_map, tmp_path):
+def test_pairs_of_vertices_in_mat_files_are_read(bodies, pointwise_map, tmp_path):
     x, y = bodies
     pairs = np.stack([np.arange(9), pointwise_map[:9]], axis=1)
     path = mat_file(tmp_path / "pairs.mat", pairs=pairs + 1)
@@ -540,8 +544,8 @@ BAD_VARIABLES = {
     "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but one is needed for each of the 642"),
     "map of fractions": ("pointwise map", {"T12": np.full(M, 1.5)}, "row 1: 1.5 is not one of"),
     "map of NaN": ("pointwise map", {"T12": np.full(M, np.nan)}, "row 1: nan is not one of"),
-    "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "holds 'T12', but no list of numbers"),
-    "two maps": ("pointwise map", {"a": np.ones(M), "b": np.ones(M)}, "more than one list of numbers, a, b: save the right one as T12"),
+    "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "contains 'T12', but no list of numbers"),
+    "two maps": ("pointwise map", {"a": np.ones(M), "b": np.ones(M)}, "more than one list of numbers .a, b.: save the right one as T12"),
     "no variable": ("pointwise map", {}, "is empty"),
     "words": ("pointwise map", {"T12": "one two"}, "no list of numbers"),
     "complex": ("functional map", {"C21": np.eye(3) * 1j}, "no matrix"),
@@ -551,19 +555,19 @@ BAD_VARIABLES = {
     "complex positions": ("mesh", {"VERT": np.eye(4, 3) + 1j, "TRIV": SURFACE["TRIV"]}, "VERT is not an array of real numbers"),
     "complex faces": ("mesh", {"surface": {**SURFACE, "TRIV": SURFACE["TRIV"] + 1j}}, "surface.TRIV is not an array of real numbers"),
     "words for coordinates": ("mesh", {"surface": {**SURFACE, "X": "abcd"}}, "surface.X is not an array of real numbers"),
-    "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"is \(12, 13\), but .* at most \(12, 12\): compute more eigenvectors"),
+    "too large": ("functional map", {"C21": np.ones((K, K + 1))}, r"has shape \(12, 13\), but .* at most \(12, 12\): compute more eigenvectors"),
     "infinite": ("functional map", {"C21": np.full((3, 3), np.inf)}, "not finite"),
     "two matrices": ("functional map", {"C12": np.eye(3), "C": np.eye(4)}, "save the right one as C21"),
     "no basis": ("spectrum", {"S": {"evals": np.arange(3.0)}}, "no evals and evecs"),
-    "two bases": ("spectrum", {"S1": BASIS, "S2": BASIS}, "holds 2 eigenbases, S1, S2"),
-    "no areas": ("spectrum", BASIS, "has evecs but no areas"),
-    "one area": ("spectrum", {**BASIS, "area": 3.0}, "has evecs but no areas"),
+    "two bases": ("spectrum", {"S1": BASIS, "S2": BASIS}, r"contains 2 eigenbases \(S1, S2\)"),
+    "no areas": ("spectrum", BASIS, "contains evecs but no areas"),
+    "one area": ("spectrum", {**BASIS, "area": 3.0}, "contains evecs but no areas"),
     "areas of another shape": ("spectrum", {**BASIS, "A": np.ones(7)}, "do not fit each other"),
     "another mass matrix": ("spectrum", {**BASIS, "A": np.full(8, 2.0)}, "not orthonormal"),
     "no faces": ("mesh", {"surface": {"X": np.ones(4)}}, "no struct 'surface' with X, Y, Z"),
     "no coordinates": ("mesh", {"surface": {"TRIV": np.ones((4, 3))}}, "no struct 'surface' with X, Y, Z"),
     "coordinates of other lengths": ("mesh", {"S": {"surface": {**SURFACE, "Z": np.ones(5)}}}, "no struct 'surface' with X, Y, Z"),
-    "two shapes": ("mesh", {"S1": {"surface": SURFACE}, "S2": {"surface": SURFACE}}, "holds 2 shapes, S1.surface, S2.surface"),
+    "two shapes": ("mesh", {"S1": {"surface": SURFACE}, "S2": {"surface": SURFACE}}, r"contains 2 shapes \(S1.surface, S2.surface\)"),
     "faces from 0": ("mesh", {"surface": {**SURFACE, "TRIV": np.array([[0, 1, 2], [1, 2, 3]])}}, "triangle 0 uses vertex -1"),
 }  # fmt: skip
 
@@ -592,13 +596,13 @@ def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path):
         jaxsmw.io.read_spectrum(tmp_path / "bomb.npz")
 
 
-def test_what_cannot_be_written_or_read_is_refused(bodies, spectra, tmp_path):
+def test_unsupported_and_damaged_files_are_refused(bodies, spectra, tmp_path):
     x, _ = spectra
     (tmp_path / "damaged.npz").write_bytes(b"no archive")
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
         "written as .npz or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
-        "has 642 vertices and y 162": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
+        "has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
         "written as .mat": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.txt", np.eye(3)),
         "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
         "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),

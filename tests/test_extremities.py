@@ -1,4 +1,4 @@
-"""Ends of limbs, and the ways to pair them."""
+"""The extremities of a body, and the pairings of the extremities of two bodies."""
 
 import numpy as np
 import pytest
@@ -12,20 +12,20 @@ from jaxsmw.repair.extremities import extremities, plausible_pairings
 
 @pytest.fixture(scope="module")
 def creature():
-    """Two poses of a body, and what is found of both."""
+    """Two poses of a body, and the extremities of both."""
     pair = creature_pair(vertices=2000)
     return pair, extremities(pair.source), extremities(pair.target)
 
 
-def test_arms_end_at_their_tips():
+def test_the_tips_of_arms_are_extremities():
     mesh = body_with_arms()
     found = extremities(mesh)
     tips = mesh.vertices[found.vertices[:2], 0]
     assert sorted(np.sign(tips)) == [-1, 1] and np.abs(tips).min() > 0.9 * np.abs(mesh.vertices[:, 0]).max()
 
 
-def test_distances_are_along_the_surface(creature):
-    """But for the detour of a graph, and in units of their mean remoteness."""
+def test_distances_run_along_the_surface(creature):
+    """Distances are slightly too long, because they run along edges. Their unit is the mean remoteness."""
     pair, ends, _ = creature
     assert 3 <= len(ends.vertices) <= 6
     exact = geodesic_distances(pair.source, ends.vertices)[:, ends.vertices]
@@ -36,18 +36,18 @@ def test_distances_are_along_the_surface(creature):
     assert (np.diff(ends.remoteness) <= 0).all()
 
 
-def test_the_true_pairing_is_among_the_likeliest(creature):
+def test_the_true_pairing_is_among_the_most_plausible(creature):
     pair, x, y = creature
     points = SurfacePoints(pair.truth.faces[x.vertices], pair.truth.weights[x.vertices])
     reach = geodesic_distances(pair.target, points)[:, y.vertices]
     true = np.sort(reach, axis=1)[:, 0] < 0.1 * pair.target.area**0.5
-    assert true.sum() >= 3  # ends that are ends on both
+    assert true.sum() >= 3  # vertices that are extremities of both bodies
     best = dict(zip(np.flatnonzero(true), reach.argmin(axis=1)[true], strict=True))
-    pairings = plausible_pairings(x, y, 72)  # of 720
+    pairings = plausible_pairings(x, y, 72)  # of 720 possible pairings
     assert any(all(dict(pairing).get(a) == b for a, b in best.items()) for pairing in pairings)
 
 
-def test_neither_unit_nor_numbering_matters(creature):
+def test_the_unit_and_the_vertex_numbers_have_no_effect(creature):
     pair, ends, _ = creature
     mesh = pair.source
     order = np.random.default_rng(0).permutation(len(mesh.vertices))
@@ -57,18 +57,18 @@ def test_neither_unit_nor_numbering_matters(creature):
     assert apart.min(axis=0).max() < 0.02 and apart.min(axis=1).max() < 0.02
 
 
-def test_pairings_are_one_to_one_and_turn_round(creature):
+def test_pairings_are_one_to_one_and_symmetric_in_both_bodies(creature):
     _, x, y = creature
-    there, back = plausible_pairings(x, y, 5), plausible_pairings(y, x, 5)
-    assert len(there) == 5
-    for pairing in there:
+    forward, backward = plausible_pairings(x, y, 5), plausible_pairings(y, x, 5)
+    assert len(forward) == 5
+    for pairing in forward:
         assert len(set(pairing[:, 0])) == len(set(pairing[:, 1])) == min(len(x.vertices), len(y.vertices))
         assert (pairing >= 0).all() and (pairing < [len(x.vertices), len(y.vertices)]).all()
-    for one, other in zip(there, back, strict=True):
+    for one, other in zip(forward, backward, strict=True):
         assert set(map(tuple, one)) == set(map(tuple, other[:, ::-1]))
 
 
-def test_separate_pieces_have_ends_of_their_own():
+def test_every_connected_component_has_extremities():
     mesh = body_with_arms()
     n = len(mesh.vertices)
     apart = make_mesh(
@@ -80,7 +80,7 @@ def test_separate_pieces_have_ends_of_their_own():
     np.testing.assert_array_equal(pairing[:, 0], pairing[:, 1])
 
 
-def test_a_ball_will_do_too():
+def test_a_sphere_has_extremities():
     mesh = make_mesh(*sphere_mesh(1))
     ends = extremities(mesh)
     assert 1 <= len(ends.vertices) <= 6 and np.isfinite(ends.remoteness).all()

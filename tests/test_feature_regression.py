@@ -1,4 +1,4 @@
-"""Refinement by regression of features."""
+"""Refinement by feature regression."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,10 @@ M, K, D = 250, 12, 5
 
 @pytest.fixture
 def pair():
-    """A shape with descriptors; a copy of it in another order, whose features are mixed and disturbed."""
+    """Two spectra with descriptors, an initial map and the true map.
+
+    Y is X in another vertex order, with mixed and disturbed features. Two fifths of the initial map are random.
+    """
     generator = np.random.default_rng(0)
     x = random_spectrum(M, K).with_descriptors(jnp.asarray(generator.normal(size=(M, D))))
     order = generator.permutation(M)
@@ -32,8 +35,8 @@ def pair():
         x.descriptors[order] @ generator.normal(size=(D, D)) + 0.3 * generator.normal(size=(M, D)),
     )
     truth = np.argsort(order)
-    start = np.where(generator.random(M) < 0.4, generator.integers(0, M, M), truth)
-    return x, y, jnp.asarray(start, jnp.int32), truth
+    initial_map = np.where(generator.random(M) < 0.4, generator.integers(0, M, M), truth)
+    return x, y, jnp.asarray(initial_map, jnp.int32), truth
 
 
 def features(spectrum):
@@ -41,7 +44,7 @@ def features(spectrum):
 
 
 def predicted(moments_xx, moments_xy, moments_yy):
-    """The matrix that predicts x, and the precision of its residual, from their definitions."""
+    """The matrix that predicts the features of X from those of Y, and the precision of the residual."""
 
     def least_squares(cross, gram):
         return cross @ np.linalg.inv(gram + 1e-3 * np.eye(len(gram)))
@@ -53,116 +56,127 @@ def predicted(moments_xx, moments_xy, moments_yy):
     return matrix, np.linalg.inv(residual + 0.03 * np.eye(len(residual)))
 
 
-@pytest.mark.parametrize("partial", [False, True], ids=["whole", "part"])
-def test_is_what_its_definition_says(pair, partial):
-    """Two turns, written out without whitening, masks or blocks."""
-    x, y, start, _ = pair
+@pytest.mark.parametrize("partial", [False, True], ids=["full", "partial"])
+def test_refinement_agrees_with_the_definition(pair, partial):
+    """The reference computes two iterations without whitening, masks or blocks."""
+    x, y, initial_map, _ = pair
     a, b = features(x), features(y)
     w_x, w_y = (np.asarray(s.vertex_areas / s.vertex_areas.sum()) for s in (x, y))
-    t = np.asarray(start)
-    back = None
+    t = np.asarray(initial_map)
+    reverse_map = None
     for _ in range(2):
-        if partial and back is not None:
-            forth_squared = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t] ** 2
-            back_squared = (
-                cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back)[np.arange(M), back] ** 2
-            )
-            # Here the way back fits worse.
-            assert w_x @ forth_squared < w_y @ back_squared
-            w_y = w_y / (1 + (back_squared / (w_x @ forth_squared)) ** 2)
+        if partial and reverse_map is not None:
+            forward_squared = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t] ** 2
+            distances = cdist(b, a @ reverse_matrix.T, "mahalanobis", VI=reverse_precision)
+            backward_squared = distances[np.arange(M), reverse_map] ** 2
+            # The reverse map fits worse, so only the weights of Y change.
+            assert w_x @ forward_squared < w_y @ backward_squared
+            w_y = w_y / (1 + (backward_squared / (w_x @ forward_squared)) ** 2)
             w_y /= w_y.sum()
         xx, xy, yy = (p.T @ (w_x[:, None] * q) for p, q in ((a, a), (a, b[t]), (b[t], b[t])))
-        if back is not None:
-            pairs = (a[back], a[back]), (a[back], b), (b, b)
+        if reverse_map is not None:
+            pairs = (a[reverse_map], a[reverse_map]), (a[reverse_map], b), (b, b)
             xx, xy, yy = (
                 (m + p.T @ (w_y[:, None] * q)) / 2 for m, (p, q) in zip((xx, xy, yy), pairs, strict=True)
             )
         matrix, precision = predicted(xx, xy, yy)
         t = cdist(a, b @ matrix.T, "mahalanobis", VI=precision).argmin(axis=1)
-        matrix_back, precision_back = predicted(yy, xy.T, xx)
-        back = cdist(b, a @ matrix_back.T, "mahalanobis", VI=precision_back).argmin(axis=1)
-    found = refine(x, y, start, refiner=FeatureRegression(), iterations=2, partial=partial, history=True)
+        reverse_matrix, reverse_precision = predicted(yy, xy.T, xx)
+        reverse_map = cdist(b, a @ reverse_matrix.T, "mahalanobis", VI=reverse_precision).argmin(axis=1)
+    found = refine(
+        x, y, initial_map, refiner=FeatureRegression(), iterations=2, partial=partial, history=True
+    )
     np.testing.assert_array_equal(found.pointwise_map, t)
     np.testing.assert_allclose(found.functional_map, matrix[:K, :K], atol=1e-10)
     distances = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t]
     np.testing.assert_allclose(found.history.objective[1], w_x @ distances**2, rtol=1e-8)
-    log_determinants = np.linalg.slogdet(precision)[1] + np.linalg.slogdet(precision_back)[1]
+    log_determinants = np.linalg.slogdet(precision)[1] + np.linalg.slogdet(reverse_precision)[1]
     per_feature = -log_determinants / 2 / (a.shape[1] + b.shape[1])
     np.testing.assert_allclose(found.history.energy[1], per_feature, rtol=1e-8)
 
 
-def test_mends_a_copy_whose_features_are_mixed(pair):
-    x, y, start, truth = pair
-    found = refine(x, y, start, refiner=FeatureRegression(), iterations=5)
+def test_recovers_a_copy_with_mixed_features_better_with_descriptors(pair):
+    x, y, initial_map, truth = pair
+    found = refine(x, y, initial_map, refiner=FeatureRegression(), iterations=5)
     assert found.result == RESULTS.successful
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
     blind = refine(
-        x.with_descriptors(None), y.with_descriptors(None), start, refiner=FeatureRegression(), iterations=5
+        x.with_descriptors(None),
+        y.with_descriptors(None),
+        initial_map,
+        refiner=FeatureRegression(),
+        iterations=5,
     )
     assert np.mean(np.asarray(blind.pointwise_map) == truth) < np.mean(
         np.asarray(found.pointwise_map) == truth
     )
 
 
-def test_levels_are_truncated_spectra(pair):
-    """Eigenvectors that do not count might as well not be there."""
-    x, y, start, _ = pair
-    found = refine(x, y, start, refiner=FeatureRegression((5, 5, 5)), iterations=3)
-    truncated = refine(x.truncate(5), y.truncate(5), start, refiner=FeatureRegression(), iterations=3)
+def test_a_level_equals_a_truncated_spectrum(pair):
+    """Level 5 gives the same maps as spectra with only 5 eigenvectors."""
+    x, y, initial_map, _ = pair
+    found = refine(x, y, initial_map, refiner=FeatureRegression((5, 5, 5)), iterations=3)
+    truncated = refine(x.truncate(5), y.truncate(5), initial_map, refiner=FeatureRegression(), iterations=3)
     np.testing.assert_array_equal(found.pointwise_map, truncated.pointwise_map)
     np.testing.assert_allclose(found.functional_map[:5, :5], truncated.functional_map, atol=1e-10)
     assert not found.functional_map[5:].any() and not found.functional_map[:, 5:].any()
 
 
-def test_levels_count_in_proportion_on_the_smaller_spectrum(pair):
-    x, y, start, _ = pair
-    found = refine(x.truncate(6), y, start, refiner=FeatureRegression((4,)), iterations=1)
+def test_levels_are_proportionally_smaller_on_the_smaller_spectrum(pair):
+    x, y, initial_map, _ = pair
+    found = refine(x.truncate(6), y, initial_map, refiner=FeatureRegression((4,)), iterations=1)
     assert found.functional_map.shape == (6, K)
     assert found.functional_map[:2, :4].any()
     assert not found.functional_map[2:].any() and not found.functional_map[:, 4:].any()
 
 
 def test_does_not_stop_before_the_last_level(pair):
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
     refiner = FeatureRegression((3, 3, 3, 3, 3, 3, 3, 3))
-    found = refine(x, y, start, refiner=refiner, iterations=40, stop_when_unchanged=True)
+    found = refine(x, y, initial_map, refiner=refiner, iterations=40, stop_when_unchanged=True)
     assert 9 < found.iterations < 40
 
 
-def test_samples_ask_and_all_vertices_answer(pair):
-    x, y, start, truth = pair
+def test_samples_are_queries_and_all_vertices_are_targets(pair):
+    x, y, initial_map, truth = pair
     samples = jnp.arange(0, M, 2), jnp.arange(1, M, 2)
-    found = refine(x, y, start, refiner=FeatureRegression(), iterations=4, samples=(samples[0], samples[1]))
+    found = refine(
+        x, y, initial_map, refiner=FeatureRegression(), iterations=4, samples=(samples[0], samples[1])
+    )
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
-def test_patches_decide_by_eigenvectors_alone(pair):
-    """With matches of eigenvectors in the metric that descriptors have no part in."""
-    x, y, start, truth = pair
+def test_search_in_patches_ignores_descriptors(pair):
+    """The first map is the same as for spectra without descriptors."""
+    x, y, initial_map, truth = pair
     maps = [
-        refine(x, y, start, refiner=FeatureRegression(search=search), iterations=1).pointwise_map
+        refine(x, y, initial_map, refiner=FeatureRegression(search=search), iterations=1).pointwise_map
         for search in ("exhaustive", "patches")
     ]
     blind = refine(
-        x.with_descriptors(None), y.with_descriptors(None), start, refiner=FeatureRegression(), iterations=1
+        x.with_descriptors(None),
+        y.with_descriptors(None),
+        initial_map,
+        refiner=FeatureRegression(),
+        iterations=1,
     )
     np.testing.assert_array_equal(maps[1], blind.pointwise_map)
     assert np.mean(np.asarray(maps[0]) == truth) > np.mean(np.asarray(maps[1]) == truth)
 
 
-def test_vmap_is_the_loop(pair):
-    x, y, start, _ = pair
+def test_vmap_equals_a_loop(pair):
+    x, y, initial_map, _ = pair
     pairs = [(x, y), (y, x)]
     stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *side) for side in zip(*pairs, strict=True)]
     both = eqx.filter_vmap(lambda *arguments: refine(*arguments, refiner=FeatureRegression((4, 8))))(
-        *stacked, jnp.stack([start, start])
+        *stacked, jnp.stack([initial_map, initial_map])
     )
     for row, (one, other) in enumerate(pairs):
-        alone = refine(one, other, start, refiner=FeatureRegression((4, 8)))
+        alone = refine(one, other, initial_map, refiner=FeatureRegression((4, 8)))
         np.testing.assert_array_equal(both.pointwise_map[row], alone.pointwise_map)
 
 
-def test_rows_that_are_not_those_of_the_vertices_are_refused(pair):
+def test_arrays_with_a_wrong_number_of_rows_are_refused(pair):
     x, _, _, _ = pair
     with pytest.raises(
         ValueError, match=rf"descriptors have shape \(3, 2\); one row per vertex .*\({M}, d\)"
@@ -172,17 +186,17 @@ def test_rows_that_are_not_those_of_the_vertices_are_refused(pair):
         x.with_positions(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
 
 
-def test_descriptors_that_are_no_numbers_are_reported(pair):
-    x, y, start, _ = pair
+def test_nan_in_descriptors_is_reported(pair):
+    x, y, initial_map, _ = pair
     broken = x.with_descriptors(x.descriptors.at[3, 1].set(jnp.nan))
-    found = refine(broken, y, start, refiner=FeatureRegression())
+    found = refine(broken, y, initial_map, refiner=FeatureRegression())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()
 
 
-def test_what_cannot_work_is_refused(pair):
-    x, y, start, _ = pair
+def test_invalid_descriptors_and_settings_are_refused(pair):
+    x, y, initial_map, _ = pair
     with pytest.raises(ValueError, match="X has 5 descriptors and Y has 0"):
-        refine(x, y.with_descriptors(None), start, refiner=FeatureRegression())
+        refine(x, y.with_descriptors(None), initial_map, refiner=FeatureRegression())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         FeatureRegression((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):

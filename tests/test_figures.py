@@ -1,4 +1,4 @@
-"""Figures show what they were given."""
+"""Figures: their contents, their files, and the inputs that they refuse."""
 
 import subprocess
 import sys
@@ -39,7 +39,7 @@ def pixels(figure: Any) -> np.ndarray:
 
 
 def panels(figure: Any) -> dict[str, np.ndarray]:
-    """The pictures of the bodies in a figure, by their role."""
+    """The images of the bodies in a figure, by the labels of their axes."""
     return {axes.get_label(): np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images}
 
 
@@ -49,14 +49,14 @@ def test_correspondence_transfers_colors() -> None:
     figure = draw_correspondence(TALL, other, number)
     shown = panels(figure)
     assert list(shown) == ["Source", "Target"]
-    # The true map gives the same picture twice.
+    # The ground truth gives source and target the same picture.
     assert np.abs(shown["Source"].astype(int) - shown["Target"]).max() <= 1
     wrong = panels(draw_correspondence(TALL, other, np.roll(number, 1)))
     assert np.array_equal(wrong["Target"], shown["Target"])
     assert np.abs(wrong["Source"].astype(int) - shown["Source"]).max() > 50
     covered = np.mean(shown["Source"][..., 3] == 255)
     assert 0.15 < covered < 0.5
-    # The figure shows the panel pixel for pixel as it was rendered.
+    # The figure shows the rendered panel without resampling.
     image = pixels(figure)
     target = shown["Target"]
     inside = target[..., 3] == 255
@@ -67,7 +67,7 @@ def test_correspondence_transfers_colors() -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_correspondence_with_errors() -> None:
+def test_correspondence_shows_errors_on_the_source() -> None:
     n = len(TALL.vertices)
     errors = np.where(TALL.vertices[:, 1] > 0, 0.3, 0.0)
     errors[0] = np.nan
@@ -101,7 +101,7 @@ def test_the_scale_of_errors_is_the_same_for_all_maps() -> None:
         assert labels[0] == "0" and labels[-1] == "0.1 and\nabove"
         image = panels(figure)["Error on the source"]
         shown[size] = image[image[..., 3] == 255].mean()
-    # A good map looks good: nearly white, and the lighter the better.
+    # Smaller errors have lighter colours.
     assert shown[0.001] > 1.1 * shown[0.1] > 1.1 * shown[0.7]
     wider = draw_correspondence(TALL, TALL, np.arange(n), errors={"Error": np.ones(n)}, error_limit=0.25)
     assert error_scale(wider).get_ylim() == pytest.approx((0, 0.25))
@@ -122,7 +122,7 @@ def test_the_color_of_unknown_errors_is_explained() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_view_options_change_the_picture() -> None:
-    # A pointed body, so that every view differs.
+    # Every view of this pointed body is different.
     vertices = TALL.vertices * (1 + 0.5 * np.clip(TALL.vertices @ [[0.3], [1], [0.6]], 0, None))
     body = replace(TALL, vertices=vertices)
     images = [pixels(draw_mesh(body, up=up, azimuth=azimuth)) for up, azimuth in
@@ -146,7 +146,7 @@ def test_draw_mesh_in_given_colors() -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_functional_map_figure() -> None:
+def test_functional_map_figure_shows_the_matrix_with_axis_labels() -> None:
     matrix = np.diag([1.0, -2.0, 0.5]) @ np.eye(3, 5)
     figure = draw_functional_map(matrix)
     axes = figure.axes[0]
@@ -168,7 +168,7 @@ def test_functional_map_figure() -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_filter_figure() -> None:
+def test_filter_figure_shows_responses_frame_function_and_eigenvalues() -> None:
     grid = np.linspace(0, 10, 50)
     responses = np.stack([np.cos(grid / 7) ** 2, np.sin(grid / 7), 0.3 + 0 * grid])
     eigenvalues = np.array([0.0, 2.5, 9.0])
@@ -187,7 +187,7 @@ def test_filter_figure() -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_quality_curves() -> None:
+def test_quality_curves_are_distinguishable_and_in_the_legend() -> None:
     thresholds = np.linspace(0, 0.25, 26)
     names = ["$x_1", "_hidden", *(f"method {i}" for i in range(18))]
     curves = {name: (thresholds, 1 - np.exp(-(i + 1) * 5 * thresholds)) for i, name in enumerate(names)}
@@ -200,7 +200,7 @@ def test_quality_curves() -> None:
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts == ["$x_1: 0.0123", *names[1:]]
     assert axes.get_xlim() == (0, 0.25)
-    # The whole legend is inside the figure, beside the curves.
+    # The whole legend is inside the figure, next to the curves.
     pixels(figure)
     legend = figure.legends[0].get_window_extent()
     assert legend.x0 > axes.get_window_extent().x1
@@ -214,7 +214,7 @@ def test_quality_curves() -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_save_figure(tmp_path: Path) -> None:
+def test_figures_are_saved_reproducibly_or_not_at_all(tmp_path: Path) -> None:
     for suffix, magic in ((".png", b"\x89PNG"), (".PDF", b"%PDF"), (".svg", b"<?xml")):
         first, second = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
         save_figure(first, draw_mesh(TALL))
@@ -234,7 +234,7 @@ def test_save_figure(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_hostile_names_in_figures() -> None:
+def test_hostile_names_are_drawn_as_plain_text() -> None:
     body = replace(TALL, name="/secret/dir/$\\frac{$_\udcff.off")
     figure = draw_correspondence(body, body, np.arange(len(body.vertices)))
     pixels(figure)
@@ -248,7 +248,7 @@ def test_hostile_names_in_figures() -> None:
     assert boxes[1].x1 < boxes[3].x0
 
 
-def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_matplotlib_only_figures_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
     with pytest.raises(InputError, match=r"pip install 'jaxsmw\[report\]'"):
         draw_functional_map(np.eye(3))
@@ -256,7 +256,7 @@ def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     write_page(tmp_path / "page.html", TALL, TALL, {"map": shown}, title="no figures needed")
 
 
-def test_matplotlib_is_imported_late_and_pyplot_never() -> None:
+def test_matplotlib_is_imported_on_first_use_and_without_pyplot() -> None:
     script = (
         "import sys, jaxsmw.report.page, jaxsmw.report.figures as f; assert 'matplotlib' not in sys.modules; "
         "f.draw_functional_map([[1.0]]); assert 'matplotlib.pyplot' not in sys.modules"

@@ -1,4 +1,4 @@
-"""Reading and writing files: failures are one sentence, and no reader sees half a file."""
+"""Reading and writing files: errors are one sentence, and no file is left half-written."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory, read_bytes
 
 
-def test_the_file_appears_whole_or_not_at_all(tmp_path):
+def test_a_file_is_written_completely_or_not_at_all(tmp_path):
     path = tmp_path / "result.npz"
     with atomic_write(str(path)) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary.read_bytes() == b""
@@ -40,7 +40,7 @@ def test_system_errors_become_one_sentence(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "missing/a.txt", "/dev/null", ".", "/"])
-def test_unwritable_places(tmp_path, name):
+def test_unwritable_paths_are_refused_and_leave_no_files(tmp_path, name):
     with pytest.raises(InputError, match=r"cannot be written"), atomic_write(tmp_path / name) as temporary:
         temporary.write_text("x")
     assert list(tmp_path.iterdir()) == []
@@ -49,20 +49,20 @@ def test_unwritable_places(tmp_path, name):
 def test_write_protection_is_respected(tmp_path, monkeypatch):
     path = tmp_path / "kept.txt"
     path.write_text("old")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind the superuser
+    monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser can write in spite of permissions
     with pytest.raises(InputError, match="write-protected"), atomic_write(path) as temporary:
         temporary.write_text("new")
     assert path.read_text() == "old"
 
 
-def test_permissions_are_those_of_any_new_file(tmp_path):
+def test_new_files_have_the_default_permissions(tmp_path):
     (tmp_path / "plain").touch()
     with atomic_write(tmp_path / "atomic"):
         pass
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_links_are_followed(tmp_path):
+def test_symbolic_links_are_followed(tmp_path):
     (tmp_path / "store").mkdir()
     (tmp_path / "link.txt").symlink_to(tmp_path / "store" / "real.txt")
     with atomic_write(tmp_path / "link.txt") as temporary:
@@ -70,7 +70,7 @@ def test_links_are_followed(tmp_path):
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "store" / "real.txt").read_text() == "x"
 
 
-def test_many_writers_of_one_file_leave_one_whole_file(tmp_path):
+def test_concurrent_writers_leave_one_complete_file(tmp_path):
     path = tmp_path / "shared.txt"
 
     def write(letter: str) -> None:
@@ -121,12 +121,12 @@ CALLS = {
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 @pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)
-def test_impossible_names_end_in_one_sentence(tmp_path, name, call):
+def test_impossible_names_are_refused_in_one_sentence(tmp_path, name, call):
     (tmp_path / "file").touch()
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     path = tmp_path / name
     if call is make_directory and name.startswith("new"):
-        path.parent.mkdir()  # otherwise the parents that can be made are made
+        path.parent.mkdir()  # otherwise make_directory creates this parent before it fails
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError) as caught:
         call(path)
@@ -135,15 +135,15 @@ def test_impossible_names_end_in_one_sentence(tmp_path, name, call):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_writable_name_is_writable_with_the_temporary_suffix(tmp_path):
-    """The temporary name is longer than the name itself if most of that is a suffix."""
+def test_names_with_a_too_long_temporary_name_are_refused(tmp_path):
+    """The temporary name repeats the long suffix, so it exceeds the limit although the name does not."""
     path = tmp_path / ("a." + "x" * 250)
     for write in (check_writable, lambda path: atomic_write(path).__enter__()):
         with pytest.raises(InputError, match="File name too long"):
             write(path)
 
 
-def test_read_bytes(tmp_path):
+def test_read_bytes_refuses_large_missing_and_special_files(tmp_path):
     (tmp_path / "data").write_bytes(b"\0\1")
     assert read_bytes(tmp_path / "data") == b"\0\1" == read_bytes(str(tmp_path / "data"), largest=2)
     with pytest.raises(InputError, match="data: is larger than 0 GiB"):
@@ -156,7 +156,7 @@ def test_read_bytes(tmp_path):
             read_bytes(path)
 
 
-def test_check_directory_raises_before_the_work_and_leaves_nothing(tmp_path):
+def test_check_directory_creates_nothing_and_refuses_impossible_paths(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "kept").mkdir()
     check_directory(tmp_path / "new" / "one")

@@ -38,7 +38,7 @@ WARPS = {
     "power": Power(),
     "distribution": SpectralDistribution(),
 }
-# All of these banks are Parseval. The banks of this first table exist in any size from 5 filters on.
+# The banks of this table and the next are Parseval frames. The banks of this table take 5 or more filters.
 PARSEVAL_OF_ANY_SIZE = {
     "meyer": Meyer,
     "simple tight": SimpleTight,
@@ -100,7 +100,7 @@ def test_squares_sum_to_one(make, filters, lambda_max, seed):
 
 
 @pytest.mark.parametrize("make", PARSEVAL_OF_ANY_SIZE.values(), ids=PARSEVAL_OF_ANY_SIZE.keys())
-def test_banks_with_more_filters_than_float32_has_octaves(make):
+def test_banks_with_more_filters_than_float32_has_octaves_are_parseval(make):
     eigenvalues = spectrum().astype(jnp.float32)
     np.testing.assert_allclose(frame_function(sample(make(200), eigenvalues, eigenvalues)), 1, atol=1e-5)
 
@@ -132,7 +132,7 @@ def test_precision_of_the_points_is_kept(bank):
 
 
 @each_bank
-def test_scale_cancels_and_order_does_not_matter(bank):
+def test_responses_do_not_depend_on_scale_or_order(bank):
     eigenvalues = spectrum()
     order = np.random.default_rng(0).permutation(30)
     responses = sample(bank, eigenvalues, eigenvalues)
@@ -142,7 +142,7 @@ def test_scale_cancels_and_order_does_not_matter(bank):
 
 
 @each_bank
-def test_compiled_and_batched(bank):
+def test_compiled_and_batched_banks_give_the_same_responses(bank):
     stack = jnp.stack([spectrum(seed) for seed in range(3)])
     banks = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), bank)
     batched = jax.jit(jax.vmap(lambda b, e: b(e, e)))(banks, stack)
@@ -215,22 +215,22 @@ def test_every_continuous_parameter_changes_the_result(bank):
 def test_a_softmax_frame_resembles_another_bank_at_its_knots():
     knots = jnp.linspace(0, 20, 33)
     for bank in (Meyer(5), Itersine(4)):
-        alike = SoftmaxFrame.like(bank, 33, floor=1e-6)
-        np.testing.assert_allclose(sample(alike, knots, knots), sample(bank, knots, knots), atol=1e-5)
+        similar = SoftmaxFrame.like(bank, 33, floor=1e-6)
+        np.testing.assert_allclose(sample(similar, knots, knots), sample(bank, knots, knots), atol=1e-5)
     # For a bank that is not tight, the proportions between the filters agree.
     squares = sample(Heat([1.0, 10.0]), knots, knots) ** 2
-    alike = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
-    np.testing.assert_allclose(alike[0], squares[0] / squares.sum(axis=0), atol=1e-3)
+    similar = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
+    np.testing.assert_allclose(similar[0], squares[0] / squares.sum(axis=0), atol=1e-3)
 
 
-def test_only_differences_of_logits_count():
+def test_softmax_frames_depend_only_on_differences_of_logits():
     logits = jnp.asarray(np.random.default_rng(0).normal(size=(4, 7)))
     grid = jnp.linspace(0, 3, 50)
     shifted = SoftmaxFrame(logits + jnp.arange(7.0)[None, :])
     np.testing.assert_allclose(shifted(grid, grid), SoftmaxFrame(logits)(grid, grid), atol=1e-12)
 
 
-def test_the_sizes_are_not_traced():
+def test_numbers_of_filters_are_not_traced():
     banks = [Meyer(), SimpleTight(), Itersine(), HalfCosine(), Regular(), Identity()]
     assert not jax.tree.leaves(banks)
 
@@ -259,13 +259,13 @@ def test_first_filter_is_a_low_pass(bank):
     assert low[0] == pytest.approx(1) and low[-1] == pytest.approx(0) and (np.diff(low) <= 1e-12).all()
 
 
-def test_the_cubic_spline_covers_the_interval_with_the_bounds_of_the_paper():
+def test_the_cubic_spline_has_the_frame_bounds_of_the_paper():
     grid = jnp.linspace(0, 3, 5000)
     covered = frame_function(CubicSpline()(grid, grid))
     assert 1.28 < covered.min() < 1.29 and 2.11 < covered.max() < 2.125
 
 
-def test_few_filters_follow_their_closed_forms():
+def test_some_banks_follow_closed_forms():
     grid = np.linspace(0, 4, 41)
     relative = grid / 4
 
@@ -277,7 +277,7 @@ def test_few_filters_follow_their_closed_forms():
     centres = np.asarray([0, 1 / 3, 2 / 3, 1])
     gaussians = np.exp(-((relative - centres[:, None]) ** 2) / (2 * (0.4 / 3) ** 2))
     np.testing.assert_allclose(respond(Gabor(4, 0.4)), gaussians)
-    # Two Meyer filters start their transition at one half.
+    # The transition of two Meyer filters begins at one half.
     np.testing.assert_allclose(respond(LowPass(0.5)), respond(Meyer(2))[:1], atol=1e-15)
     window = respond(ExponentialWindow(0.8, 2.0))[0]
     assert window[16] == pytest.approx(0.5) and (window[32:] == 0).all()
@@ -311,8 +311,8 @@ def test_the_spectral_distribution_gives_bands_equal_numbers_of_eigenvalues():
     assert plain.max() > 2 * plain[1:-1].min()
 
 
-def test_repeated_eigenvalues_are_filtered_alike():
-    # The spectrum of a sphere with its multiplicities, and two more components.
+def test_repeated_eigenvalues_have_equal_responses():
+    # The eigenvalues of a sphere with multiplicities, and zero eigenvalues of two more components.
     degrees = np.arange(8)
     exact = np.concatenate([[0, 0], np.repeat(degrees * (degrees + 1.0), 2 * degrees + 1)])
     noisy = np.sort(exact + 1e-9 * np.random.default_rng(0).uniform(size=exact.size))
@@ -368,7 +368,7 @@ def test_invalid_parameters_are_refused(make, message):
     assert "\n" not in str(caught.value)
 
 
-def test_banks_can_be_made_of_traced_parameters():
+def test_banks_accept_traced_parameters():
     eigenvalues = spectrum()
     widths = jnp.asarray([0.3, 0.6])
     made = jax.jit(jax.vmap(lambda width: Gabor(4, width)(eigenvalues, eigenvalues)))(widths)
@@ -379,11 +379,11 @@ def test_banks_can_be_made_of_traced_parameters():
 
 # Comparison with an independent toolbox. The tables state every difference in convention.
 
-PARSEVAL_FACTOR = np.sqrt(9 / 8)  # the half cosines of the toolbox sum to 9/8
+PARSEVAL_FACTOR = np.sqrt(9 / 8)  # the squared half cosines of the toolbox sum to 9/8
 
 
 def as_in_the_toolbox(lambda_max):
-    """Returns our banks under the names of the toolbox, with the factors of its filters."""
+    """Returns our banks by toolbox name, with factors that turn our responses into those of the toolbox."""
     # The toolbox normalises by the scale in units of 1 / lambda.
     scale_units = np.r_[1, np.full(5, 1 / np.sqrt(lambda_max))]
     logarithm = Logarithm(10 * lambda_max)
@@ -432,7 +432,8 @@ def test_the_logarithm_and_regular_equal_the_independent_toolbox(shared, lambda_
     grid = jnp.asarray(reference["x"])
     warped = Logarithm(10 * lambda_max)(grid, grid)
     np.testing.assert_allclose(warped, reference["warped_log_wf"], atol=1e-10)
-    # The toolbox returns the high-pass first. Its low-pass is sqrt(1 - high²), with half the digits near zero.
+    # The toolbox returns the high-pass first. Its low-pass is sqrt(1 - high²), which has half the digits
+    # near zero.
     low, high = Regular()(grid, grid)
     np.testing.assert_allclose(high, reference["regular"][:, 0], atol=1e-10)
     np.testing.assert_allclose(low**2, reference["regular"][:, 1] ** 2, atol=1e-10)
@@ -462,7 +463,7 @@ def test_values_equal_pygsp(lambda_max, filters):
         (Itersine(filters), 1, pygsp_filters.Itersine(graph, filters)),
         (HalfCosine(filters), PARSEVAL_FACTOR, pygsp_filters.HalfCosine(graph, filters)),
         (Heat(np.arange(1.0, filters)), 1, pygsp_filters.Heat(graph, np.arange(1, filters))),
-        # PyGSP scales the spectrum to [0, 2], and its window is as wide as the whole interval.
+        # PyGSP scales the spectrum to [0, 2]. Its exponential window is as wide as the whole interval.
         (Held(edge), 1, pygsp_filters.Held(graph, 2 * edge)),
         (Simoncelli(edge), 1, pygsp_filters.Simoncelli(graph, 2 * edge)),
         (Papadakis(edge), 1, pygsp_filters.Papadakis(graph, 2 * edge)),

@@ -34,7 +34,7 @@ COVERING = [
 
 
 class Impulse(FilterBank):
-    """One filter that passes a single point of the interval."""
+    """One filter with response 3 at the largest eigenvalue and 0.5 everywhere else."""
 
     def __call__(self, points, eigenvalues):
         return jnp.where(points == eigenvalues[-1], 3.0, 0.5)[None, :]
@@ -90,7 +90,7 @@ def test_bounds_are_traced_and_keep_the_precision():
     [({"over": "graph"}, "eigenvalues"), ({"over": "interval", "resolution": 1}, "at least 2")],
 )
 def test_invalid_options_are_refused(options, message):
-    # In the tests the type check refuses an unknown word before the function does.
+    # In tests, the run-time type check refuses an unknown word before frame_bounds does.
     with pytest.raises((ValueError, TypeError), match=message):
         frame_bounds(Meyer(), EIGENVALUES, **options)
 
@@ -146,7 +146,7 @@ def test_tightened_responses_vanish_with_the_frame_function():
 
 
 class Constant(FilterBank):
-    """Two filters with one value everywhere."""
+    """Two filters with the same constant response."""
 
     value: jax.Array
 
@@ -169,7 +169,7 @@ def test_a_tightened_low_pass_filter_still_stops_high_eigenvalues(dtype):
 
 
 @pytest.mark.parametrize("shape", [lambda p: (len(p),), lambda p: (3, 5)], ids=["flat", "short"])
-def test_responses_of_another_shape_are_refused(shape):
+def test_responses_of_a_wrong_shape_are_refused(shape):
     class Misshapen(FilterBank):
         def __call__(self, points, eigenvalues):
             return jnp.ones(shape(points))

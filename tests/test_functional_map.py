@@ -39,7 +39,7 @@ def permutation_matrix(pointwise_map):
 
 
 @pytest.mark.parametrize("pseudo_inverse", ["area", "least_squares"])
-def test_encode_is_the_matrix_product(pair, pointwise_map, pseudo_inverse):
+def test_encode_equals_the_matrix_product(pair, pointwise_map, pseudo_inverse):
     x, y = pair
     p = permutation_matrix(pointwise_map)
     if pseudo_inverse == "area":
@@ -86,7 +86,7 @@ def stacked(pair, pointwise_map, convention, norm):
 
 
 def tall_system(pair, pointwise_map, g_x, g_y, convention, norm):
-    """Returns both sides of the linear system with one row per scale and vertex, without any moments."""
+    """Returns both sides of the linear system with one row for each scale and vertex."""
     inputs, outputs, weights = stacked(pair, pointwise_map, convention, norm)
     g_in, g_out = (g_y, g_x) if convention == "pullback" else (g_x, g_y)
     root = np.sqrt(weights)[:, None]
@@ -133,7 +133,7 @@ def test_no_map_has_less_energy_than_the_minimizer(case):
     np.testing.assert_allclose(jax.grad(energy)(best), 0, atol=1e-9)
     for size in (1e-3, 1e-1, 1.0):
         assert energy(best + size * generator.normal(size=best.shape)) > energy(best)
-    # Gradient descent from another map comes closer and closer to the minimiser, but never below.
+    # Gradient descent from another map lowers the energy in every step, but not below the minimum.
     c = jnp.asarray(generator.normal(size=best.shape))
     step = 1 / jnp.linalg.eigvalsh(energy.gram)[-1]
     before = jnp.inf
@@ -143,7 +143,7 @@ def test_no_map_has_less_energy_than_the_minimizer(case):
         before = energy(c)
 
 
-def test_closed_forms(pair, pointwise_map):
+def test_minimizer_agrees_with_closed_forms(pair, pointwise_map):
     """The minimiser agrees with four formulas that were derived separately."""
     x, y = pair
     g_x, g_y = (responses(spectrum, tight=False) for spectrum in pair)
@@ -205,7 +205,7 @@ def test_energies_add_and_scale():
 
 
 def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair, pointwise_map):
-    """Remark 4.1 holds for any T in the pushforward convention: Phi_X is orthonormal and the frame Parseval."""
+    """Remark 4.1 holds for any T in the pushforward convention: Phi_X is orthonormal and the frame is Parseval."""
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)
@@ -219,11 +219,11 @@ def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair
     update = encode(inverse, x, copy) * multiscale_kernel(g_x, g_x)
     energy = WaveletProblem(x, copy, g_x, g_x).energy(inverse)
     np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
-    # There the energy of the identity is zero, because the wavelets of a copy are preserved exactly.
+    # The identity has zero energy for this copy, because all wavelets are preserved exactly.
     np.testing.assert_allclose(energy(jnp.eye(K_X)), 0, atol=1e-12)
 
 
-def test_energy_of_the_zero_map(pair, pointwise_map):
+def test_energy_of_the_zero_map_is_the_sum_of_the_frame_function(pair, pointwise_map):
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     energy = WaveletProblem(x, y, g_x, g_y).energy(pointwise_map)(jnp.zeros((K_X, K_Y)))

@@ -25,7 +25,7 @@ def no_cache(monkeypatch):
 
 
 def shaken_square(side: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Irregular triangles of the unit square, with straight boundaries: vertices (side^2, 2) and faces."""
+    """Vertices (side^2, 2) and faces of the unit square, with irregular triangles and straight boundaries."""
     vertices, _ = grid_mesh(side, side)
     square = vertices[:, :2]
     inner = ((square > 0) & (square < 1)).all(axis=1)
@@ -112,7 +112,7 @@ def test_faust_agrees_with_exact_distances(shared):
     assert (distances[~elsewhere] == 0).all()
 
 
-def test_a_flat_sheet_is_euclidean():
+def test_distances_on_a_flat_sheet_are_euclidean():
     mesh = flat_sheet()
     distances = geodesic_distances(mesh, np.arange(len(mesh.vertices)))
     expected = np.linalg.norm(mesh.vertices[:, None] - mesh.vertices, axis=2)
@@ -124,13 +124,13 @@ def test_a_flat_sheet_is_euclidean():
     assert np.abs(error[near]).max() < 1e-12
 
 
-def test_a_grid_with_all_its_collinear_vertices_is_euclidean():
+def test_distances_on_a_grid_with_collinear_vertices_are_euclidean():
     vertices, faces = grid_mesh(9, 9)
     mesh = make_mesh(vertices, faces)
     distances = geodesic_distances(mesh, np.arange(81))
     expected = np.linalg.norm(vertices[:, None] - vertices, axis=2)
     assert (distances - expected).min() > -1e-12
-    # Along rows, columns and diagonals lines pass exactly through vertices.
+    # Lines along rows, columns and diagonals pass exactly through vertices.
     np.testing.assert_allclose(distances[0, ::9], expected[0, ::9], rtol=1e-12)
     np.testing.assert_allclose(distances[0, ::10], expected[0, ::10], rtol=1e-12)
     np.testing.assert_allclose(distances[8, 8:80:8], expected[8, 8:80:8], rtol=1e-12)
@@ -138,11 +138,11 @@ def test_a_grid_with_all_its_collinear_vertices_is_euclidean():
     assert (distances[off_diagonal] / expected[off_diagonal]).max() < 1.005
 
 
-def test_a_cube():
+def test_distances_on_a_cube_are_exact():
     distances = geodesic_distances(CUBE, np.arange(8))
     np.testing.assert_allclose(distances[0], np.sqrt([0, 1, 2, 1, 1, 2, 5, 2]), rtol=1e-14)
     assert sorted(np.round(distances.ravel() ** 2).astype(int)) == [0] * 8 + [1] * 24 + [2] * 24 + [5] * 8
-    # Centres of faces, which lie on the diagonals: bottom, top, front.
+    # The centres of the bottom, top and front sides of the cube, which are on diagonals.
     centres = SurfacePoints(np.array([0, 2, 4]), np.array([[0.5, 0.5, 0], [0.5, 0, 0.5], [0.5, 0, 0.5]]))
     np.testing.assert_allclose(centres.positions(CUBE), [[0.5, 0.5, 0], [0.5, 0.5, 1], [0.5, 0, 0.5]])
     first, second = np.array([0, 0, 1, 0]), np.array([1, 2, 2, 0])
@@ -154,7 +154,7 @@ def test_a_cube():
     )
 
 
-def test_a_prism_unrolls():
+def test_distances_on_a_prism_equal_those_on_the_unrolled_prism():
     sides, rings, seed = 12, 6, 0
     generator = np.random.default_rng(seed)
     corner, ring = np.meshgrid(np.arange(sides), np.arange(rings))
@@ -176,7 +176,7 @@ def test_a_prism_unrolls():
     assert error[expected[elsewhere] < 3].max() < 1e-12
 
 
-def test_a_curved_surface_agrees_with_exact_distances():
+def test_distances_on_a_curved_surface_agree_with_exact_distances():
     mesh = blob()
     sources = np.arange(0, 642, 40)
     distances, expected = geodesic_distances(mesh, sources), exact_distances(mesh, sources)
@@ -186,7 +186,7 @@ def test_a_curved_surface_agrees_with_exact_distances():
     assert near.sum() > 200 and error[near].max() < 1e-12
 
 
-def test_more_depth_never_makes_distances_longer():
+def test_greater_depth_never_makes_distances_longer():
     mesh = blob(2)
     totals = []
     previous = np.full((len(mesh.vertices),) * 2, np.inf)
@@ -218,7 +218,7 @@ def test_distances_are_a_metric():
 
 @pytest.mark.parametrize("method", ["strips", "exact"])
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e30])
-def test_moving_scaling_and_renumbering(method, scale):
+def test_distances_scale_with_the_mesh_and_do_not_depend_on_motion_or_numbering(method, scale):
     mesh, generator = blob(2), np.random.default_rng(0)
     n = len(mesh.vertices)
     sources = np.array([0, 50, 100])
@@ -233,7 +233,7 @@ def test_moving_scaling_and_renumbering(method, scale):
     np.testing.assert_allclose(moved[:, number], scale * expected, rtol=1e-9, atol=1e-12 * scale)
 
 
-def test_three_and_more_sheets_at_an_edge():
+def test_distances_across_an_edge_of_several_sheets():
     mesh, page, place = book(pages=4)
     used = mesh.referenced_vertices
     assert len(mesh.nonmanifold_edges) == 6
@@ -256,7 +256,7 @@ def test_sheets_that_touch_in_a_vertex_are_connected():
     np.testing.assert_allclose(geodesic_distances(mesh, [1]), [[1, 0, np.sqrt(2), 4, 5]])
 
 
-def test_components_unreferenced_vertices_and_duplicates():
+def test_components_and_unreferenced_vertices_are_infinitely_far_apart():
     square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     vertices = np.concatenate([square, [[5, 5, 5]], square])
@@ -273,7 +273,7 @@ def test_components_unreferenced_vertices_and_duplicates():
 
 
 def test_edges_without_length_and_faces_without_area_have_no_effect():
-    # A square that was cut along its diagonal and closed again with faces without width.
+    # A square that is cut along its diagonal and closed again with faces of zero width.
     vertices = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]]
     mesh = make_mesh(vertices, [[0, 1, 2], [4, 5, 3], [0, 2, 5], [0, 5, 4]])
     assert mesh.degenerate_faces.sum() == 2
@@ -281,7 +281,7 @@ def test_edges_without_length_and_faces_without_area_have_no_effect():
     np.testing.assert_allclose(distances, np.linalg.norm(mesh.vertices[:, None] - mesh.vertices, axis=2))
 
 
-def test_a_limit_changes_nothing_below():
+def test_a_limit_does_not_change_smaller_distances():
     mesh = blob()
     for method in ("strips", "exact"):
         everything = geodesic_distances(mesh, [0, 9], method=method)
@@ -290,7 +290,7 @@ def test_a_limit_changes_nothing_below():
         assert np.isinf(some).any() and np.isfinite(some).sum() > 10
 
 
-def test_exact_method():
+def test_the_exact_method_agrees_with_pygeodesic():
     mesh = blob(2)
     sources = np.array([3, 100])
     expected = exact_distances(mesh, sources)
@@ -302,7 +302,7 @@ def test_exact_method():
         rtol=1e-12,
     )
     strips = geodesic_distances(mesh, sources)
-    assert (strips > expected * (1 + 1e-6)).any()  # otherwise the two methods could be the same
+    assert (strips > expected * (1 + 1e-6)).any()  # the default method is not the exact method
 
 
 def test_the_exact_method_refuses_unsuitable_meshes():
@@ -359,10 +359,10 @@ def test_points_at_corners_act_as_vertices():
     np.testing.assert_allclose(geodesic_distances_between(mesh, others, points), expected, atol=1e-12)
 
 
-def test_points_on_a_flat_sheet_are_euclidean():
+def test_distances_between_points_on_a_flat_sheet_are_euclidean():
     mesh = flat_sheet()
     points, others = random_points(mesh, 1500), random_points(mesh, 1500, seed=1)
-    # Some points lie on vertices, on edges, or on the same face, and some pairs are equal.
+    # Some points are on vertices, on edges, or on the same face, and some pairs are equal.
     points.weights[:100], others.weights[:50] = [0, 1, 0], [0, 0, 1]
     points.weights[100:300], others.weights[200:400] = [0.3, 0, 0.7], [0.8, 0.2, 0]
     others.faces[300:600] = points.faces[300:600]
@@ -373,7 +373,7 @@ def test_points_on_a_flat_sheet_are_euclidean():
     expected = np.linalg.norm(points.positions(mesh) - others.positions(mesh), axis=1)
     distances = geodesic_distances_between(mesh, points, others)
     assert (distances - expected).min() > -1e-12
-    assert (distances - expected)[300:900].max() < 1e-12  # same and touching faces: exactly straight
+    assert (distances - expected)[300:900].max() < 1e-12  # on same or touching faces: straight paths
     assert (distances / np.maximum(expected, 0.05) - 1).max() < 0.02
     np.testing.assert_allclose(geodesic_distances_between(mesh, others, points), distances, atol=1e-12)
     to_vertices = np.linalg.norm(points.positions(mesh)[:, None] - mesh.vertices, axis=2)
@@ -381,10 +381,10 @@ def test_points_on_a_flat_sheet_are_euclidean():
     assert error.min() > -1e-12 and (error / np.maximum(to_vertices, 0.05)).max() < 0.02
 
 
-def test_points_on_a_curved_surface_agree_with_exact_distances():
+def test_distances_between_points_on_a_curved_surface_agree_with_exact_distances():
     mesh = blob()
     faces = np.random.default_rng(0).permutation(len(mesh.faces))[:40]
-    for k in range(0, 20, 2):  # half of the pairs lie on faces that share a corner or a side
+    for k in range(0, 20, 2):  # half of the pairs are on faces that share a corner or a side
         touching = np.isin(mesh.faces, mesh.faces[faces[k]]).sum(axis=1) == 1 + k // 2 % 2
         touching[faces] = False
         faces[k + 1] = np.flatnonzero(touching)[0]
@@ -409,7 +409,7 @@ def test_a_straight_line_between_points_need_not_be_the_shortest_path():
     assert (distances / expected)[longer].max() < 1.01
 
 
-def test_points_on_sheets_that_meet_in_an_edge():
+def test_distances_between_points_on_sheets_that_meet_in_an_edge():
     mesh, *_ = book(pages=3)
     near_spine = np.flatnonzero(np.isin(mesh.faces, np.unique(mesh.nonmanifold_edges)).sum(axis=1) == 2)
     first, second = np.array(np.meshgrid(near_spine, near_spine)).reshape(2, -1)
@@ -417,7 +417,7 @@ def test_points_on_sheets_that_meet_in_an_edge():
     points, others = SurfacePoints(first, weights), SurfacePoints(second, weights)
 
     def unrolled(where):
-        """The distance from the spine, the position along it, and the angle of the page."""
+        """The distance from the spine, the position along the spine, and the angle of the page."""
         x, y, z = where.T
         return np.hypot(x, y), z, np.round(np.arctan2(y, x), 6)
 
@@ -444,7 +444,7 @@ def test_distances_do_not_depend_on_the_other_points():
         )
 
 
-def test_graphs_come_from_the_cache(tmp_path, monkeypatch):
+def test_graphs_are_read_from_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
     mesh = blob(2)
     geodesic_graph.cache_clear()
@@ -452,7 +452,7 @@ def test_graphs_come_from_the_cache(tmp_path, monkeypatch):
     assert geodesic_graph(mesh, depth=2).nnz < geodesic_graph(mesh).nnz
     assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 2
     geodesic_graph.cache_clear()
-    monkeypatch.setattr(geodesics, "_unfold", None)  # another computation would fail
+    monkeypatch.setattr(geodesics, "_unfold", None)  # so another computation would fail
     np.testing.assert_array_equal(geodesic_distances(mesh, [0, 1]), first)
 
 

@@ -1,4 +1,4 @@
-"""Damaged result files are refused with one sentence, and left as they are."""
+"""Damaged result files are refused in one sentence and are not changed."""
 
 import json
 
@@ -21,7 +21,7 @@ COLUMNS = {"name": str, "value": float}
         ('name,value\n"a,1\n', "is not a table of results"),
     ],
 )
-def test_tables_of_any_columns_are_checked(tmp_path, contents, message):
+def test_malformed_tables_are_refused(tmp_path, contents, message):
     path = tmp_path / "table.csv"
     path.write_text(contents)
     with pytest.raises(InputError, match=message):
@@ -29,7 +29,7 @@ def test_tables_of_any_columns_are_checked(tmp_path, contents, message):
     assert path.read_text() == contents
 
 
-def test_columns_and_values_are_checked_where_they_are_known(tmp_path):
+def test_tables_with_wrong_columns_or_values_are_refused(tmp_path):
     path = tmp_path / "table.csv"
     for contents, message in (
         ("name,other\na,1\n", "line 1: is not the header name,value"),
@@ -50,7 +50,7 @@ def test_columns_and_values_are_checked_where_they_are_known(tmp_path):
     assert path.read_text() == "name,value\na,1\n"
 
 
-def test_files_that_cannot_be_read_or_written_are_named(tmp_path):
+def test_unreadable_and_unwritable_files_are_named(tmp_path):
     (tmp_path / "table.csv").mkdir()
     with pytest.raises(InputError, match=r"table.csv: cannot be read \(Is a directory\)"):
         Journal(tmp_path / "table.csv", ["name"])

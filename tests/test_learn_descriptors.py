@@ -1,4 +1,4 @@
-"""The script that learns descriptors: they depend on the surface alone, training goes on, nothing is half written."""
+"""The script that learns descriptors: invariances, resumed training, and complete files."""
 
 import sys
 from pathlib import Path
@@ -44,7 +44,7 @@ def small():
     with (
         pytest.MonkeyPatch.context() as patch,
         jax.numpy_dtype_promotion("standard"),
-    ):  # optax and equinox need it
+    ):  # optax and equinox need standard promotion
         patch.setattr(learn_descriptors, "EIGENVECTORS", 30)
         patch.setattr(learn_descriptors, "LAYER_EIGENVECTORS", EIGENVECTORS)
         yield
@@ -62,7 +62,7 @@ def spectra(creatures):
 
 @pytest.fixture(scope="module")
 def pair(creatures, spectra):
-    """A creature and its other pose, as training takes them."""
+    """A creature in two poses, in the form that training takes."""
     meshes = creatures.source, creatures.target
     chosen = [farthest_point_samples(mesh, SAMPLES) for mesh in meshes]
     positions = [
@@ -103,18 +103,18 @@ def learn(network, pair, directory, *, loss="labels", prepare=None):
 def test_learning_lowers_the_loss(network, pair, tmp_path, loss):
     trained = learn(network, pair, tmp_path, loss=loss)
     assert trained.losses.shape == (STEPS,) and trained.losses[-1] < trained.losses[0]
-    # What is watched is this very pair, before the first step and after the last.
+    # The watched pair is the training pair. Its loss is measured before the first and after the last step.
     np.testing.assert_array_equal(trained.steps, [0, STEPS])
     np.testing.assert_allclose(trained.watched[0], trained.losses[0], rtol=1e-9)
     assert trained.watched[1] < trained.losses[0]
 
 
-def test_descriptors_do_not_depend_on_signs(network, spectra):
+def test_descriptors_do_not_depend_on_signs_of_eigenvectors(network, spectra):
     x, _ = spectra
     signs = jnp.where(jnp.arange(30) % 3 == 1, -1.0, 1.0)[None, :]
     flipped = eqx.tree_at(lambda s: s.eigenvectors, x, x.eigenvectors * signs)
     np.testing.assert_allclose(network(flipped), network(x), atol=1e-12)
-    # But on the surface: without its eigenvectors they are others.
+    # Descriptors do depend on the eigenvectors: fewer eigenvectors give other descriptors.
     assert float(jnp.abs(network(x.truncate(5)) - network(x)).max()) > 1e-3
 
 
@@ -124,12 +124,12 @@ def test_descriptors_do_not_depend_on_numbering_units_or_padding(network, creatu
     expected = np.asarray(network(spectra[0]))[:n]
     order = np.random.default_rng(0).permutation(n)
     renumbered = make_mesh(7 * mesh.vertices[order], np.argsort(order)[mesh.faces])
-    # Not to rounding: eigensolvers begin elsewhere, and SHOT's sums run in another order.
+    # Rounding errors are large: the eigensolver has another initial vector, and SHOT adds in another order.
     np.testing.assert_allclose(np.asarray(network(described(renumbered)))[:n], expected[order], atol=1e-5)
     np.testing.assert_allclose(np.asarray(network(spectra[0].pad(2000)))[:n], expected, atol=1e-12)
 
 
-def test_starts_are_vertices_of_the_target(network, creatures, spectra):
+def test_nearest_descriptors_are_vertices_of_the_target(network, creatures, spectra):
     x, y = spectra
     found = np.asarray(nearest_descriptors(network, x, y))[: len(creatures.source.vertices)]
     assert found.min() >= 0 and found.max() < len(creatures.target.vertices)
@@ -137,8 +137,8 @@ def test_starts_are_vertices_of_the_target(network, creatures, spectra):
     np.testing.assert_array_equal(of_itself, np.arange(len(of_itself)))
 
 
-class Stops:
-    """Gives out prepared pairs so many times; then someone presses Ctrl-C."""
+class InterruptedPreparation:
+    """Returns the prepared pair `left` times and then raises KeyboardInterrupt."""
 
     def __init__(self, pair, left):
         self.pair, self.left = pair, left
@@ -150,24 +150,25 @@ class Stops:
         return self.pair
 
 
-def test_goes_on_where_it_was(network, pair, tmp_path, monkeypatch):
+def test_resumed_training_gives_the_same_result(network, pair, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_SAVED_EVERY", 2)
     for name in ("whole", "parts"):
         (tmp_path / name).mkdir()
     whole = learn(network, pair, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        learn(network, pair, tmp_path / "parts", prepare=Stops(pair, 4))  # one to watch, three to learn from
+        # One watched pair and three steps.
+        learn(network, pair, tmp_path / "parts", prepare=InterruptedPreparation(pair, 4))
     assert [file.name for file in (tmp_path / "parts").iterdir()] == ["training_labels.eqx"]
-    again = Stops(pair, 5)  # four steps, and one to watch
+    again = InterruptedPreparation(pair, 5)  # four steps and one watched pair
     resumed = learn(network, pair, tmp_path / "parts", prepare=again)
     assert again.left == 0
     for found, expected in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(found, expected)
-    # Once more: all is done already.
-    learn(network, pair, tmp_path / "parts", prepare=Stops(pair, 0))
+    # A third run has nothing left to do.
+    learn(network, pair, tmp_path / "parts", prepare=InterruptedPreparation(pair, 0))
 
 
-def test_networks_are_kept_bit_for_bit(network, spectra, tmp_path):
+def test_saved_networks_are_loaded_bit_for_bit(network, spectra, tmp_path):
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), network)
     for number, kept in enumerate((network, single)):
         save(kept, tmp_path / f"{number}.eqx")
@@ -176,7 +177,7 @@ def test_networks_are_kept_bit_for_bit(network, spectra, tmp_path):
         np.testing.assert_array_equal(again(spectra[0]), kept(spectra[0]))
 
 
-def test_an_interrupted_save_leaves_what_was_there(network, tmp_path, monkeypatch):
+def test_an_interrupted_save_keeps_the_existing_file(network, tmp_path, monkeypatch):
     save(network, tmp_path / "kept.eqx")
     before = (tmp_path / "kept.eqx").read_bytes()
 
@@ -217,14 +218,14 @@ def test_damaged_files_are_named(network, pair, tmp_path):
         learn(network, pair, tmp_path)
 
 
-def test_what_is_no_input_is_refused(network, pair, spectra, tmp_path):
+def test_invalid_inputs_are_refused(network, pair, spectra, tmp_path):
     x, _ = spectra
     with pytest.raises(ValueError, match="no descriptors, where 352 are needed"):
         network(x.with_descriptors(None))
     with pytest.raises(ValueError, match="10 descriptors, where 352"):
         network(x.with_descriptors(x.descriptors[:, :10]))
     for wrong in ({"width": 0}, {"blocks": 1.5}, {"filters": True}):
-        with pytest.raises(ValueError, match=f"at least one of its {next(iter(wrong))}"):
+        with pytest.raises(ValueError, match=f"Sizes.{next(iter(wrong))} must be an integer"):
             Sizes(**wrong)
     nowhere = pair._replace(truth=pair.truth.at[0, 0].set(jnp.nan))
     with pytest.raises(ArithmeticError, match=r"the loss became nan at step 0 \(a to"):
@@ -232,7 +233,7 @@ def test_what_is_no_input_is_refused(network, pair, spectra, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_arguments_that_do_not_work_are_refused_in_one_sentence(tmp_path, monkeypatch, capsys):
+def test_invalid_arguments_are_refused_in_one_sentence(tmp_path, monkeypatch, capsys):
     for arguments, sentence in (
         ([str(tmp_path / "nothing")], "is not a directory"),
         ([str(tmp_path), "--steps", "0"], "must be at least 1"),
@@ -245,14 +246,14 @@ def test_arguments_that_do_not_work_are_refused_in_one_sentence(tmp_path, monkey
         assert sentence in capsys.readouterr().err
 
 
-def test_the_summary_and_the_figure_say_how_it_went(tmp_path):
+def test_the_summary_states_the_differences_and_the_figure_is_written(tmp_path):
     rows = [
         {"SHOT, start": 200.0, "learned, start": 100.0, "SHOT, refined": 20.0, "learned, refined": 21.0},
         {"SHOT, start": 220.0, "learned, start": 110.0, "SHOT, refined": 10.0, "learned, refined": 10.5},
         {"SHOT, start": 210.0, "learned, start": 120.0, "SHOT, refined": 12.0, "learned, refined": 11.0},
     ]
     page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
-    assert "| people, start | 3 | 210.0 | 110.0 (−100.0 [" in page
+    assert "| people, initial map | 3 | 210.0 | 110.0 (−100.0 [" in page
     assert "| people, refined | 3 | 14.0 | 14.2 (+0.2 [" in page
     curve = learning.Trained(None, np.linspace(1, 0.5, 30), np.array([0, 20, 30]), np.array([1.0, 0.8, 0.7]))
     draw({"from labels": curve, "from cycles": curve}, tmp_path / "curves.png")

@@ -1,4 +1,4 @@
-"""The script that learns a frame: it lowers its losses, goes on where it was, and keeps what it learned."""
+"""The script that learns a frame: lower losses, resumed training, and saved frames."""
 
 import sys
 from pathlib import Path
@@ -25,24 +25,24 @@ N, K = 60, 12
 
 
 def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
-    """A shape and a disturbed copy."""
+    """The names of a pair, and a random spectrum with a disturbed copy as samples for training."""
     generator = np.random.default_rng(seed)
     x = random_spectrum(N, K, seed=seed)
     y = Spectrum(x.eigenvalues, x.eigenvectors + 0.3 * generator.normal(size=(N, K)), x.vertex_areas, x.mask)
     positions = jnp.asarray(generator.normal(size=(N, 3)))
-    start = np.where(generator.random(N) < 0.3, generator.integers(0, N, N), np.arange(N)).astype(np.int32)
-    starts = jnp.asarray(start), jnp.asarray(start)
+    initial_map = np.where(generator.random(N) < 0.3, generator.integers(0, N, N), np.arange(N))
+    initial_maps = (jnp.asarray(initial_map, jnp.int32),) * 2
     return SimpleNamespace(names=("a", str(seed)), name=f"a to {seed}"), Sampled(
-        x, y, positions, positions, *starts, positions
+        x, y, positions, positions, *initial_maps, positions
     )
 
 
 @pytest.fixture
 def pairs(monkeypatch):
-    # Vertices of random spectra are far from each other.
+    # The vertices of random spectra are far from each other, which needs a high temperature.
     monkeypatch.setattr(learn_frame, "TEMPERATURE", 1.0)
     made = [fake_pair(seed) for seed in range(3)]
-    with jax.numpy_dtype_promotion("standard"):  # which optax needs
+    with jax.numpy_dtype_promotion("standard"):  # optax needs standard promotion
         yield [pair for pair, _ in made], {pair.names: sampled for pair, sampled in made}
 
 
@@ -73,8 +73,8 @@ def test_learning_lowers_the_loss(pairs, tmp_path, name):
     assert float(abs(frame.logits - like_meyer().logits).max()) > 0.1
 
 
-class Stops(dict):
-    """Prepared pairs of which only so many are given out before someone presses Ctrl-C."""
+class InterruptedPairs(dict):
+    """Prepared pairs that raise KeyboardInterrupt after `left` look-ups."""
 
     left = 3
 
@@ -85,38 +85,38 @@ class Stops(dict):
         return super().__getitem__(key)
 
 
-def test_goes_on_where_it_was(pairs, tmp_path, monkeypatch):
+def test_resumed_training_gives_the_same_result(pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_SAVED_EVERY", 2)
     listed, prepared = pairs
     frame, losses = train("labels", listed, 6, 1, tmp_path / "whole", prepared)
     with pytest.raises(KeyboardInterrupt):
-        train("labels", listed, 6, 1, tmp_path / "parts", Stops(prepared))
-    again = Stops(prepared)
-    again.left = 4  # the two steps that were saved are not done again
+        train("labels", listed, 6, 1, tmp_path / "parts", InterruptedPairs(prepared))
+    again = InterruptedPairs(prepared)
+    again.left = 4  # the two saved steps are not repeated
     resumed, resumed_losses = train("labels", listed, 6, 1, tmp_path / "parts", again)
     np.testing.assert_array_equal(resumed.logits, frame.logits)
     np.testing.assert_array_equal(resumed_losses, losses)
 
 
-def test_whoever_interrupts_is_told_how_to_go_on(tmp_path, monkeypatch):
+def test_an_interruption_says_how_to_continue(tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "open_data", lambda directory: learning.Data([], [], [], []))
     output = tmp_path / "learned"
     monkeypatch.setattr(sys, "argv", [learn_frame.__file__, str(tmp_path), "--output", str(output)])
-    told = pytest.raises(SystemExit, match=r"the same command goes on from what .*learned holds")
+    told = pytest.raises(SystemExit, match=r"the same command continues from the results in .*learned")
     with told, learning.running(learning.parser("", output="", steps=1), {}):
         raise KeyboardInterrupt
 
 
-def test_frames_are_kept(tmp_path):
+def test_saved_frames_are_loaded_unchanged(tmp_path):
     frame, points = like_meyer(), jnp.linspace(0, 7, 40)
     save(frame, tmp_path / "frame.npz")
     bank = load(tmp_path / "frame.npz")
     np.testing.assert_array_equal(bank(points, points), bank_of(frame)(points, points))
-    # Learning starts near Meyer's frame.
+    # Training begins near the Meyer frame.
     np.testing.assert_allclose(bank(points, points), Meyer(6)(points, points), atol=0.2)
 
 
-def test_the_summary_says_whether_it_helped():
+def test_the_summary_states_the_difference_from_meyer():
     rows = [
         {"Meyer": 20.0, "learned": 18.0},
         {"Meyer": 10.0, "learned": 9.0},

@@ -1,4 +1,4 @@
-"""MATLAB files that would fill the memory are refused before they do; all others read as before."""
+"""MATLAB files that would fill the memory are refused, and all other files are read."""
 
 import io
 import struct
@@ -21,12 +21,12 @@ NUMERIC, CELL, STRUCT = 6, 1, 2
 
 
 def element(kind: int, data: bytes, size: int | None = None) -> bytes:
-    """An element that declares a size, by default the true one."""
+    """An element with a declared size, by default its true size."""
     return struct.pack("<II", kind, len(data) if size is None else size) + data + bytes(-len(data) % 8)
 
 
 def array(kind: int, shape: tuple[int, ...], contents: bytes = b"", size: int | None = None) -> bytes:
-    """An array called x of a class and a shape."""
+    """An array named x, of the class `kind`."""
     flags, name = element(6, struct.pack("<II", kind, 0)), element(1, b"x")
     return element(14, flags + element(5, struct.pack(f"<{len(shape)}i", *shape)) + name + contents, size)
 
@@ -41,9 +41,9 @@ HUGE = 3 << 30
 BOMBS = {
     # name: (variables, what the message says)
     "a compressed variable": (compressed(array(NUMERIC, (1000, 1), ZEROS, size=HUGE)), "more than 1 GiB"),
-    "four smaller ones": (4 * compressed(array(NUMERIC, (6250, 8), element(2, bytes(50_000_000)))), "more than 1 GiB"),
-    "a cell array that declares too much": (array(CELL, (2**31 - 1, 2**10), 10 * element(14, b"")), "damaged"),
-    "a nested one that declares too much": (array(CELL, (1, 1), array(CELL, (2**30, 2**30))), "damaged"),
+    "four smaller variables": (4 * compressed(array(NUMERIC, (6250, 8), element(2, bytes(50_000_000)))), "more than 1 GiB"),
+    "a cell array that declares too many elements": (array(CELL, (2**31 - 1, 2**10), 10 * element(14, b"")), "damaged"),
+    "a nested cell array that declares too many elements": (array(CELL, (1, 1), array(CELL, (2**30, 2**30))), "damaged"),
     "a struct array without fields": (array(STRUCT, (2**20, 2**12), element(5, struct.pack("<i", 8)) + element(1, b"")), "damaged"),
     "a struct with a million fields": (
         compressed(array(STRUCT, (1, 1), element(5, struct.pack("<i", 1)) + element(1, b"a" * 10**6))), "damaged",
@@ -98,7 +98,7 @@ def test_the_limit_holds_for_all_contents_together(monkeypatch, contents, compre
     assert parse_variables(file.getvalue()).keys() == contents.keys()
 
 
-def test_unpacking_changes_nothing():
+def test_unpacking_gives_the_contents_of_an_uncompressed_file():
     variables = {
         "matrix": np.random.default_rng(0).normal(size=(30, 4)),
         "flag": True,
@@ -114,7 +114,7 @@ def test_unpacking_changes_nothing():
     assert mat_format.unpacked(packed.getvalue())[128:] == plain.getvalue()[128:]
 
 
-def test_files_of_big_endian_machines():
+def test_files_of_big_endian_machines_are_read():
     parts = (6, (6, 0)), (5, (2, 1)), (9, np.array([3.5, -1], ">f8").tobytes())
     contents = [data if isinstance(data, bytes) else struct.pack(">2i", *data) for _, data in parts]
     elements = [struct.pack(">2I", kind, len(c)) + c for (kind, _), c in zip(parts, contents, strict=True)]
@@ -124,7 +124,7 @@ def test_files_of_big_endian_machines():
     assert parse_variables(data)["x"].tolist() == [3.5, -1]
 
 
-def test_files_of_level_4(tmp_path):
+def test_files_of_level_4_are_read(tmp_path):
     path = tmp_path / "old.mat"
     mesh = bumpy_mesh(1)
     scipy.io.savemat(path, {"T12": np.arange(1.0, 43)}, format="4")
@@ -132,7 +132,7 @@ def test_files_of_level_4(tmp_path):
 
 
 def test_eigenvectors_beyond_the_limit_are_read(monkeypatch, tmp_path):
-    """They hardly compress, so that four times the size of their file leaves room for them."""
+    """Eigenvectors hardly compress, so a limit of four times the size of their file is enough."""
     monkeypatch.setattr(mat_format, "largest_contents", lambda size: max(10_000, 4 * size))
     spectrum = jaxsmw.compute_spectrum(bumpy_mesh(2), 20)
     jaxsmw.io.write_spectrum(tmp_path / "s.mat", spectrum)

@@ -1,4 +1,4 @@
-"""One pair from meshes to correspondence."""
+"""Matching one pair, from meshes to the correspondence."""
 
 import inspect
 import logging
@@ -45,7 +45,7 @@ OPTIONS = {"preset": STAGE}
 
 @pytest.fixture(scope="module")
 def pair():
-    """A bumpy body, and a turned, rescaled, renumbered and slightly noisy copy, with the true map."""
+    """A bumpy body, a rotated, scaled, renumbered and slightly noisy copy, and the true map."""
     mesh_x = bumpy_mesh(4)
     generator = np.random.default_rng(1)
     order = generator.permutation(len(mesh_x.vertices))
@@ -62,7 +62,7 @@ def mean_error(mesh_y: Mesh, t: np.ndarray, truth: np.ndarray) -> float:
     )
 
 
-def test_finds_the_copy(pair):
+def test_matches_a_noisy_copy(pair):
     mesh_x, mesh_y, truth = pair
     result = match(mesh_x, mesh_y, **OPTIONS)
     before = mean_error(mesh_y, result.initial_map, truth)
@@ -75,8 +75,8 @@ def test_finds_the_copy(pair):
 
 
 @pytest.mark.parametrize("init", ["shot", "wks", "functional", [[0, 0], [900, 900], [2000, 2000]]])
-def test_large_meshes_start_among_samples(pair, init, monkeypatch):
-    """Descriptors of half of the vertices lead where those of all do: to the right map."""
+def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
+    """Descriptors at half of the vertices suffice for the right map."""
     mesh_x, mesh_y, truth = pair
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
@@ -92,8 +92,8 @@ def test_large_meshes_start_among_samples(pair, init, monkeypatch):
     assert mean_error(mesh_y, result.pointwise_map, truth) < 0.02
 
 
-def test_both_shapes_have_the_same_eigensolver(pair, monkeypatch):
-    """Also where one is larger than what is approximated, and the other is not."""
+def test_both_shapes_use_the_same_eigensolver(pair, monkeypatch):
+    """Only one of the meshes has enough vertices for the approximate eigensolver."""
     mesh_x = pair[0]
     monkeypatch.setattr(eigenbasis, "APPROXIMATE_FROM", 2000)
     smaller = bumpy_mesh(3)
@@ -103,18 +103,18 @@ def test_both_shapes_have_the_same_eigensolver(pair, monkeypatch):
         np.testing.assert_array_equal(spectrum.eigenvalues, wanted)
 
 
-def test_the_approximate_eigenbasis_matches_as_well(pair):
+def test_the_approximate_eigenbasis_is_nearly_as_accurate(pair):
     mesh_x, mesh_y, truth = pair
     exact, approximate = (
         match(mesh_x, mesh_y, eigensolver=solver, **OPTIONS) for solver in ("exact", "approximate")
     )
     assert (exact.spectrum_x.eigenvalues[1:] < approximate.spectrum_x.eigenvalues[1:]).all()
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (exact, approximate)]
-    # Of a copy, noise aside, all vertices are found exactly.
+    # Without noise, all vertices of the copy would be matched exactly.
     assert errors[1] < errors[0] + 0.003
 
 
-def test_repeats_bit_for_bit(pair):
+def test_results_are_reproducible_bit_for_bit(pair):
     first, second = (match(*pair[:2], **OPTIONS) for _ in range(2))
     np.testing.assert_array_equal(first.pointwise_map, second.pointwise_map)
     np.testing.assert_array_equal(first.functional_map, second.functional_map)
@@ -125,7 +125,7 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
     jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=samples))
-    # Where messages about compilation are wanted in this thread only, those of another do not appear.
+    # jax.log_compiles applies to this thread only, so compilation in another thread is not logged.
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
 
@@ -145,14 +145,14 @@ def compilations():
 
 @pytest.mark.parametrize("preset", ["fast", "accurate", replace(STAGE, stop_when_unchanged=True)], ids=str)
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
-    """Programs compiled ahead, from outlines of the arrays, are those that refinement runs."""
+    """Refinement runs the programs that were compiled ahead from the shapes of the arrays."""
     jax.clear_caches()
     found = match(*pair[:2], preset=preset)
-    assert compilations.count("jit(refine)") == len(found.stages)
+    assert compilations.count("jit(refine)") == len(found.preset.stages)
 
 
 def test_the_reverse_map_of_registration_compares_all_columns():
-    """Above 15 000 vertices the search uses patches, also with fewer eigenvectors than columns."""
+    """Above 15 000 vertices the search uses patches, even if columns outnumber eigenvectors."""
     creature = creature_pair(vertices=15_600)
     truth = creature.truth.nearest_corners(creature.target)
     stage = Stage(Registration((20, 30)), number_of_samples=400)
@@ -185,13 +185,13 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 
 
-def test_pairs_of_about_one_size_share_programs(caplog):
+def test_pairs_of_similar_size_share_compiled_programs(caplog):
     pairs = [creature_pair(vertices=vertices) for vertices in (700, 720)]
     assert len({len(mesh.vertices) for pair in pairs for mesh in (pair.source, pair.target)}) == 4
     match(pairs[0].source, pairs[0].target, preset=STAGE)
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         found = match(pairs[1].source, pairs[1].target, preset=STAGE, history=False)
-    assert "jit(pad)" in caplog.text  # of the size that is theirs
+    assert "jit(pad)" in caplog.text  # padding is compiled for each size
     assert "jit(refine)" not in caplog.text and "jit(nearest_neighbor)" not in caplog.text
     m = len(pairs[1].source.vertices)
     assert found.refinement.pointwise_map.shape == found.spectrum_x.mask.shape == (m,)
@@ -208,7 +208,7 @@ def test_scale_and_rotation_do_not_matter(pair):
 
 
 @pytest.mark.parametrize("init", ["shot", "wks", "hks", "wavelet", "landmarks", "map"])
-def test_every_start_is_better_than_chance_and_differs(pair, init):
+def test_every_initial_map_is_better_than_chance_and_differs_from_shot(pair, init):
     mesh_x, mesh_y, truth = pair
     given = init
     if init == "landmarks":
@@ -255,7 +255,7 @@ def test_every_option_changes_the_result(pair, options):
     )
 
 
-def test_history_and_early_stop(pair):
+def test_history_ends_when_the_map_no_longer_changes(pair):
     patient = replace(STAGE, iterations=30, stop_when_unchanged=True)
     result = match(*pair[:2], preset=patient, history=True)
     assert result.iterations < 30
@@ -266,7 +266,7 @@ def test_history_and_early_stop(pair):
     assert match(*pair[:2], **OPTIONS).refinement.history is None
 
 
-def test_unreferenced_vertices_on_either_side(pair):
+def test_unreferenced_vertices_do_not_change_other_matches(pair):
     mesh_x, mesh_y, _ = pair
     plain = match(mesh_x, mesh_y, **OPTIONS).pointwise_map
     stray_x = make_mesh(
@@ -279,7 +279,7 @@ def test_unreferenced_vertices_on_either_side(pair):
 
 
 def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
-    """Threads of OpenBLAS that wait for work would slow down all that is not linear algebra."""
+    """OpenBLAS threads that wait for work slow down everything except linear algebra."""
 
     def threads() -> list[int]:
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
@@ -299,7 +299,7 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
 
 def test_stages_are_logged(pair, caplog, monkeypatch):
-    # Whatever a command has set up in this process before.
+    # An earlier command in this process may have changed the logger.
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "handlers", [caplog.handler])
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
@@ -328,13 +328,13 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     ],
     ids=str,
 )
-def test_bad_arguments(pair, options, fault):
+def test_invalid_arguments_are_refused(pair, options, fault):
     with pytest.raises(InputError, match=fault):
         match(*pair[:2], **(OPTIONS | options))
 
 
-def test_whether_a_pair_is_partial_is_no_word(pair):
-    untyped = inspect.unwrap(Pair.make.__func__)  # as without the checks of types that tests have
+def test_partial_must_be_a_truth_value(pair):
+    untyped = inspect.unwrap(Pair.make.__func__)  # without the run-time type checks of the tests
     with pytest.raises(InputError, match="partial is 'yes'; give True or False"):
         untyped(Pair, *pair[:2], partial="yes")
 
@@ -342,13 +342,13 @@ def test_whether_a_pair_is_partial_is_no_word(pair):
 def test_maps_and_landmarks_must_lie_on_the_surface(pair):
     mesh_x, mesh_y, _ = pair
     stray = make_mesh(np.insert(mesh_y.vertices, 0, 0.0, axis=0), mesh_y.faces + 1)
-    with pytest.raises(InputError, match="no face uses"):
+    with pytest.raises(InputError, match="unreferenced vertices"):
         match(mesh_x, stray, **OPTIONS, init=np.zeros(len(mesh_x.vertices), int))
     with pytest.raises(InputError, match="landmark 0"):
         match(mesh_x, stray, **OPTIONS, init=np.array([[0, 0]]))
 
 
-def test_numbers_that_went_wrong_are_not_returned(pair):
+def test_nonfinite_results_raise_an_error(pair):
     class Broken(WaveletPreservation):
         def update(self, prepared, pointwise_map, previous):
             state, result = super().update(prepared, pointwise_map, previous)
@@ -358,7 +358,7 @@ def test_numbers_that_went_wrong_are_not_returned(pair):
         match(*pair[:2], preset=Stage(Broken(), number_of_eigenvectors=20))
 
 
-def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
+def test_the_initial_map_by_shot_takes_nearest_neighbours(pair):
     from jaxsmw.geometry.shot import shot_descriptors
 
     mesh_x, mesh_y, _ = pair
@@ -368,7 +368,7 @@ def test_initial_map_of_a_descriptor_is_its_nearest_neighbour(pair):
 
 
 @pytest.mark.parametrize("thinned", [False, True])
-def test_alternative_initial_maps_differ_and_are_better_here(pair, thinned, monkeypatch):
+def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair, thinned, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
     if thinned:
@@ -376,16 +376,16 @@ def test_alternative_initial_maps_differ_and_are_better_here(pair, thinned, monk
         monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *spectra))
     assert len(starts) == 3
-    # With descriptors there are more, by the ends of limbs; of this body there is but one way to pair them.
+    # Spectra with descriptors add maps from pairings of extremities. This body adds only one map.
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
     assert mean_error(mesh_y, by_extremities, truth) < 0.1
     usual = initial_map(Pair(mesh_x, mesh_y), *spectra)
     for start in starts:
         assert start.dtype == np.int64 and start.shape == truth.shape
-        # Read back from a filtered functional map, they are smoother than nearest neighbours.
+        # Maps from a filtered functional map are smoother than maps from nearest neighbours.
         assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, usual, truth)
-    if thinned:  # else all find nearly the whole copy
+    if thinned:  # otherwise all maps are nearly exact
         assert all(np.any(a != b) for a, b in combinations(starts, 2))
 
 
@@ -396,7 +396,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     monkeypatch.setattr(descriptors, "_FINE", 10**6)
     coarse = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
-    for x, y in (described, coarse):  # of mean square 1, and the same on both shapes
+    for x, y in (described, coarse):  # the mean square over both shapes is 1
         squares = [
             np.asarray(s.vertex_areas) @ np.asarray(s.descriptors) ** 2 / np.sum(s.vertex_areas)
             for s in (x, y)
@@ -405,8 +405,8 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     assert np.abs(np.asarray(described[0].descriptors - coarse[0].descriptors)).max() > 0.1
 
 
-def test_functional_start_preserves_descriptors_smoothly(pair):
-    """Among the same descriptors the functional map finds better matches than the nearest neighbours do."""
+def test_the_functional_initial_map_is_better_than_nearest_neighbours(pair):
+    """From the same descriptors, a functional map gives better matches than nearest neighbours."""
     mesh_x, mesh_y, truth = pair
     spectra = [compute_spectrum(mesh, 30) for mesh in (mesh_x, mesh_y)]
     nearest, functional = (
@@ -426,16 +426,16 @@ def test_functional_start_preserves_descriptors_smoothly(pair):
     ],
     ids=str,
 )
-def test_stages_that_cannot_work(settings, fault):
+def test_invalid_stages_are_refused(settings, fault):
     with pytest.raises((InputError, TypeCheckError), match=fault):
         Stage(**settings)
 
 
-def test_presets_find_the_copy(pair):
+def test_presets_match_a_copy_accurately(pair):
     mesh_x, mesh_y, truth = pair
     accurate, paper = match(mesh_x, mesh_y), match(mesh_x, mesh_y, preset="paper")
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (accurate, paper)]
-    assert max(errors) < 0.002  # of a copy
+    assert max(errors) < 0.002
     assert accurate.iterations == 3 + 4 + 4 and accurate.functional_map.shape == (200, 200)
     assert list(accurate.seconds) == ["eigenbases", "initial map", "descriptors", "samples", "refinement"]
     assert accurate.expected_error().mean() < 0.002
@@ -445,14 +445,14 @@ def test_presets_find_the_copy(pair):
 
 
 def test_presets_fit_small_meshes(monkeypatch):
-    """Of 162 vertices there are no 200 eigenvectors, nor 1000 samples."""
-    # Beartype, which only tests use, catches warnings of its own, and in a thread beside this one then ours.
+    """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
+    # Beartype, which only tests use, captures warnings. In a compilation thread it would capture ours, too.
     monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="goes on without descriptors: .* coarse"):
         found = match(mesh, mesh, init=np.arange(162))
     assert found.functional_map.shape == (81, 81)
-    last = found.stages[-1]
+    last = found.preset.stages[-1]
     assert last.number_of_samples is None and last.number_of_descriptors == 0
     with pytest.raises(InputError, match="coarse"):
         match(
@@ -479,18 +479,18 @@ def test_an_unknown_preset_is_refused():
         ({"number_of_samples": 500.0}, "number_of_samples"),
     ],
 )
-def test_stages_that_cannot_be_are_refused(settings, fault):
+def test_stage_sizes_must_be_positive_integers(settings, fault):
     with pytest.raises((InputError, TypeCheckError), match=fault):
         Stage(**settings)
 
 
-def test_a_single_triangle_is_too_little(pair):
+def test_a_mesh_of_one_triangle_is_refused(pair):
     triangle = make_mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle.off")
     with pytest.raises(InputError, match=r"triangle\.off: its faces use 3 vertices, .* at least 4"):
         match(triangle, pair[1])
 
 
-def test_a_soup_of_triangles_is_named(pair):
+def test_triangle_soup_is_refused_with_a_hint_to_weld(pair):
     mesh = pair[0]
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
     with pytest.raises(InputError, match=r"30 eigenvectors only tell to which connected component .* --weld"):
@@ -499,7 +499,7 @@ def test_a_soup_of_triangles_is_named(pair):
 
 @pytest.fixture(scope="module")
 def part(pair):
-    """The upper two thirds of the bumpy body as X, the whole as Y in the same unit, and the true map."""
+    """The upper two thirds of the bumpy body as X, the full shape as Y in the same unit, and the true map."""
     whole = pair[0]
     kept = whole.vertices[:, 2] > np.quantile(whole.vertices[:, 2], 1 / 3)
     faces = whole.faces[kept[whole.faces].all(axis=1)]
@@ -511,7 +511,7 @@ def part(pair):
     )
 
 
-def test_spectra_of_a_part_keep_the_unit_of_the_whole(part):
+def test_spectra_of_a_partial_shape_keep_the_unit_of_the_full_shape(part):
     mesh_x, mesh_y, _ = part
     x, y = paired_spectra(Pair(mesh_x, mesh_y, True), 40)
     own = compute_spectrum(mesh_x, 40)
@@ -522,14 +522,14 @@ def test_spectra_of_a_part_keep_the_unit_of_the_whole(part):
     gram = x.eigenvectors.T @ (x.vertex_areas[:, None] * x.eigenvectors)
     np.testing.assert_allclose(gram, np.eye(k), atol=1e-9)
     assert x.eigenvalues[-1] <= y.eigenvalues[-1] < (own.eigenvalues * mesh_y.area / mesh_x.area)[k]
-    # The other way round nothing changes but the names.
+    # Exchanging X and Y exchanges their spectra.
     reverse = paired_spectra(Pair(mesh_y, mesh_x, True), 40)
     np.testing.assert_array_equal(reverse[1].eigenvalues, x.eigenvalues)
     whole = paired_spectra(Pair(mesh_x, mesh_y), 40)
     np.testing.assert_array_equal(whole[0].eigenvalues, own.eigenvalues)
 
 
-def test_a_part_in_another_unit_is_refused(part):
+def test_a_partial_shape_in_another_unit_is_refused(part):
     mesh_x, mesh_y, _ = part
     shrunken = make_mesh(mesh_x.vertices / 100, mesh_x.faces, name="x.off")
     with pytest.raises(
@@ -538,7 +538,7 @@ def test_a_part_in_another_unit_is_refused(part):
         match(shrunken, mesh_y, partial=True)
 
 
-def test_a_part_is_found_in_the_whole(part):
+def test_a_partial_shape_is_matched_to_the_full_shape(part):
     mesh_x, mesh_y, truth = part
     found = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), partial=True)
     as_wholes = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40))
@@ -550,7 +550,7 @@ def test_a_part_is_found_in_the_whole(part):
 
 
 @pytest.mark.parametrize("init", ["functional", np.array([[0, 0], [900, 900]])], ids=str)
-def test_other_initial_maps_of_a_part(part, init):
+def test_other_initial_maps_work_for_partial_shapes(part, init):
     mesh_x, mesh_y, truth = part
     if not isinstance(init, str):
         init = np.stack([init[:, 0], truth[init[:, 1]]], axis=1)
@@ -558,8 +558,8 @@ def test_other_initial_maps_of_a_part(part, init):
     assert mean_error(mesh_y, found.initial_map, truth) < 0.15
 
 
-def test_surface_points_follow_the_map_between_vertices(pair):
-    """To a coarser copy of the body, whose vertices are too few to be where its points belong."""
+def test_surface_points_are_more_accurate_than_vertices(pair):
+    """The target is a coarser copy, so the true positions are between its vertices."""
     mesh_x, coarse = pair[0], bumpy_mesh(3)
     result = match(mesh_x, coarse, **OPTIONS)
     points = result.surface_points()
@@ -590,13 +590,13 @@ def test_unreferenced_vertices_share_matches_one_to_one(pair):
     found = result.one_to_one()
     assert found.dtype == np.int64 and found[-1] == found[0]
     np.testing.assert_array_equal(np.sort(found[:-1]), np.arange(len(truth)))
-    # On the same triangulation no vertex needs to go astray.
+    # Both meshes have one triangulation, so one-to-one matches need not be worse.
     assert mean_error(mesh_y, found[:-1], truth) <= mean_error(mesh_y, result.pointwise_map[:-1], truth)
     with pytest.raises(InputError, match=r"2562 vertices of the source .* 642 .* swap"):
         match(mesh_x, bumpy_mesh(3), **OPTIONS).one_to_one()
 
 
-def test_soft_map_carries_positions(pair):
+def test_soft_map_transfers_positions(pair):
     mesh_x, mesh_y, truth = pair
     extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
     result = match(extra, mesh_y, **OPTIONS)
@@ -614,7 +614,7 @@ def test_soft_map_carries_positions(pair):
             result.soft_map(**settings)
 
 
-def test_a_start_on_triangles_is_taken_to_their_corners(pair):
+def test_an_initial_map_to_surface_points_uses_their_nearest_corners(pair):
     mesh_x, mesh_y, _ = pair
     start = mesh_y.faces[np.arange(len(mesh_x.vertices)) % len(mesh_y.faces)]
     weights = np.full((len(start), 3), 0.01)

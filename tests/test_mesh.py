@@ -49,7 +49,7 @@ def same_mesh(a: Mesh, b: Mesh) -> bool:
 
 @pytest.fixture
 def saved(tmp_path):
-    """Write a file and return its path."""
+    """A function that writes a file and returns its path."""
 
     def save(name: str, content: str | bytes) -> Path:
         path = tmp_path / name
@@ -112,9 +112,9 @@ BAD_ARRAYS = {
     "all faces repeat a vertex": (SQUARE, [[0, 0, 1], [2, 3, 2]], "no triangle has an area"),
     "on a line": ([[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[0, 1, 2]], "no triangle has an area"),
     "on a slanted line": (np.outer([0, 1, 3], [0.1, 0.7, 0.3]), [[0, 1, 2]], "no triangle has an area"),
-    "in one point": (np.ones((3, 3)), [[0, 1, 2]], "no triangle has an area"),
+    "all at one point": (np.ones((3, 3)), [[0, 1, 2]], "no triangle has an area"),
     "too large": (np.array(SQUARE) * 1e200, SQUARE_FACES, "another unit"),
-    "beyond the largest float apart": ((np.array(SQUARE) * 2.0 - 1) * 1.7e308, SQUARE_FACES, "another unit"),
+    "extent beyond float64": ((np.array(SQUARE) * 2.0 - 1) * 1.7e308, SQUARE_FACES, "another unit"),
     "too small": (np.array(SQUARE) * 1e-200, SQUARE_FACES, "another unit"),
     "a corner far away": (
         [*SQUARE[:3], [0, -1e30, 0], *BUMPS],
@@ -137,7 +137,7 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize(("vertices", "faces", "fault"), BAD_ARRAYS.values(), ids=BAD_ARRAYS)
 @pytest.mark.parametrize("weld", [False, True])
-def test_bad_arrays_end_in_one_sentence(vertices, faces, fault, weld):
+def test_invalid_arrays_are_refused_in_one_sentence(vertices, faces, fault, weld):
     with pytest.raises(InputError) as caught:
         make_mesh(vertices, faces, name="my body", weld=weld)
     message = str(caught.value)
@@ -147,7 +147,7 @@ def test_bad_arrays_end_in_one_sentence(vertices, faces, fault, weld):
 
 @pytest.mark.parametrize("scale", [1e-20, 1, 1e20])
 def test_distant_vertices_are_accepted_within_the_limits(scale):
-    """Far from the origin, with a distant unreferenced vertex, and with a distant corner, in any unit."""
+    """The cases are a mesh far from the origin, a distant unreferenced vertex, and a distant corner."""
     for vertices in (np.array(SQUARE) + 1e11, [*SQUARE, [1e11, 0, 0]], [*SQUARE[:3], [0, 1e5, 0]]):
         mesh = make_mesh(np.array(vertices) * scale, SQUARE_FACES)
         np.testing.assert_array_equal(mesh.vertices, np.array(vertices) * scale)
@@ -211,7 +211,7 @@ def mesh(request) -> Mesh:
     return grid if request.param == "grid" else OCTAHEDRON
 
 
-def test_areas_and_normals_against_libigl(mesh):
+def test_areas_and_normals_agree_with_libigl(mesh):
     assert np.allclose(2 * mesh.face_areas, igl.doublearea(mesh.vertices, mesh.faces), rtol=1e-13, atol=0)
     lumped = scipy.sparse.csc_matrix(
         igl.massmatrix(mesh.vertices, mesh.faces, igl.MASSMATRIX_TYPE_BARYCENTRIC)
@@ -224,7 +224,7 @@ def test_areas_and_normals_against_libigl(mesh):
     assert (mesh.vertex_normals[~used] == 0).all() and (mesh.vertex_areas[~used] == 0).all()
 
 
-def test_edges_against_a_plain_count(mesh):
+def test_edges_agree_with_a_plain_count(mesh):
     count = Counter(
         (min(i, j), max(i, j)) for a, b, c in mesh.faces.tolist() for i, j in ((a, b), (b, c), (c, a))
     )
@@ -232,7 +232,7 @@ def test_edges_against_a_plain_count(mesh):
     assert mesh.boundary_edges.tolist() == [list(edge) for edge in sorted(count) if count[edge] == 1]
 
 
-def test_octahedron_in_closed_form():
+def test_properties_of_an_octahedron_follow_closed_forms():
     assert OCTAHEDRON.area == pytest.approx(4 * np.sqrt(3), rel=1e-15)
     assert np.allclose(OCTAHEDRON.vertex_areas, 2 / np.sqrt(3), rtol=1e-15)
     assert np.allclose(OCTAHEDRON.vertex_normals, OCTAHEDRON.vertices, atol=1e-15)
@@ -241,7 +241,7 @@ def test_octahedron_in_closed_form():
 
 
 def test_normals_are_zero_where_they_cancel():
-    # Both sides of a triangle; the other side consists of two triangles, so that rounding leaves a residue.
+    # The front is one triangle and the back is two triangles, so rounding leaves a residue.
     corners = np.array(
         [[0.1, 0.2, 0.3], [1, 0, 0.5], [0, 1, 0.7], [1, 0, 0.5], [0, 1, 0.7], [0.3, 0.7, 0.64]]
     )
@@ -296,7 +296,7 @@ DIAGNOSES = {
 
 
 @pytest.mark.parametrize(("faces", "expected"), DIAGNOSES.values(), ids=DIAGNOSES)
-def test_peculiarities_are_counted(faces, expected):
+def test_diagnose_counts_defects(faces, expected):
     found = dataclasses.asdict(diagnose(make_mesh(POINTS, faces)))
     usual = dict(
         vertices=12, faces=len(faces), components=1, boundary_edges=0, boundary_loops=1, nonmanifold_edges=0,
@@ -320,7 +320,7 @@ def test_each_finding_has_one_sentence():
         assert sentence.startswith(part) and sentence.endswith(".") and "\n" not in sentence
 
 
-def test_degenerate_faces_are_relative_and_at_any_scale():
+def test_degenerate_faces_are_found_at_any_scale():
     heights = np.array([0, 1e-14, 1e-11, 1e-9, 1e-3])
     for scale in (1e-55, 1e-6, 1, 1e6, 1e55):
         vertices = np.concatenate([[[0, 0, 0], [1, 0, 0]], [[0.5, h, 0] for h in heights]]) * scale
@@ -391,7 +391,7 @@ SQUARE_FILES = {
     "no end of line.off": "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3",
     "no edge count.off": "OFF\n4 2\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
     "one-line header.off": "OFF 4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
-    "glued header.off": "OFF4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
+    "header without space.off": "OFF4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
     "UPPER.OFF": "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
     "dos.off": "OFF\r\n4 2 0\r\n0 0 0\r\n1 0 0\r\n1 1 0\r\n0 1 0\r\n3 0 1 2\r\n3 0 2 3\r\n",
     "old mac.off": "OFF\r4 2 0\r0 0 0\r1 0 0\r1 1 0\r0 1 0\r3 0 1 2\r3 0 2 3\r",
@@ -506,7 +506,7 @@ def text_stl(corners: np.ndarray) -> str:
 @pytest.mark.parametrize("form", ["binary", "binary that says solid", "text", "TEXT", "text in one line"])
 def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
     corners = np.array(SQUARE, float)[[[2, 3, 0], [0, 1, 2]]]
-    corners[1, 0] = -0.0  # the same place as 0
+    corners[1, 0] = -0.0  # the same position as 0.0
     content = {
         "binary": binary_stl(corners),
         "binary that says solid": binary_stl(corners, header=b"solid facet"),
@@ -520,8 +520,8 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
     assert len(mesh.notes) == 1 and "4 vertices, numbered by first appearance" in mesh.notes[0]
 
 
-def test_welding_says_when_it_changes_nothing(saved):
-    """For example in STL files, whose corners the reader merges."""
+def test_welding_reports_that_it_changed_nothing(saved):
+    """One case is an STL file, because the reader already merges its corners."""
     path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
     plain, welded = read_mesh(path), read_mesh(path, weld=True)
     assert same_mesh(plain, welded) and diagnose(plain).components == 1
@@ -534,11 +534,11 @@ def test_welding_says_when_it_changes_nothing(saved):
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl"])
-def test_files_of_another_program(tmp_path, suffix):
+def test_files_written_by_trimesh_are_read(tmp_path, suffix):
     mesh = bumpy_grid(9)
     path = tmp_path / f"m.{suffix}"
     exporter = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert len(exporter.vertex_normals) == len(mesh.vertices)  # once computed they are written too
+    assert len(exporter.vertex_normals) == len(mesh.vertices)  # trimesh exports normals after computing them
     exporter.export(path)
     again = read_mesh(path)
     if suffix == "stl":
@@ -594,14 +594,14 @@ HOSTILE = {
     "negative count.off": (f"OFF\n-3 1 0\n{T}3 0 1 2\n", "numbers of vertices"),
     "fractional count.off": (f"OFF\n3.5 1 0\n{T}3 0 1 2\n", "numbers of vertices"),
     "count of 5000 digits.off": (f"OFF\n{'9' * 5000} 1 0\n{T}3 0 1 2\n", "numbers of vertices"),
-    "too many vertices promised.off": (f"OFF\n4 1 0\n{T}3 0 1 2\n", "promises 4 vertices"),
-    "too few vertices promised.off": (f"OFF\n2 1 0\n{T}3 0 1 2\n", "promises 2 vertices"),
+    "too many vertices declared.off": (f"OFF\n4 1 0\n{T}3 0 1 2\n", "declares 4 vertices"),
+    "too few vertices declared.off": (f"OFF\n2 1 0\n{T}3 0 1 2\n", "declares 2 vertices"),
     "vertices for faces.off": (f"OFF\n2 2 0\n{T}3 0 1 2\n", "0 corners"),
-    "fractional vertices for faces.off": ("OFF\n2 2 0\n0 0 0\n1 0 0\n0.5 1 0\n3 0 1 2\n", "a face should be"),
-    "faces for vertices.off": (f"OFF\n4 0 0\n{T}3 0\n", "'3 0' stands where 3 numbers"),
-    "too many faces promised.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n", "2 faces"),
-    "too few faces promised.off": (f"OFF\n3 1 0\n{T}3 0 1 2\n3 0 1 2\n", "and 1 face"),
-    "a trillion vertices.off": (f"OFF\n1000000000000 1 0\n{T}3 0 1 2\n", "promises 1000000000000"),
+    "fractional vertices for faces.off": ("OFF\n2 2 0\n0 0 0\n1 0 0\n0.5 1 0\n3 0 1 2\n", "where a face with its number of corners"),
+    "faces for vertices.off": (f"OFF\n4 0 0\n{T}3 0\n", "'3 0' is written where 3 numbers"),
+    "too many faces declared.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n", "2 faces"),
+    "too few faces declared.off": (f"OFF\n3 1 0\n{T}3 0 1 2\n3 0 1 2\n", "and 1 face"),
+    "a trillion vertices.off": (f"OFF\n1000000000000 1 0\n{T}3 0 1 2\n", "declares 1000000000000"),
     "a trillion faces.off": (f"OFF\n3 1000000000000 0\n{T}3 0 1 2\n", "1000000000000 faces"),
     "truncated in vertices.off": ("OFF\n3 1 0\n0 0 0\n1 0", "truncated"),
     "truncated in a face.off": (f"OFF\n3 1 0\n{T}3 0 1", "4 numbers"),
@@ -611,8 +611,8 @@ HOSTILE = {
     "inf.off": ("OFF\n3 1 0\n0 0 0\n1 0 -inf\n0 1 0\n3 0 1 2\n", "finite"),
     "overflow.off": ("OFF\n3 1 0\n0 0 0\n1e999 0 0\n0 1 0\n3 0 1 2\n", "finite"),
     "word.off": ("OFF\n3 1 0\n0 0 0\n1 zero 0\n0 1 0\n3 0 1 2\n", "'1 zero 0'"),
-    "underscore.off": ("OFF\n3 1 0\n0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0 0 0' stands where 3 numbers"),
-    "underscore in a face.off": (f"OFF\n3 1 0\n{T}3 0 1 0_2\n", "'3 0 1 0_2' stands where 4 numbers"),
+    "underscore.off": ("OFF\n3 1 0\n0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0 0 0' is written where 3 numbers"),
+    "underscore in a face.off": (f"OFF\n3 1 0\n{T}3 0 1 0_2\n", "'3 0 1 0_2' is written where 4 numbers"),
     "underscore in a count.off": (f"OFF\n3_0 1 0\n{T}3 0 1 2\n", "numbers of vertices"),
     "hexadecimal.off": ("OFF\n3 1 0\n0 0 0\n0x1 0 0\n0 1 0\n3 0 1 2\n", "'0x1 0 0'"),
     "comma.off": ("OFF\n3 1 0\n0,0 0,0 0,0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0,0 0,0 0,0'"),
@@ -649,25 +649,25 @@ HOSTILE = {
     "huge.obj": (V + "f 1 2 99999999999999999999\n", "uses vertex 1e+20"),
     "word in a face.obj": (V + "f 1 2 c\n", "3 1 2 c"),
     "slashes.obj": (V + "f / // /\n", "0 corners"),
-    "header without end.ply": (PLY_HEAD, "no end"),
-    "no format.ply": (("ply\n" + PLY_HEAD[21:] + PLY_FACE + T + "3 0 1 2\n"), "none of the formats"),
-    "unknown format.ply": (PLY_HEAD.replace("ascii", "xml") + PLY_FACE, "none of the formats"),
-    "two formats.ply": (PLY_HEAD + "format ascii 1.0\n" + PLY_FACE + T + "3 0 1 2\n", "none of the formats"),
+    "header without end.ply": (PLY_HEAD, "no end_header"),
+    "no format.ply": (("ply\n" + PLY_HEAD[21:] + PLY_FACE + T + "3 0 1 2\n"), "not name exactly one of the formats"),
+    "unknown format.ply": (PLY_HEAD.replace("ascii", "xml") + PLY_FACE, "not name exactly one of the formats"),
+    "two formats.ply": (PLY_HEAD + "format ascii 1.0\n" + PLY_FACE + T + "3 0 1 2\n", "not name exactly one of the formats"),
     "version that does not exist.ply": (PLY_HEAD.replace("1.0", "9.9") + PLY_FACE + T + "3 0 1 2\n", "in version 1.0"),
     "no version.ply": (PLY_HEAD.replace(" 1.0", "") + PLY_FACE + T + "3 0 1 2\n", "in version 1.0"),
-    "format without name.ply": (PLY_HEAD.replace(" ascii 1.0", "") + PLY_FACE, "none of the formats"),
+    "format without name.ply": (PLY_HEAD.replace(" ascii 1.0", "") + PLY_FACE, "not name exactly one of the formats"),
     "property first.ply": ("ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property float x"),
     "unknown type.ply": (PLY_HEAD + "property quad w\n" + PLY_FACE, "property quad w"),
     "list of fractional length.ply": (PLY_HEAD + PLY_FACE.replace("uchar", "float"), "list float int"),
     "property twice.ply": (PLY_HEAD + "property float x\n" + PLY_FACE, "property float x"),
     "element twice.ply": (PLY_HEAD + "element vertex 3\n" + PLY_FACE, "element vertex 3"),
     "negative count.ply": (PLY_HEAD.replace("vertex 3", "vertex -3") + PLY_FACE, "element vertex -3"),
-    "junk in the header.ply": (PLY_HEAD + "\xff\xfe\n" + PLY_FACE + T + "3 0 1 2\n", "makes no sense"),
-    "no vertices.ply": ("ply\nformat ascii 1.0\n" + PLY_FACE + "3 0 1 2\n", "no x, y and z"),
-    "no z.ply": (PLY_HEAD.replace("float z", "float w") + PLY_FACE + T + "3 0 1 2\n", "no x, y and z"),
+    "junk in the header.ply": (PLY_HEAD + "\xff\xfe\n" + PLY_FACE + T + "3 0 1 2\n", "invalid line"),
+    "no vertices.ply": ("ply\nformat ascii 1.0\n" + PLY_FACE + "3 0 1 2\n", "no properties x, y and z"),
+    "no z.ply": (PLY_HEAD.replace("float z", "float w") + PLY_FACE + T + "3 0 1 2\n", "no properties x, y and z"),
     "lists for z.ply": (
         PLY_HEAD.replace("property float z", "property list uchar float z") + PLY_FACE
-        + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "no x, y and z",
+        + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "no properties x, y and z",
     ),
     "no face element.ply": (PLY_HEAD + "end_header\n" + T, "no faces"),
     "faces without corners.ply": (
@@ -677,16 +677,16 @@ HOSTILE = {
         PLY_HEAD + "element face 1\nproperty int vertex_indices\nend_header\n" + T + "1\n", "1 corner,"
     ),
     "no faces.ply": (PLY_HEAD + PLY_FACE.replace("face 1", "face 0") + T, "no faces"),
-    "word.ply": (PLY_HEAD + PLY_FACE + "0 0 zero\n1 0 0\n0 1 0\n3 0 1 2\n", "'zero' stands where a number"),
-    "underscore.ply": (PLY_HEAD + PLY_FACE + "0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0' stands where a number"),
-    "underscore in a face.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 0_2\n", "'0_2' stands where a number"),
-    "null character.ply": (PLY_HEAD + PLY_FACE + "0 0 0\0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0\\x00' stands where a number"),
-    "strange digit.ply": (PLY_HEAD + PLY_FACE + "0 0 \xb2\n1 0 0\n0 1 0\n3 0 1 2\n", "stands where a number"),
+    "word.ply": (PLY_HEAD + PLY_FACE + "0 0 zero\n1 0 0\n0 1 0\n3 0 1 2\n", "'zero' is written where a number"),
+    "underscore.ply": (PLY_HEAD + PLY_FACE + "0 0 0\n1_0 0 0\n0 1 0\n3 0 1 2\n", "'1_0' is written where a number"),
+    "underscore in a face.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 0_2\n", "'0_2' is written where a number"),
+    "null character.ply": (PLY_HEAD + PLY_FACE + "0 0 0\0\n1 0 0\n0 1 0\n3 0 1 2\n", "'0\\x00' is written where a number"),
+    "strange digit.ply": (PLY_HEAD + PLY_FACE + "0 0 \xb2\n1 0 0\n0 1 0\n3 0 1 2\n", "is written where a number"),
     "truncated.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3", "truncated"),
     "truncated in texture.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\nf 1/1 3/", "truncated"),
     "truncated text.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1", "'face'"),
     "truncated vertices.ply": (PLY_HEAD + PLY_FACE + T[:9], "'vertex'"),
-    "text goes on.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 2\n3 0 1 2\n", "continues after the last promised row"),
+    "text goes on.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 2\n3 0 1 2\n", "continues after the last declared row"),
     "list of minus one.ply": (PLY_HEAD + PLY_FACE + T + "-1 0 1 2\n", "-1 numbers"),
     "list of nan.ply": (PLY_HEAD + PLY_FACE + T + "nan 0 1 2\n", "nan numbers"),
     "list of one and a half.ply": (PLY_HEAD + PLY_FACE + T + "1.5 0 1 2\n", "1.5 numbers"),
@@ -701,9 +701,9 @@ HOSTILE = {
         PLY_BINARY.replace(b"element face", b"element void 1000000000000\nelement face"), None
     ),
     "too many vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 4"), "'vertex'"),
-    "too few vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 2"), "continues after the last promised row"),
+    "too few vertices.ply": (PLY_BINARY.replace(b"vertex 3", b"vertex 2"), "continues after the last declared row"),
     "truncated.ply": (PLY_BINARY[:-1], "'face'"),
-    "goes on.ply": (PLY_BINARY + b"\1", "continues after the last promised row"),
+    "goes on.ply": (PLY_BINARY + b"\1", "continues after the last declared row"),
     "list length negative.ply": (
         ply(
             "binary_big_endian",
@@ -719,10 +719,10 @@ HOSTILE = {
         "4294967295 numbers",
     ),
     "short.stl": (b"\1" * 40, "neither"),
-    "promises more.stl": (binary_stl(TRIANGLE, count=2), "promises 2 triangles"),
-    "promises fewer.stl": (binary_stl(TRIANGLE, count=0), "promises 0 triangles"),
-    "promises four billion.stl": (binary_stl(TRIANGLE, count=2**32 - 1), "promises 4294967295"),
-    "truncated.stl": (binary_stl(TRIANGLE)[:-10], "promises 1 triangles"),
+    "declares more.stl": (binary_stl(TRIANGLE, count=2), "declares 2 triangles"),
+    "declares fewer.stl": (binary_stl(TRIANGLE, count=0), "declares 0 triangles"),
+    "declares four billion.stl": (binary_stl(TRIANGLE, count=2**32 - 1), "declares 4294967295"),
+    "truncated.stl": (binary_stl(TRIANGLE)[:-10], "declares 1 triangles"),
     "no triangles.stl": (binary_stl(TRIANGLE[:0]), "no vertices"),
     "nan.stl": (binary_stl(TRIANGLE * np.nan), "finite"),
     "in one point.stl": (binary_stl(TRIANGLE * 0), "no triangle has an area"),
@@ -737,7 +737,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_files_end_in_one_sentence(saved, name):
+def test_hostile_files_are_refused_in_one_sentence(saved, name):
     content, fault = HOSTILE[name]
     path = saved(name, content)
     if fault is None:  # the file is strange but complete
@@ -757,7 +757,7 @@ def test_hostile_files_end_in_one_sentence(saved, name):
     assert peak < 4e6
 
 
-def test_paths_that_are_not_files(tmp_path):
+def test_paths_that_are_not_files_are_refused(tmp_path):
     for path, fault in [
         (tmp_path / "missing.off", "does not exist"),
         (tmp_path / "no" / "such" / "directory.off", "does not exist"),
@@ -782,7 +782,7 @@ def test_a_pipe_is_refused_without_waiting(tmp_path):
         read_mesh(path)
 
 
-def test_no_permission(saved, monkeypatch):
+def test_unreadable_files_are_refused(saved, monkeypatch):
     path = saved("secret.off", SQUARE_FILES["plain.off"])
 
     def refuse(self):
@@ -793,7 +793,7 @@ def test_no_permission(saved, monkeypatch):
         read_mesh(path)
 
 
-def test_a_terabyte_is_not_read(tmp_path):
+def test_a_file_of_a_terabyte_is_refused_without_reading(tmp_path):
     path = tmp_path / "sparse.off"
     with path.open("wb") as file:
         file.truncate(2**40)  # a sparse file takes no space on the disk
@@ -884,7 +884,7 @@ def test_written_meshes_are_read_back_bit_for_bit(scratch, vertices):
 
 
 @pytest.mark.parametrize("suffix", [".off", ".ply", ".OFF"])
-def test_another_program_reads_written_meshes(tmp_path, suffix):
+def test_trimesh_reads_written_meshes(tmp_path, suffix):
     mesh = bumpy_grid(5)
     colors = np.random.default_rng(0).integers(0, 256, (25, 3), dtype=np.uint8)
     path = tmp_path / f"m{suffix}"
@@ -923,7 +923,7 @@ def test_colors_are_rounded(tmp_path):
     [np.zeros((5, 3)), np.zeros(18), np.zeros((6, 4)), np.full((6, 3), 1.01), np.full((6, 3), -0.1),
      np.full((6, 3), np.nan), np.zeros((6, 3), int), np.full((6, 3), "red")],
 )  # fmt: skip
-def test_bad_colors_write_nothing(tmp_path, colors):
+def test_invalid_colors_write_nothing(tmp_path, colors):
     with pytest.raises(InputError, match="colors"):
         write_mesh(tmp_path / "m.ply", OCTAHEDRON, colors=colors)
     assert list(tmp_path.iterdir()) == []
@@ -932,7 +932,7 @@ def test_bad_colors_write_nothing(tmp_path, colors):
 @pytest.mark.parametrize(
     "name", ["m.obj", "m.stl", "m", "m.off.gz", "no/such/m.off", "file/m.off", "directory.off"]
 )
-def test_bad_targets_write_nothing(tmp_path, name):
+def test_invalid_output_paths_write_nothing(tmp_path, name):
     (tmp_path / "file").touch()
     (tmp_path / "directory.off").mkdir()
     before = sorted(tmp_path.rglob("*"))
@@ -973,7 +973,7 @@ def test_real_shapes_keep_vertices_and_faces(shared):
     ("file", "dropped", "nonmanifold_edges", "boundary_edges"),
     [("shrec16_partial/null/cat.off", 12, 12, 84), ("shrec16_topology/kid00.off", 1, 1, 90)],
 )
-def test_real_shapes_that_are_not_manifold(shared, file, dropped, nonmanifold_edges, boundary_edges):
+def test_nonmanifold_real_shapes_are_diagnosed(shared, file, dropped, nonmanifold_edges, boundary_edges):
     mesh = read_mesh(shared / "data" / file)
     found = diagnose(mesh)
     assert (found.nonmanifold_edges, found.boundary_edges) == (nonmanifold_edges, boundary_edges)
@@ -981,7 +981,7 @@ def test_real_shapes_that_are_not_manifold(shared, file, dropped, nonmanifold_ed
     assert len(mesh.notes) == 1 and mesh.notes[0].startswith(f"{dropped} face")
 
 
-def test_real_shapes_against_other_programs(shared):
+def test_real_shapes_agree_with_other_programs(shared):
     oracle = np.load(shared / "oracle" / "faust_r_002_007.npz")
     mesh = read_mesh(shared / "data" / "faust_r" / "off" / "tr_reg_002.off")
     assert np.allclose(mesh.vertex_areas, oracle["x_vertex_areas"], rtol=1e-12, atol=0)
@@ -991,7 +991,7 @@ def test_real_shapes_against_other_programs(shared):
     assert len(mesh.vertices) - len(mesh.edges) + len(mesh.faces) == 2, "a sphere"
 
 
-def test_real_shape_round_trip(shared, tmp_path):
+def test_a_written_real_shape_is_read_back_unchanged(shared, tmp_path):
     mesh = read_mesh(shared / "data" / "tosca" / "off" / "wolf0.off")
     for name in ("w.off", "w.ply"):
         write_mesh(tmp_path / name, mesh)

@@ -1,4 +1,4 @@
-"""The compared methods equal plain NumPy programs of their papers, and solve cases with a known result."""
+"""Opponents agree with plain NumPy programs of their papers, and solve cases with a known result."""
 
 from dataclasses import replace
 
@@ -103,7 +103,7 @@ def test_all_methods_repair_a_noisy_initial_map():
 
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
-    """The peers see neither padding nor unreferenced vertices, and their maps use our vertex numbers."""
+    """The other libraries see neither padding nor unreferenced vertices, and their maps use our vertex numbers."""
     peers = installed_peers()
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")

@@ -1,4 +1,4 @@
-"""The page as a file: its data, its size and what it refuses."""
+"""The page as a file: its data, its size and the inputs that it refuses."""
 
 import hashlib
 import json
@@ -31,11 +31,11 @@ def _page(mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Any, *, errors: Any = None,
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("show", [draw_correspondence, _page])
-def test_bad_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
+def test_invalid_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
     n = len(TALL.vertices)
     good = np.arange(n)
     for bad in (good[1:], good.astype(float), good[None], good + 1, good - 1):
-        with pytest.raises(InputError, match="is the direction right"):
+        with pytest.raises(InputError, match="give a map from X to Y"):
             show(TALL, TALL, bad)
     for errors in (np.zeros(n - 1), np.full(n, -0.1)):
         with pytest.raises(InputError, match="non-negative"):
@@ -132,7 +132,7 @@ def test_large_meshes_get_fewer_eigenvectors(tmp_path: Path, monkeypatch: pytest
         assert min(eigenvectors_on_page(TALL, TALL), 60) == eigenvectors
 
 
-def test_same_input_same_page(tmp_path: Path) -> None:
+def test_the_same_input_gives_the_same_page(tmp_path: Path) -> None:
     n = len(TALL.vertices)
     spectra = random_spectrum(n, 30), random_spectrum(n, 30)
     for name in ("a", "b"):
@@ -140,11 +140,11 @@ def test_same_input_same_page(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_viewer_bundle_is_current_licensed_and_sealed() -> None:
+def test_viewer_bundle_is_current_licensed_and_safe_to_embed() -> None:
     assets = ROOT / "jaxsmw" / "report" / "assets"
     viewer, license = (assets / "viewer.js").read_text("utf-8"), (assets / "THREE-LICENSE").read_text("utf-8")
     assert license.strip() in viewer and "MIT" in license
-    # The script must not end its element early, nor open a comment that hides the end.
+    # The script must neither end its element early nor open a comment that hides the end tag.
     assert "</script" not in viewer.lower() and "<!--" not in viewer
     # The page shows the current source of the viewer.
     source = (ROOT / "scripts" / "build_viewer" / "viewer.js").read_bytes()

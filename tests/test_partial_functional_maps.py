@@ -115,7 +115,7 @@ def test_total_variation_of_a_linear_function_is_its_slope_times_the_area():
         SurfaceGradient.of(mesh, random_spectrum(20, 5))
 
 
-def test_derivatives_are_those_of_differences():
+def test_derivatives_agree_with_finite_differences():
     mesh, spectrum = flat()
     gradient, generator = SurfaceGradient.of(mesh, spectrum), np.random.default_rng(0)
     n = spectrum.mask.shape[0]
@@ -178,7 +178,7 @@ def test_signs_do_not_matter(case):
     np.testing.assert_allclose(again.region, plain.region, atol=1e-3)
 
 
-def test_bad_numbers_are_reported(case):
+def test_nonfinite_numbers_and_invalid_maps_are_reported(case):
     broken = case.x.with_descriptors(case.x.descriptors.at[3, 2].set(jnp.nan))
     bad_map = np.full_like(case.initial_map, len(case.full.vertices))
     for arguments, expected in [

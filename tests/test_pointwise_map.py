@@ -15,7 +15,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 
 
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
-def test_decode_finds_the_nearest_and_the_objective_is_their_distance(convention):
+def test_decode_finds_nearest_neighbours_and_the_objective_is_their_distance(convention):
     x, y = random_spectrum(40, 8, seed=1), random_spectrum(30, 6, seed=2)
     shape = (8, 6) if convention == "pullback" else (6, 8)
     functional_map = jnp.asarray(np.random.default_rng(0).normal(size=shape))

@@ -1,4 +1,4 @@
-"""The loop: what it must not depend on, what it reports, and how often it compiles."""
+"""The refinement loop: its invariances, the failures that it reports, and how often it compiles."""
 
 import subprocess
 import sys
@@ -34,15 +34,15 @@ def permuted(spectrum: Spectrum, order: np.ndarray) -> Spectrum:
 
 @pytest.fixture
 def pair():
-    """A shape, a shuffled and slightly disturbed copy, the true map and a start with a third of it wrong."""
+    """A spectrum, a disturbed and shuffled copy, a map with a third of its matches wrong, and the true map."""
     generator = np.random.default_rng(0)
     x = random_spectrum(M, K)
     order = generator.permutation(M)
     y = permuted(x, order)
     y = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors + 0.02 * generator.normal(size=(M, K)))
     truth = np.argsort(order)
-    start = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
-    return x, y, jnp.asarray(start, jnp.int32), truth
+    initial_map = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
+    return x, y, jnp.asarray(initial_map, jnp.int32), truth
 
 
 REFINERS = {
@@ -65,18 +65,18 @@ ALL_REFINERS = REFINERS | {
 
 
 def test_recovers_a_disturbed_copy(pair):
-    x, y, start, truth = pair
-    refined = refine(x, y, start, iterations=5)
+    x, y, initial_map, truth = pair
+    refined = refine(x, y, initial_map, iterations=5)
     assert refined.result == RESULTS.successful
-    assert np.mean(np.asarray(start) == truth) < 0.75
+    assert np.mean(np.asarray(initial_map) == truth) < 0.75
     assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
 
 
 @pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
-def test_is_the_plain_loop(pair, refiner):
-    x, y, start, _ = pair
+def test_refine_equals_a_plain_loop(pair, refiner):
+    x, y, initial_map, _ = pair
     problem = refiner.problem(x, y)
-    t, c = start, None
+    t, c = initial_map, None
     for _ in range(3):
         if isinstance(refiner.solution, Filtering):
             kernel = multiscale_kernel(*problem.responses)
@@ -87,7 +87,7 @@ def test_is_the_plain_loop(pair, refiner):
         else:
             c, _ = refiner.solution.solve(problem, None, t, c)
         t = decode(c, x, y, convention=refiner.convention)
-    refined = refine(x, y, start, refiner=refiner)
+    refined = refine(x, y, initial_map, refiner=refiner)
     assert refined.result == RESULTS.successful
     np.testing.assert_array_equal(refined.pointwise_map, t)
     np.testing.assert_allclose(refined.functional_map, c, atol=1e-12)
@@ -97,14 +97,14 @@ def test_is_the_plain_loop(pair, refiner):
 def test_every_option_changes_the_result(name):
     x, y = random_spectrum(M, K, seed=1), random_spectrum(M, K, seed=2)
     y = eqx.tree_at(lambda s: s.eigenvalues, y, y.eigenvalues * 1.5)
-    start = jnp.asarray(np.random.default_rng(0).integers(0, M, M))
-    default = refine(x, y, start, iterations=1).functional_map
-    other = refine(x, y, start, iterations=1, refiner=REFINERS[name]).functional_map
+    initial_map = jnp.asarray(np.random.default_rng(0).integers(0, M, M))
+    default = refine(x, y, initial_map, iterations=1).functional_map
+    other = refine(x, y, initial_map, iterations=1, refiner=REFINERS[name]).functional_map
     assert jnp.max(jnp.abs(default - other)) > 1e-3
 
 
 def products(jaxpr):
-    """All matrix products of a program, however deep."""
+    """All matrix products of a program and of its nested programs."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             yield equation
@@ -115,14 +115,14 @@ def products(jaxpr):
 
 
 @pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
-def test_products_ask_for_all_digits(pair, refiner):
-    """GPUs would take fewer by default, and matches are decided by small differences."""
-    x, y, start, _ = pair
-    arrays, rest = eqx.partition((x, y, start, refiner), eqx.is_array)
+def test_products_use_the_highest_precision(pair, refiner):
+    """The default precision of GPUs is lower, but small differences can change matches."""
+    x, y, initial_map, _ = pair
+    arrays, rest = eqx.partition((x, y, initial_map, refiner), eqx.is_array)
 
     def refined(arrays):
-        x, y, start, refiner = eqx.combine(arrays, rest)
-        return eqx.filter(refine(x, y, start, refiner=refiner), eqx.is_array)
+        x, y, initial_map, refiner = eqx.combine(arrays, rest)
+        return eqx.filter(refine(x, y, initial_map, refiner=refiner), eqx.is_array)
 
     found = list(products(jax.make_jaxpr(refined)(arrays).jaxpr))
     assert len(found) >= 3
@@ -132,21 +132,21 @@ def test_products_ask_for_all_digits(pair, refiner):
 
 @pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_signs_of_eigenvectors_do_not_matter(pair, refiner):
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
     generator = np.random.default_rng(4)
     flipped = [
         eqx.tree_at(lambda s: s.eigenvectors, s, s.eigenvectors * generator.choice([-1.0, 1.0], (1, K)))
         for s in (x, y)
     ]
     np.testing.assert_array_equal(
-        refine(*flipped, start, refiner=refiner).pointwise_map,
-        refine(x, y, start, refiner=refiner).pointwise_map,
+        refine(*flipped, initial_map, refiner=refiner).pointwise_map,
+        refine(x, y, initial_map, refiner=refiner).pointwise_map,
     )
 
 
 def test_basis_within_an_eigenspace_does_not_matter(pair):
-    """A double eigenvalue leaves its two eigenvectors free up to a rotation."""
-    x, y, start, _ = pair
+    """The two eigenvectors of a double eigenvalue are determined only up to a rotation."""
+    x, y, initial_map, _ = pair
     x, y = (
         eqx.tree_at(lambda s: s.eigenvalues, s, s.eigenvalues.at[5].set(s.eigenvalues[4])) for s in (x, y)
     )
@@ -154,33 +154,37 @@ def test_basis_within_an_eigenspace_does_not_matter(pair):
     turned = eqx.tree_at(
         lambda s: s.eigenvectors, x, x.eigenvectors.at[:, 4:6].set(x.eigenvectors[:, 4:6] @ rotation)
     )
-    np.testing.assert_array_equal(refine(turned, y, start).pointwise_map, refine(x, y, start).pointwise_map)
+    np.testing.assert_array_equal(
+        refine(turned, y, initial_map).pointwise_map, refine(x, y, initial_map).pointwise_map
+    )
 
 
 def test_renumbering_vertices_renumbers_the_map(pair):
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
     generator = np.random.default_rng(4)
     order_x, order_y = generator.permutation(M), generator.permutation(M)
-    renumbered_start = jnp.argsort(jnp.asarray(order_y))[start[order_x]]
-    renumbered = refine(permuted(x, order_x), permuted(y, order_y), renumbered_start)
+    renumbered_initial_map = jnp.argsort(jnp.asarray(order_y))[initial_map[order_x]]
+    renumbered = refine(permuted(x, order_x), permuted(y, order_y), renumbered_initial_map)
     np.testing.assert_array_equal(
-        order_y[renumbered.pointwise_map], np.asarray(refine(x, y, start).pointwise_map)[order_x]
+        order_y[renumbered.pointwise_map], np.asarray(refine(x, y, initial_map).pointwise_map)[order_x]
     )
 
 
 @pytest.mark.parametrize("factor", [1e-2, 1e3])
 def test_common_scale_does_not_matter(pair, factor):
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
     scaled = [
         Spectrum(s.eigenvalues / factor**2, s.eigenvectors / factor, s.vertex_areas * factor**2, s.mask)
         for s in (x, y)
     ]
-    np.testing.assert_array_equal(refine(*scaled, start).pointwise_map, refine(x, y, start).pointwise_map)
+    np.testing.assert_array_equal(
+        refine(*scaled, initial_map).pointwise_map, refine(x, y, initial_map).pointwise_map
+    )
 
 
 @pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_padding_changes_nothing(pair, refiner):
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
 
     def padded(spectrum: Spectrum, rows: int) -> Spectrum:
         return Spectrum(
@@ -190,8 +194,8 @@ def test_padding_changes_nothing(pair, refiner):
             jnp.pad(spectrum.mask, (0, rows)),
         )
 
-    plain = refine(x, y, start, refiner=refiner, history=True)
-    wide = refine(padded(x, 70), padded(y, 33), jnp.pad(start, (0, 70)), refiner=refiner, history=True)
+    plain = refine(x, y, initial_map, refiner=refiner, history=True)
+    wide = refine(padded(x, 70), padded(y, 33), jnp.pad(initial_map, (0, 70)), refiner=refiner, history=True)
     np.testing.assert_array_equal(wide.pointwise_map[:M], plain.pointwise_map)
     np.testing.assert_allclose(wide.functional_map, plain.functional_map, atol=1e-12)
     for series in ("changed", "energy", "objective"):
@@ -202,33 +206,33 @@ def test_padding_changes_nothing(pair, refiner):
 
 def test_different_numbers_of_vertices_and_eigenvectors():
     x, y = random_spectrum(80, 12, seed=1), random_spectrum(90, 10, seed=2)
-    start = jnp.asarray(np.random.default_rng(0).integers(0, 90, 80))
-    refined = refine(x, y, start)
+    initial_map = jnp.asarray(np.random.default_rng(0).integers(0, 90, 80))
+    refined = refine(x, y, initial_map)
     assert refined.functional_map.shape == (12, 10)
     assert refined.pointwise_map.shape == (80,)
-    assert refine(x, y, start, refiner=REFINERS["pushforward"]).functional_map.shape == (10, 12)
+    assert refine(x, y, initial_map, refiner=REFINERS["pushforward"]).functional_map.shape == (10, 12)
 
 
-def test_history_is_what_it_says(pair):
-    x, y, start, _ = pair
+def test_history_describes_every_iteration(pair):
+    x, y, initial_map, _ = pair
     refiner = WaveletPreservation()
-    maps = [start, *(refine(x, y, start, iterations=i).pointwise_map for i in range(1, 5))]
-    history = refine(x, y, start, iterations=4, history=True).history
+    maps = [initial_map, *(refine(x, y, initial_map, iterations=i).pointwise_map for i in range(1, 5))]
+    history = refine(x, y, initial_map, iterations=4, history=True).history
     for i in range(4):
         assert history.changed[i] == np.mean(np.asarray(maps[i]) != np.asarray(maps[i + 1]))
-        c = refine(x, y, start, iterations=i + 1).functional_map
+        c = refine(x, y, initial_map, iterations=i + 1).functional_map
         energy = refiner.problem(x, y).energy(maps[i])(c)
         np.testing.assert_allclose(history.energy[i], energy, rtol=1e-9)
         objective = refiner.objective(refiner.prepare(Problem(x, y)), State(c), maps[i + 1])
         np.testing.assert_allclose(history.objective[i], objective, rtol=1e-9)
         np.testing.assert_array_equal(history.pointwise_maps[i], maps[i + 1])
-    assert refine(x, y, start).history is None
+    assert refine(x, y, initial_map).history is None
 
 
 def test_stops_when_the_map_no_longer_changes(pair):
-    x, y, start, _ = pair
-    patient = refine(x, y, start, iterations=40)
-    stopped = refine(x, y, start, iterations=40, stop_when_unchanged=True, history=True)
+    x, y, initial_map, _ = pair
+    patient = refine(x, y, initial_map, iterations=40)
+    stopped = refine(x, y, initial_map, iterations=40, stop_when_unchanged=True, history=True)
     assert patient.iterations == 40
     assert stopped.iterations < 40
     np.testing.assert_array_equal(patient.pointwise_map, stopped.pointwise_map)
@@ -239,43 +243,43 @@ def test_stops_when_the_map_no_longer_changes(pair):
     assert np.all(np.asarray(stopped.history.pointwise_maps[done:]) == np.asarray(stopped.pointwise_map))
 
 
-def test_samples_iterate_between_samples_and_end_on_all_vertices(pair):
-    x, y, start, _ = pair
+def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair):
+    x, y, initial_map, _ = pair
     generator = np.random.default_rng(1)
     samples_x, samples_y = (jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
     refiner = WaveletPreservation()
     kernel = multiscale_kernel(*refiner.problem(x, y).responses)
-    c = kernel * encode(start, x, y)
+    c = kernel * encode(initial_map, x, y)
     for _ in range(3):
         t = decode(c, x.sample(samples_x), y.sample(samples_y))
         c = kernel * np.linalg.lstsq(x.eigenvectors[samples_x], y.eigenvectors[samples_y][t])[0]
-    refined = refine(x, y, start, iterations=4, samples=(samples_x, samples_y), history=True)
+    refined = refine(x, y, initial_map, iterations=4, samples=(samples_x, samples_y), history=True)
     np.testing.assert_allclose(refined.functional_map, c, atol=1e-10)
     np.testing.assert_array_equal(refined.pointwise_map, decode(jnp.asarray(c), x, y))
     assert np.isnan(refined.history.changed[jnp.asarray([0, 3])]).all()
     assert np.isfinite(refined.history.changed[1:3]).all()
     assert refined.history.pointwise_maps is None
     with pytest.raises((ValueError, TypeCheckError), match="samples"):
-        refine(x, y, start, samples=(samples_x,))
+        refine(x, y, initial_map, samples=(samples_x,))
 
 
 def test_vmap_over_pairs_equals_a_loop():
     pairs = [(random_spectrum(M, K, seed=s), random_spectrum(M, K, seed=s + 10)) for s in range(3)]
-    starts = jnp.asarray(np.random.default_rng(0).integers(0, M, (3, M)))
+    initial_maps = jnp.asarray(np.random.default_rng(0).integers(0, M, (3, M)))
     stack = lambda *leaves: jnp.stack(leaves)  # noqa: E731
     xs, ys = (jax.tree.map(stack, *side) for side in zip(*pairs, strict=True))
     for options in ({}, {"stop_when_unchanged": True}, {"history": True}):
-        batched = jax.vmap(lambda x, y, t, o=options: refine(x, y, t, **o))(xs, ys, starts)
+        batched = jax.vmap(lambda x, y, t, o=options: refine(x, y, t, **o))(xs, ys, initial_maps)
         for index, (x, y) in enumerate(pairs):
-            alone = refine(x, y, starts[index], **options)
+            alone = refine(x, y, initial_maps[index], **options)
             np.testing.assert_array_equal(batched.pointwise_map[index], alone.pointwise_map)
             np.testing.assert_allclose(batched.functional_map[index], alone.functional_map, atol=1e-12)
             assert batched.iterations[index] == alone.iterations
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to tell the peak memory")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux for the peak memory")
 def test_memory_stays_far_below_all_distances():
-    """30 000 x 30 000 distances would take 3.6 GB; the process as a whole has to do with a fifth of it."""
+    """30 000 x 30 000 distances would take 3.6 GB; the whole process must use less than a fifth of that."""
     program = """
 import re
 import jax.numpy as jnp
@@ -288,7 +292,7 @@ def spectrum():
     return Spectrum(jnp.arange(k, dtype=jnp.float32), vectors, jnp.full(n, 1 / n, jnp.float32), jnp.ones(n, bool))
 t = refine(spectrum(), spectrum(), jnp.zeros(n, jnp.int32), iterations=1).pointwise_map
 assert len(np.unique(t)) > 1
-# Not getrusage: its peak counts what the parent process had before this one began.
+# The peak of getrusage would include the memory of the parent process before this process began.
 print(re.search(r"VmHWM:\\s*(\\d+) kB", open("/proc/self/status").read())[1])
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -305,14 +309,14 @@ def test_compiles_once_per_size_and_setting():
             return super().update(problem, pointwise_map, previous)
 
     refiner = Counting()
-    start = jnp.zeros(50, jnp.int32)
-    refine(random_spectrum(50, 5, seed=0), random_spectrum(40, 5, seed=1), start, refiner=refiner)
+    initial_map = jnp.zeros(50, jnp.int32)
+    refine(random_spectrum(50, 5, seed=0), random_spectrum(40, 5, seed=1), initial_map, refiner=refiner)
     traced = len(traces)
     for seed in range(3):
         pair = random_spectrum(50, 5, seed=seed), random_spectrum(40, 5, seed=seed + 5)
-        refine(*pair, start + seed, refiner=refiner)
+        refine(*pair, initial_map + seed, refiner=refiner)
     assert len(traces) == traced
-    refine(random_spectrum(50, 6), random_spectrum(40, 6), start, refiner=refiner)
+    refine(random_spectrum(50, 6), random_spectrum(40, 6), initial_map, refiner=refiner)
     assert len(traces) > traced
 
 
@@ -334,34 +338,34 @@ def test_float32_in_float32_out():
         (lambda x, y, t: (eqx.tree_at(lambda s: s.vertex_areas, x, x.vertex_areas * 1e307), eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * 1e10), t), RESULTS.nonfinite_functional_map),
     ],
 )  # fmt: skip
-def test_failures_are_named_not_returned_as_if_fine(pair, damage, result):
-    x, y, start, _ = pair
-    refined = refine(*damage(x, y, start), iterations=4, history=True)
+def test_failures_are_reported_and_return_no_map(pair, damage, result):
+    x, y, initial_map, _ = pair
+    refined = refine(*damage(x, y, initial_map), iterations=4, history=True)
     assert refined.result == result
     assert (refined.pointwise_map == -1).all() and (refined.history.pointwise_maps == -1).all()
     assert len(RESULTS[result]) > 40
 
 
-def test_a_failure_sticks(pair):
-    """Everything after a failure is in doubt, however well the next iteration goes."""
+def test_an_early_failure_is_reported(pair):
+    """Successful iterations do not hide an earlier failure."""
 
     class FailsAtFirst(WaveletPreservation):
         def update(self, problem, pointwise_map, previous):
             functional_map, result = super().update(problem, pointwise_map, previous)
             return functional_map, RESULTS.singular_system if previous is None else result
 
-    x, y, start, _ = pair
-    assert refine(x, y, start, refiner=FailsAtFirst()).result == RESULTS.singular_system
+    x, y, initial_map, _ = pair
+    assert refine(x, y, initial_map, refiner=FailsAtFirst()).result == RESULTS.singular_system
 
 
-def test_too_few_samples_are_named(pair):
-    x, y, start, _ = pair
+def test_too_few_samples_are_reported(pair):
+    x, y, initial_map, _ = pair
     few = jnp.arange(5)
-    refined = refine(x, y, start, samples=(few, few))
+    refined = refine(x, y, initial_map, samples=(few, few))
     assert refined.result == RESULTS.nonfinite_functional_map
 
 
-def test_settings_that_do_not_exist():
+def test_unknown_settings_are_refused():
     for name, maker in {
         "convention": WaveletPreservation,
         "lambda_max": WaveletPreservation,
@@ -372,74 +376,74 @@ def test_settings_that_do_not_exist():
             maker(**{name: "pullbakc"})
 
 
-def test_needs_one_vertex_per_vertex(pair):
-    x, y, start, _ = pair
+def test_the_initial_map_needs_one_match_per_vertex(pair):
+    x, y, initial_map, _ = pair
     with pytest.raises(ValueError, match="X has 300 vertices"):
-        refine(x, y, start[:10])
+        refine(x, y, initial_map[:10])
 
 
-def test_needs_an_iteration(pair):
+def test_at_least_one_iteration_is_needed(pair):
     with pytest.raises(ValueError, match="at least 1 iteration"):
         refine(*pair[:3], iterations=0)
 
 
-def test_a_new_refiner_plugs_in(pair):
-    """Spectral ICP's half-step in place of the filter: the loop knows nothing of wavelets."""
+def test_the_loop_accepts_new_refiners(pair):
+    """This refiner computes the orthogonal functional map of spectral ICP, without wavelets."""
 
     class Orthogonal(WaveletPreservation):
         def update(self, prepared, pointwise_map, previous):
             u, _, vt = jnp.linalg.svd(encode(pointwise_map, prepared.spectrum_x, prepared.spectrum_y))
             return State(u @ vt), RESULTS.successful
 
-    x, y, start, truth = pair
+    x, y, initial_map, truth = pair
     assert issubclass(Orthogonal, Refiner)
-    refined = refine(x, y, start, refiner=Orthogonal(), iterations=5)
+    refined = refine(x, y, initial_map, refiner=Orthogonal(), iterations=5)
     np.testing.assert_allclose(refined.functional_map @ refined.functional_map.T, np.eye(K), atol=1e-10)
     assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
 
 
-def test_a_map_of_nothing_is_named(pair):
+def test_an_undetermined_functional_map_is_reported(pair):
     class Nothing(FilterBank):
         def __call__(self, points, eigenvalues):
             return jnp.zeros((2, len(points)))
 
-    x, y, start, _ = pair
+    x, y, initial_map, _ = pair
     assert (
-        refine(x, y, start, refiner=WaveletPreservation(Nothing())).result
+        refine(x, y, initial_map, refiner=WaveletPreservation(Nothing())).result
         == RESULTS.undetermined_functional_map
     )
 
 
 @pytest.mark.parametrize("kind", [float, bool])
-def test_a_start_that_holds_no_vertices_is_refused(pair, kind):
-    x, y, _, start = pair
+def test_initial_maps_of_other_types_than_integers_are_refused(pair, kind):
+    x, y, _, initial_map = pair
     with pytest.raises(TypeError, match=r"must be integer vertex indices|pointwise_map"):
-        refine(x, y, jnp.asarray(start).astype(kind), refiner=WaveletPreservation(), iterations=1)
+        refine(x, y, jnp.asarray(initial_map).astype(kind), refiner=WaveletPreservation(), iterations=1)
 
 
-def test_two_float_types_are_refused(pair):
-    x, y, start, _ = pair
+def test_spectra_of_different_float_types_are_refused(pair):
+    x, y, initial_map, _ = pair
     single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, x)
     with pytest.raises(ValueError, match="X is float32 and that of Y float64"):
-        refine(single, y, start, stop_when_unchanged=True)
+        refine(single, y, initial_map, stop_when_unchanged=True)
 
 
 @pytest.mark.parametrize("settings", [dict(bank=Meyer), dict(bank="meyer"), dict(solution="least-squares")])
-def test_what_is_no_bank_or_solution_is_refused(settings):
+def test_banks_and_solutions_of_wrong_types_are_refused(settings):
     with pytest.raises((TypeError, TypeCheckError), match=r"bank|solution"):
         WaveletPreservation(**settings)
 
 
-_OF_ANOTHER_KIND = """
+_ARGUMENTS_OF_WRONG_TYPES = """
 import jax.numpy as jnp, jaxsmw, numpy as np
 from jaxsmw import Meyer, Registration, Stage, WaveletPreservation, refine
 
 x = jaxsmw.Spectrum(jnp.arange(3.0), jnp.ones((5, 3)), jnp.ones(5), jnp.ones(5, bool))
-start = jnp.arange(5)
+initial_map = jnp.arange(5)
 for call in (
-    lambda: refine(x, x, start, refiner=WaveletPreservation),
-    lambda: refine(x, x, start, refiner="paper"),
-    lambda: refine(x, None, start),
+    lambda: refine(x, x, initial_map, refiner=WaveletPreservation),
+    lambda: refine(x, x, initial_map, refiner="paper"),
+    lambda: refine(x, None, initial_map),
     lambda: refine(x, x, [0, 1, 2, 3, 4]),
     lambda: WaveletPreservation("meyer"),
     lambda: Meyer(3.5),
@@ -449,7 +453,7 @@ for call in (
     lambda: print(Registration(tuple(np.array([35, 60]))).levels, Stage(iterations=np.int64(2)).iterations),
     lambda: Stage(iterations=True),
     lambda: jaxsmw.Preset((Stage(),), repair="accurate"),
-    lambda: refine(x, x, start, samples=([1], [1])),
+    lambda: refine(x, x, initial_map, samples=([1], [1])),
     lambda: jaxsmw.compute_spectrum("mesh.off", 3),
     lambda: jaxsmw.match("mesh.off", "mesh.off"),
     lambda: jaxsmw.compute_spectrum(jaxsmw.make_mesh(np.eye(3), [[0, 1, 2]]), 2, laplacian="Robust"),
@@ -461,10 +465,10 @@ for call in (
 """
 
 
-def test_what_is_of_another_kind_is_named():
-    """In a process of its own, where types are not checked for tests."""
+def test_arguments_of_wrong_types_are_named():
+    """The program runs in its own process, without the run-time type checks of the tests."""
     said = subprocess.run(
-        [sys.executable, "-c", _OF_ANOTHER_KIND], check=True, capture_output=True, text=True
+        [sys.executable, "-c", _ARGUMENTS_OF_WRONG_TYPES], check=True, capture_output=True, text=True
     )
     assert said.stdout.splitlines() == [
         "the refiner is <class 'jaxsmw.core.refiners.wavelet_preservation.WaveletPreservation'>, but a Refiner is needed",

@@ -1,4 +1,4 @@
-"""Refinement by registration of surfaces."""
+"""Refinement by registration."""
 
 import equinox as eqx
 import jax
@@ -25,14 +25,17 @@ K = 60
 
 
 def changed(mesh, order, motion):
-    """The mesh with vertices in another order, each moved."""
+    """The mesh with its vertices in another order and moved by `motion`."""
     place = np.argsort(order)
     return make_mesh(motion(mesh.vertices[order]), place[mesh.faces])
 
 
 @pytest.fixture(scope="module")
 def pair():
-    """A body; the same turned, moved and renumbered; the true map and a start that is nearly right."""
+    """Two spectra, an initial map that is nearly right, the true map, and the mesh of X.
+
+    Y is a rotated, scaled, translated and renumbered copy of X.
+    """
     mesh = bumpy_mesh(3)
     generator = np.random.default_rng(0)
     order = generator.permutation(len(mesh.vertices))
@@ -40,12 +43,21 @@ def pair():
     moved = changed(mesh, order, lambda vertices: 7 * vertices @ turn.T + [100, -50, 3])
     truth = np.argsort(order)
     disturbed = mesh.vertices + 0.15 * generator.normal(size=mesh.vertices.shape)
-    start = truth[KDTree(mesh.vertices).query(disturbed)[1]]
-    return compute_spectrum(mesh, K), compute_spectrum(moved, K), jnp.asarray(start, jnp.int32), truth, mesh
+    initial_map = truth[KDTree(mesh.vertices).query(disturbed)[1]]
+    return (
+        compute_spectrum(mesh, K),
+        compute_spectrum(moved, K),
+        jnp.asarray(initial_map, jnp.int32),
+        truth,
+        mesh,
+    )
 
 
-def defined(x: Spectrum, y: Spectrum, t, levels):
-    """Two turns, from definitions: vertex by vertex, with singular value decompositions and all distances."""
+def by_definition(x: Spectrum, y: Spectrum, t, levels):
+    """The map and the embeddings of X and of Y after one iteration for each level.
+
+    The rotations are computed vertex by vertex with singular value decompositions.
+    """
 
     def own(s):
         a, lam = np.asarray(s.vertex_areas), np.asarray(s.eigenvalues)
@@ -54,10 +66,10 @@ def defined(x: Spectrum, y: Spectrum, t, levels):
         points = np.hstack([positions, 0.02 * np.asarray(s.normals), smooth])
         return positions, np.asarray(s.normals), points
 
-    def bent(s, o, matches, level):
+    def deformed(s, o, matches, level):
         phi, a, lam = (np.asarray(f) for f in (s.eigenvectors, s.vertex_areas, s.eigenvalues))
         (positions, normals, _), (_, others, points) = own(s), own(o)
-        matched, turned = points[matches], others[matches]
+        matched, matched_normals = points[matches], others[matches]
         time = max(3e-3, 4 / lam[-1])
         heat = phi @ (np.exp(-time * lam)[:, None] * phi.T) * a
         low = phi[:, :level] @ phi[:, :level].T * a
@@ -66,7 +78,8 @@ def defined(x: Spectrum, y: Spectrum, t, levels):
         for i, row in enumerate(heat):
             second = np.einsum("j,ja,jb->ab", row, positions, matched[:, :3])
             spread = second - np.outer(mean_x[i], mean_y[i])
-            u, _, vt = np.linalg.svd(spread / (2 * time) + np.einsum("j,ja,jb->ab", row, normals, turned))
+            normal_products = np.einsum("j,ja,jb->ab", row, normals, matched_normals)
+            u, _, vt = np.linalg.svd(spread / (2 * time) + normal_products)
             rotations.append((u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T)
         rotations = np.array(rotations)
         details = np.einsum("iab,ib->ia", rotations, positions - low @ positions)
@@ -75,30 +88,30 @@ def defined(x: Spectrum, y: Spectrum, t, levels):
         place[:, 3:6] = 0.02 * np.einsum("iab,ib->ia", rotations, normals)
         return place
 
-    back = None
+    reverse_map = None
     for level in levels:
-        forth = bent(x, y, t, level)
+        forward = deformed(x, y, t, level)
         of_x, of_y = own(x)[2], own(y)[2]
-        asked, asking = (forth, of_y) if back is None else (queries, database)
-        back = KDTree(asked).query(asking)[1]
+        targets, reverse_queries = (forward, of_y) if reverse_map is None else (queries, database)
+        reverse_map = KDTree(targets).query(reverse_queries)[1]
         described = [
             2.8 / level**1.5 * np.asarray(s.descriptors) for s in (x, y) if s.descriptors is not None
         ]
-        queries = np.hstack([forth, of_x, *described[:1]])
-        database = np.hstack([of_y, bent(y, x, back, level), *described[1:]])
+        queries = np.hstack([forward, of_x, *described[:1]])
+        database = np.hstack([of_y, deformed(y, x, reverse_map, level), *described[1:]])
         t = KDTree(database).query(queries)[1]
     return t, queries, database
 
 
 @pytest.mark.parametrize("number_of_descriptors", [0, 5])
-def test_is_what_its_definition_says(pair, number_of_descriptors):
-    x, y, start, *_ = pair
+def test_refinement_agrees_with_the_definition(pair, number_of_descriptors):
+    x, y, initial_map, *_ = pair
     if number_of_descriptors:
         generator = np.random.default_rng(2)
         x, y = (s.with_descriptors(jnp.asarray(generator.normal(size=(len(s.mask), 5)))) for s in (x, y))
     refiner = Registration((20,))
-    found = refine(x, y, start, refiner=refiner, iterations=2, history=True)
-    t, queries, database = defined(x, y, np.asarray(start), (20, K))
+    found = refine(x, y, initial_map, refiner=refiner, iterations=2, history=True)
+    t, queries, database = by_definition(x, y, np.asarray(initial_map), (20, K))
     np.testing.assert_array_equal(found.pointwise_map, t)
     for points, expected in zip(
         refiner.embeddings(refiner.prepare(Problem(x, y)), found.state), (queries, database), strict=True
@@ -108,8 +121,8 @@ def test_is_what_its_definition_says(pair, number_of_descriptors):
     np.testing.assert_allclose(found.history.objective[1], np.asarray(x.vertex_areas) @ distances, rtol=1e-6)
 
 
-def test_rotations_are_the_best_there_are():
-    """Of any matrices, also where the best orthogonal one is a reflection, and for turns by 180 degrees."""
+def test_nearest_rotations_agree_with_singular_value_decompositions():
+    """The matrices include rotations by 180 degrees, and some whose best orthogonal matrix is a reflection."""
     generator = np.random.default_rng(0)
     turns = Rotation.random(40, rng=generator).as_matrix()
     covariances = np.concatenate(
@@ -132,46 +145,48 @@ def test_rotations_are_the_best_there_are():
     assert np.isfinite(_nearest_rotations(jnp.zeros((1, 3, 3)))).all()
 
 
-def test_a_body_that_only_moved_is_found_again(pair):
-    x, y, start, truth, _ = pair
-    assert np.mean(np.asarray(start) == truth) < 0.3
-    found = refine(x, y, start, refiner=Registration((20, 40)), iterations=4)
+def test_a_moved_copy_is_matched_exactly(pair):
+    x, y, initial_map, truth, _ = pair
+    assert np.mean(np.asarray(initial_map) == truth) < 0.3
+    found = refine(x, y, initial_map, refiner=Registration((20, 40)), iterations=4)
     assert found.result == RESULTS.successful
     np.testing.assert_array_equal(found.pointwise_map, truth)
-    # Each lies where the other does.
+    # Matched rows of both embeddings coincide.
     queries, database = Registration().embeddings(Registration().prepare(Problem(x, y)), found.state)
     np.testing.assert_allclose(queries, np.asarray(database)[truth], atol=1e-6)
 
 
-def test_the_mirror_image_is_found_as_well(pair):
-    x, _, start, truth, mesh = pair
+def test_a_mirror_image_is_matched_exactly(pair):
+    x, _, initial_map, truth, mesh = pair
     order = np.argsort(truth)
     mirrored = changed(mesh, order, lambda vertices: vertices * [-1, 1, 1])
     mirrored = make_mesh(mirrored.vertices, mirrored.faces[:, ::-1])
-    found = refine(x, compute_spectrum(mirrored, K), start, refiner=Registration((20, 40)), iterations=4)
+    found = refine(
+        x, compute_spectrum(mirrored, K), initial_map, refiner=Registration((20, 40)), iterations=4
+    )
     np.testing.assert_array_equal(found.pointwise_map, truth)
 
 
-def test_which_way_faces_run_does_not_matter(pair):
-    x, y, start, _, mesh = pair
+def test_the_orientation_of_faces_does_not_matter(pair):
+    x, y, initial_map, _, mesh = pair
     turned = compute_spectrum(make_mesh(mesh.vertices, mesh.faces[:, ::-1]), K)
     np.testing.assert_allclose(turned.normals, x.normals, atol=1e-12)
     np.testing.assert_array_equal(
-        *(refine(one, y, start, refiner=Registration()).pointwise_map for one in (turned, x))
+        *(refine(one, y, initial_map, refiner=Registration()).pointwise_map for one in (turned, x))
     )
 
 
-def test_ends_nearer_the_truth_than_eigenfunctions_alone():
-    """Another pose, other triangles."""
+def test_is_more_accurate_than_refiners_that_use_only_eigenfunctions():
+    """The target has another pose and another triangulation."""
     pair = creature_pair(vertices=1200, seed=3)
     x, y = (compute_spectrum(mesh, 100) for mesh in (pair.source, pair.target))
     target, place = pair.target.vertices, pair.truth.positions(pair.target)
     unit = pair.target.area**0.5
     disturbed = place + 0.05 * unit * np.random.default_rng(0).normal(size=place.shape)
-    start = jnp.asarray(KDTree(target).query(disturbed)[1], jnp.int32)
+    initial_map = jnp.asarray(KDTree(target).query(disturbed)[1], jnp.int32)
 
     def error(refiner):
-        found = refine(x, y, start, refiner=refiner, iterations=4).pointwise_map
+        found = refine(x, y, initial_map, refiner=refiner, iterations=4).pointwise_map
         return np.linalg.norm(target[np.asarray(found)] - place, axis=1).mean() / unit
 
     best = error(Registration((30, 50, 70)))
@@ -179,51 +194,53 @@ def test_ends_nearer_the_truth_than_eigenfunctions_alone():
         assert best < 0.9 * error(other)
 
 
-def test_signs_and_padding_and_vmap(pair):
-    x, y, start, *_ = pair
+def test_signs_padding_and_vmap_do_not_change_the_map(pair):
+    x, y, initial_map, *_ = pair
     refiner = Registration((20, 40))
-    plain = refine(x, y, start, refiner=refiner, history=True)
+    plain = refine(x, y, initial_map, refiner=refiner, history=True)
     generator = np.random.default_rng(4)
     flipped = [
         eqx.tree_at(lambda s: s.eigenvectors, s, s.eigenvectors * generator.choice([-1.0, 1.0], (1, K)))
         for s in (x, y)
     ]
-    np.testing.assert_array_equal(refine(*flipped, start, refiner=refiner).pointwise_map, plain.pointwise_map)
-    m = len(start)
-    wide = refine(x.pad(m + 30), y.pad(m + 30), jnp.pad(start, (0, 30)), refiner=refiner, history=True)
+    np.testing.assert_array_equal(
+        refine(*flipped, initial_map, refiner=refiner).pointwise_map, plain.pointwise_map
+    )
+    m = len(initial_map)
+    wide = refine(x.pad(m + 30), y.pad(m + 30), jnp.pad(initial_map, (0, 30)), refiner=refiner, history=True)
     np.testing.assert_array_equal(wide.pointwise_map[:m], plain.pointwise_map)
     np.testing.assert_allclose(wide.history.energy, plain.history.energy, rtol=1e-9, atol=1e-12)
-    way_back = jnp.asarray(KDTree(np.asarray(y.positions)).query(np.asarray(x.positions))[1], jnp.int32)
+    reverse_map = jnp.asarray(KDTree(np.asarray(y.positions)).query(np.asarray(x.positions))[1], jnp.int32)
     stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *sides) for sides in ((x, y), (y, x))]
     both = eqx.filter_vmap(lambda *arguments: refine(*arguments, refiner=refiner))(
-        *stacked, jnp.stack([start, way_back])
+        *stacked, jnp.stack([initial_map, reverse_map])
     )
     np.testing.assert_array_equal(both.pointwise_map[0], plain.pointwise_map)
     np.testing.assert_array_equal(
-        both.pointwise_map[1], refine(y, x, way_back, refiner=refiner).pointwise_map
+        both.pointwise_map[1], refine(y, x, reverse_map, refiner=refiner).pointwise_map
     )
 
 
-def test_patches_find_the_same(pair):
-    x, y, start, *_ = pair
+def test_search_in_patches_gives_the_same_map(pair):
+    x, y, initial_map, *_ = pair
     x, y = (s.with_descriptors(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
     maps = [
-        refine(x, y, start, refiner=Registration(search=search)).pointwise_map
+        refine(x, y, initial_map, refiner=Registration(search=search)).pointwise_map
         for search in ("exhaustive", "patches")
     ]
     np.testing.assert_array_equal(*maps)
 
 
-def test_samples_ask_and_all_vertices_answer(pair):
-    x, y, start, truth, _ = pair
+def test_samples_are_queries_and_all_vertices_are_targets(pair):
+    x, y, initial_map, truth, _ = pair
     generator = np.random.default_rng(1)
     samples = [jnp.asarray(generator.choice(len(truth), 300, replace=False)) for _ in "xy"]
-    found = refine(x, y, start, refiner=Registration((20,)), samples=(samples[0], samples[1]))
+    found = refine(x, y, initial_map, refiner=Registration((20,)), samples=(samples[0], samples[1]))
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
 
 
-def test_a_part_keeps_its_size(pair):
-    """In the unit of the whole; bodies that are whole are compared at area 1."""
+def test_a_partial_shape_keeps_its_size(pair):
+    """A partial shape keeps the unit of the full shape, whereas full shapes are scaled to area 1."""
     x, *_, mesh = pair
     kept = mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0.3
     used, faces = np.unique(mesh.faces[kept], return_inverse=True)
@@ -239,11 +256,11 @@ def test_a_part_keeps_its_size(pair):
 
 
 def test_float32_stays_float32_and_agrees(pair):
-    x, y, start, truth, _ = pair
+    x, y, initial_map, truth, _ = pair
     single = [
         jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, s) for s in (x, y)
     ]
-    found = refine(*single, start, refiner=Registration((20, 40)), iterations=4)
+    found = refine(*single, initial_map, refiner=Registration((20, 40)), iterations=4)
     assert {leaf.dtype for leaf in jax.tree.leaves(found.state)} == {
         np.dtype(np.float32),
         np.dtype(np.int32),
@@ -252,34 +269,34 @@ def test_float32_stays_float32_and_agrees(pair):
 
 
 def test_does_not_stop_before_the_last_level(pair):
-    x, y, start, *_ = pair
+    x, y, initial_map, *_ = pair
     refiner = Registration((20,) * 8)
-    found = refine(x, y, start, refiner=refiner, iterations=40, stop_when_unchanged=True)
+    found = refine(x, y, initial_map, refiner=refiner, iterations=40, stop_when_unchanged=True)
     assert 9 < found.iterations < 40
 
 
-def test_nothing_but_constants_to_go_by(pair):
-    """As where a mesh has as many parts as eigenvectors were asked for: still numbers."""
-    x, y, start, *_ = pair
-    found = refine(x.truncate(1), y.truncate(1), start, refiner=Registration())
+def test_a_single_constant_eigenvector_is_no_failure(pair):
+    """Such spectra occur if a mesh has as many connected components as requested eigenvectors."""
+    x, y, initial_map, *_ = pair
+    found = refine(x.truncate(1), y.truncate(1), initial_map, refiner=Registration())
     assert found.result == RESULTS.successful and (np.asarray(found.pointwise_map) >= 0).all()
 
 
-def test_what_cannot_work_is_refused(pair):
-    x, y, start, *_ = pair
+def test_invalid_spectra_and_settings_are_refused(pair):
+    x, y, initial_map, *_ = pair
     bare = Spectrum(y.eigenvalues, y.eigenvectors, y.vertex_areas, y.mask)
     with pytest.raises(ValueError, match=r"positions and normals.*Spectrum\.with_positions"):
-        refine(x, bare, start, refiner=Registration())
-    placed = refine(x, bare.with_positions(y.positions, y.normals), start, refiner=Registration())
+        refine(x, bare, initial_map, refiner=Registration())
+    placed = refine(x, bare.with_positions(y.positions, y.normals), initial_map, refiner=Registration())
     np.testing.assert_array_equal(
-        placed.pointwise_map, refine(x, y, start, refiner=Registration()).pointwise_map
+        placed.pointwise_map, refine(x, y, initial_map, refiner=Registration()).pointwise_map
     )
     with pytest.raises(ValueError, match="X has 2 descriptors and Y has 0"):
-        refine(x.with_descriptors(x.eigenvectors[:, :2]), y, start, refiner=Registration())
+        refine(x.with_descriptors(x.eigenvectors[:, :2]), y, initial_map, refiner=Registration())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         Registration((20, 0))
     with pytest.raises((ValueError, TypeCheckError), match="search"):
         Registration(search="quick")
     broken = x.with_positions(x.positions.at[3, 1].set(jnp.nan), x.normals)
-    found = refine(broken, y, start, refiner=Registration())
+    found = refine(broken, y, initial_map, refiner=Registration())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()

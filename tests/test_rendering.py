@@ -1,4 +1,4 @@
-"""Pictures of meshes: the camera, what covers what, and the light."""
+"""Pictures of meshes: camera, visibility and light."""
 
 from dataclasses import replace
 
@@ -70,12 +70,12 @@ def test_a_picture_depends_on_the_surface_only() -> None:
     other, number = renumbered(mesh)
     order = np.argsort(number)
     assert np.abs(picture(other, color[order]) - expected).max() <= 1
-    # A mesh that is inside out has the same light.
+    # An inside-out mesh has the same lighting.
     inside_out = replace(mesh, faces=mesh.faces[:, ::-1])
     assert np.abs(picture(inside_out, color) - expected).max() <= 1
 
 
-def test_large_and_many_triangles_go_through_any_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_chunk_size_does_not_change_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces = grid_mesh(3, 3)
     mesh = stand(Mesh(vertices, faces))
     color = colors.position_colors(mesh)
@@ -91,6 +91,6 @@ def test_bodies_larger_than_the_picture_are_cut_off() -> None:
     color = uniform(SPHERE, 0, 1, 0)
     large = render(SPHERE, color, azimuth=0.0, scale=400.0, width=300, height=300)
     small = render(SPHERE, color, azimuth=0.0, scale=400.0, width=100, height=60)
-    # Only ambient occlusion may differ; a convex body has it near its outline only.
+    # Only ambient occlusion may differ, and a convex body has occlusion only near its outline.
     assert np.abs(large[120:180, 100:200].astype(int) - small).max() <= 12
     assert np.all(small[..., 3] == 255)

@@ -1,4 +1,4 @@
-"""Stages one after the other, and the repair of maps that look wrong."""
+"""Runs of stages, and the repair of maps that look wrong."""
 
 from dataclasses import fields, replace
 
@@ -80,8 +80,8 @@ def test_padding_changes_nothing(body, swapped, monkeypatch):
     np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map[:n])
 
 
-def test_an_alternative_initial_map_helps_where_rounds_do_not(body, swapped, mirrored, identity):
-    """With a single round, nothing tells the arms apart: whatever the round keeps is mirrored."""
+def test_an_alternative_initial_map_helps_where_a_single_round_does_not(body, swapped, mirrored, identity):
+    """A single round keeps the mirrored map, but alternative initial maps lead to the right map."""
     mesh, spectrum = body
     repair = replace(REPAIR, rounds=1)
     assert distortion(Pair(mesh, mesh), mirrored, spectrum) > 1.3
@@ -136,8 +136,7 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     assert right.distortion < 1.1 and not right.suspicious
 
 
-def test_every_number_of_repair_is_in_the_settings():
-    """No constant of the repair lives anywhere else."""
+def test_default_repair_settings_are_those_of_the_preset_and_documented():
     settings = RepairSettings()
     assert settings == PRESETS["accurate"].repair
     for field in fields(settings):
@@ -155,7 +154,7 @@ def test_every_number_of_repair_is_in_the_settings():
         (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),
     ],
 )
-def test_presets_that_cannot_work_are_refused(make, fault):
+def test_invalid_presets_are_refused(make, fault):
     with pytest.raises(InputError, match=fault):
         make()
 

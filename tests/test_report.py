@@ -1,4 +1,4 @@
-"""The report of a match: its files, its words and its times."""
+"""The report of a match: its files, its texts and its times."""
 
 import json
 import re
@@ -67,7 +67,7 @@ def test_the_report_states_the_times_of_match_by_default(found: Correspondence, 
     assert re.search(r'<p data-for="error-0">An estimate of the distance .* without knowing', page)
 
 
-def test_the_summary_says_what_the_match_says(
+def test_the_summary_states_the_results_of_the_match(
     found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
 ) -> None:
     write_report(tmp_path, found, errors=errors, settings={"seed": 3})

@@ -30,9 +30,9 @@ def data(tmp_path_factory) -> Path:
     (directory / "bumps" / "off").mkdir(parents=True)
     (directory / "bumps" / "corres").mkdir()
     mesh = bumpy_mesh(4)
-    for number, stretch in enumerate(([1, 1, 1], [1.05, 1, 0.97], [1, 0.95, 1.04])):
+    for number, factors in enumerate(([1, 1, 1], [1.05, 1, 0.97], [1, 0.95, 1.04])):
         name = f"bump{number}"
-        moved = make_mesh(mesh.vertices * stretch, mesh.faces)
+        moved = make_mesh(mesh.vertices * factors, mesh.faces)
         write_mesh(directory / "bumps" / "off" / f"{name}.off", moved)
         np.savetxt(directory / "bumps" / "corres" / f"{name}.vts", np.arange(1, 2563), fmt="%d")
     return directory

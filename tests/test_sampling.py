@@ -85,7 +85,7 @@ def test_unreferenced_vertices_are_never_samples():
 
 @pytest.mark.parametrize("radius", [1, 3])
 def test_a_maximal_independent_set_is_independent_and_maximal(radius):
-    """By distances in the graph, no two vertices are within the radius, and no other could be added."""
+    """In graph distance, chosen vertices are farther apart than the radius, and no vertex could be added."""
     from scipy.sparse.csgraph import shortest_path
 
     mesh = bumpy()

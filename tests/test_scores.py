@@ -1,4 +1,4 @@
-"""What is wrong with a map, told without the truth."""
+"""Scores and expected errors of maps, which need no ground truth."""
 
 import igl
 import jax
@@ -41,7 +41,7 @@ def test_the_identity_has_no_faults(mesh, spectrum):
     assert not orientation_reversal(Pair(mesh, mesh), identity, spectrum).any()
 
 
-def test_neither_unit_nor_numbering_matters():
+def test_scores_do_not_depend_on_unit_or_numbering():
     mesh = bumpy_mesh(3)
     order = np.random.default_rng(0).permutation(len(mesh.vertices))
     other = make_mesh(50 * mesh.vertices[order] + 3, np.argsort(order)[mesh.faces])
@@ -50,14 +50,14 @@ def test_neither_unit_nor_numbering_matters():
     assert not orientation_reversal(Pair(mesh, other), np.argsort(order), spectrum).any()
 
 
-def test_an_inside_out_mesh_is_no_mirror_image(mesh, spectrum):
+def test_inside_out_meshes_have_no_orientation_reversal(mesh, spectrum):
     identity = np.arange(len(mesh.vertices))
     inside_out = make_mesh(mesh.vertices, mesh.faces[:, ::-1])
     for x, y in ((mesh, inside_out), (inside_out, mesh), (inside_out, inside_out)):
         assert not orientation_reversal(Pair(x, y), identity, spectrum).any()
 
 
-def test_swapped_limbs_are_discontinuous_and_reversed(mesh, spectrum):
+def test_swapped_limbs_have_discontinuities_and_orientation_reversal(mesh, spectrum):
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
@@ -78,7 +78,7 @@ def test_swapped_limbs_are_discontinuous_and_reversed(mesh, spectrum):
 
 
 def test_a_right_map_between_coarse_meshes_is_not_distorted():
-    """With 200 vertices a match is often an edge away from the truth, which is no distortion."""
+    """With 200 vertices, a match is often one edge away from the truth, which is no distortion."""
     fine, noise = body_with_arms(), np.random.default_rng(0).normal(size=(2562, 3))
     x, y = (
         make_mesh(*igl.decimate(fine.vertices + amount * noise, fine.faces, 400)[:2]) for amount in (0, 0.03)
@@ -104,14 +104,14 @@ def test_a_map_that_collapses_is_distorted(spectrum, mesh):
     shrunk = part[KDTree(mesh.vertices[part]).query(mesh.vertices)[1]]
     assert dirichlet_energy_ratio(Pair(mesh, mesh), shrunk, spectrum) < 0.8
     assert distortion(Pair(mesh, mesh), shrunk, spectrum) > 1.25
-    # Of a whole body most may well have to go where a part of it ends.
+    # For a partial pair shrinking does not count, because large parts of the full shape have no match.
     assert distortion(Pair(mesh, mesh, True), shrunk, spectrum) < distortion(
         Pair(mesh, mesh), shrunk, spectrum
     )
 
 
 def test_scattered_matches_are_no_distortion(spectrum, mesh):
-    """Matches that are wrong by an edge, every one by itself; a map that leads an arm astray is one."""
+    """Independent errors of about one edge do not count, but a map that takes an arm to one vertex does."""
     edge = np.sqrt(mesh.area / len(mesh.vertices))
     moved = mesh.vertices + edge * np.random.default_rng(0).normal(size=mesh.vertices.shape)
     _, rough = KDTree(mesh.vertices).query(moved)
@@ -123,8 +123,8 @@ def test_scattered_matches_are_no_distortion(spectrum, mesh):
     assert dirichlet_energy_ratio(Pair(mesh, mesh), astray, spectrum) > 1.1
 
 
-def test_swapped_arms_come_off_dense_meshes(mesh, monkeypatch):
-    """Where edges between spread vertices stand for all."""
+def test_swapped_arms_are_discontinuous_on_dense_meshes(mesh, monkeypatch):
+    """On dense meshes, edges between evenly spread vertices replace the edges of the mesh."""
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
@@ -136,13 +136,13 @@ def test_swapped_arms_come_off_dense_meshes(mesh, monkeypatch):
     coarse_edges.cache_clear()
 
 
-def test_of_a_perfect_map_no_error_is_expected(mesh, spectrum):
+def test_the_expected_error_of_a_perfect_map_is_zero(mesh, spectrum):
     identity = np.arange(len(mesh.vertices))
     assert expected_error(Pair(mesh, mesh), identity, identity, spectrum).max() == 0
 
 
-def test_errors_are_expected_where_they_are(mesh, spectrum):
-    """Where limbs are swapped, and where matches are scattered."""
+def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
+    """The errors come from swapped limbs and from scattered matches."""
     identity = np.arange(len(mesh.vertices))
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
@@ -163,8 +163,8 @@ def test_errors_are_expected_where_they_are(mesh, spectrum):
     assert 0.3 < expected[top].mean() / truly[top].mean() < 3
 
 
-def test_it_does_not_matter_how_far_away_a_mesh_lies():
-    """In float32, too, where a hundred bodies' widths take the digits that tell vertices apart."""
+def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
+    """The spectra are in float32, which would lose the digits of vertices far from the origin."""
     near = bumpy_mesh(3)
     far = make_mesh(near.vertices + 1e5, near.faces)
     identity = np.arange(len(near.vertices))
@@ -175,7 +175,7 @@ def test_it_does_not_matter_how_far_away_a_mesh_lies():
         assert dirichlet_energy_ratio(Pair(x, y), identity, spectrum) == pytest.approx(1, abs=1e-4)
 
 
-def test_maps_are_alike_but_for_details(mesh):
+def test_same_map_ignores_details(mesh):
     identity = np.arange(len(mesh.vertices))
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     assert same_map(Pair(mesh, mesh), identity, identity) and not same_map(
@@ -183,7 +183,7 @@ def test_maps_are_alike_but_for_details(mesh):
     )
     few = np.arange(len(mesh.vertices)) < 5
     assert same_map(Pair(mesh, mesh), identity, np.where(few, mirrored, identity))
-    # To a part that is a tenth of the body a tenth of its own size is little.
+    # For a partial pair, distances on the small piece are measured in the unit of the full shape.
     piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
     moved = np.empty_like(identity)
     moved[shift] = np.roll(shift, 40)
@@ -192,8 +192,8 @@ def test_maps_are_alike_but_for_details(mesh):
     )
 
 
-def test_lengths_of_a_part_are_measured_like_the_whole(mesh):
-    """A part in the same unit keeps its lengths; compared by area, lengths would grow."""
+def test_lengths_on_a_partial_shape_use_the_unit_of_the_full_shape(mesh):
+    """Scaling the partial shape to area 1 would enlarge its lengths."""
     kept = mesh.vertices[:, 0] < 1
     old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
     part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))
@@ -205,8 +205,8 @@ def test_lengths_of_a_part_are_measured_like_the_whole(mesh):
     assert expected_error(Pair(part, mesh, True), old, back, spectrum).max() == pytest.approx(0, abs=1e-12)
 
 
-def test_errors_on_a_part_are_in_its_own_unit(mesh, spectrum):
-    """From the whole to a part: of the same detours the smaller part makes more of its own."""
+def test_errors_on_a_partial_shape_are_in_its_own_unit(mesh, spectrum):
+    """The same displacements are larger relative to a partial target with a smaller area."""
     kept = mesh.vertices[:, 0] < 1
     old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
     part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))

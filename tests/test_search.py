@@ -26,7 +26,7 @@ def check_against_brute_force(search, m, n, d, *, draws):
         np.testing.assert_array_equal(nearest, cdist(queries, database).argmin(axis=1))
 
 
-# Around the sizes of blocks (128) and chunks (64).
+# Many sizes are close to multiples of the block size (128) or the chunk size (64).
 @pytest.mark.parametrize(
     ("m", "n", "d"),
     [
@@ -82,7 +82,7 @@ def test_padding_changes_nothing():
 
 
 def test_float32_finds_the_same_far_from_the_origin():
-    """Scores lose digits if norms are large compared to distances. True distances of two candidates help."""
+    """Scores lose digits if norms are large, so true distances decide between the two best candidates."""
     generator = np.random.default_rng(0)
     database = generator.normal(size=(1000, 10)) + 20
     queries = database[generator.permutation(1000)] + 1e-3 * generator.normal(size=(1000, 10))
@@ -119,7 +119,7 @@ def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_
 @pytest.mark.parametrize(
     ("m", "n", "d"), [(1, 1, 1), (3, 50, 2), (50, 3, 30), (130, 210, 5), (300, 300, 1), (257, 500, 20)]
 )
-def test_patches_find_the_same_for_random_points(m, n, d):
+def test_search_in_patches_equals_brute_force_for_random_points(m, n, d):
     """No patch can be skipped for points that are spread evenly in all dimensions."""
     check_against_brute_force(in_patches, m, n, d, draws=5)
 
@@ -132,7 +132,7 @@ def embedding():
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
-def test_patches_find_the_same_on_surfaces(embedding, dtype, noise):
+def test_search_in_patches_equals_exhaustive_search_on_surfaces(embedding, dtype, noise):
     """The noise gives a perfect map, a poor map and a random map."""
     generator = np.random.default_rng(0)
     turned, _ = np.linalg.qr(np.eye(30) + noise * generator.normal(size=(30, 30)) / np.sqrt(30))
@@ -167,12 +167,12 @@ def test_patches_ignore_masked_points(embedding):
 
 
 def test_patches_break_ties_like_the_exhaustive_search(embedding):
-    """Every point occurs twice, far apart in the order of rows."""
+    """Every point occurs twice, in rows that are far apart."""
     twice = jnp.concatenate([embedding, embedding])
     np.testing.assert_array_equal(in_patches(embedding, twice, size=64), jnp.arange(2562))
 
 
-def test_patches_under_vmap(embedding):
+def test_search_in_patches_gives_the_same_under_vmap(embedding):
     turned = jnp.stack([embedding, embedding * jnp.linspace(1, 0.1, 30)[None, :]])
     looped = [in_patches(embedding, database) for database in turned]
     np.testing.assert_array_equal(jax.vmap(in_patches, (None, 0))(embedding, turned), jnp.stack(looped))

@@ -24,11 +24,11 @@ def descriptors(bumpy):
 
 
 def agree(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether descriptors are equal, except at rare vertices where rounding breaks a tie of the majority."""
+    """Whether descriptors are equal, except at rare vertices where rounding decides a tied majority."""
     return np.mean(np.abs(a - b).max(axis=1) < 1e-6) > 0.99
 
 
-def test_unit_rows_of_352(bumpy, descriptors):
+def test_descriptors_are_non_negative_unit_rows_of_352(bumpy, descriptors):
     assert descriptors.shape == (len(bumpy.vertices), 352)
     assert (descriptors >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1)
@@ -42,7 +42,7 @@ def test_unit_rows_of_352(bumpy, descriptors):
         lambda v: v + np.array([3.0, -2.0, 9.0]),
         lambda v: v @ Rotation.from_euler("xyz", (0.3, 1.2, -2.0)).as_matrix().T,
     ],
-    ids=["smaller", "larger", "moved", "turned"],
+    ids=["smaller", "larger", "moved", "rotated"],
 )
 def test_invariant_to_similarity(bumpy, descriptors, move):
     assert agree(shot_descriptors(make_mesh(move(bumpy.vertices), bumpy.faces)), descriptors)
@@ -80,7 +80,7 @@ def test_the_size_of_blocks_has_no_effect(bumpy, descriptors, monkeypatch):
     np.testing.assert_allclose(shot_descriptors(bumpy), descriptors, atol=1e-9)
 
 
-def test_a_flat_square_has_a_closed_form():
+def test_a_flat_square_fills_one_bin_of_the_cosine():
     """On a plane, all normals equal z or -z, so only one bin of the cosine is not empty."""
     descriptors = shot_descriptors(make_mesh(*grid_mesh(40, 40)), radius=0.2)
     bins = descriptors.reshape(-1, 32, 11).sum(axis=1)
@@ -92,7 +92,7 @@ def test_the_radius_has_an_effect(bumpy, descriptors):
     assert np.abs(shot_descriptors(bumpy, radius=0.09) - descriptors).max() > 0.1
 
 
-def test_unreferenced_and_coincident_vertices(bumpy, descriptors):
+def test_unreferenced_vertices_get_zeros_and_coincident_vertices_get_finite_values(bumpy, descriptors):
     vertices = np.concatenate([bumpy.vertices, bumpy.vertices[:1]])
     with_unreferenced = shot_descriptors(make_mesh(vertices, bumpy.faces))
     assert (with_unreferenced[-1] == 0).all()
@@ -130,7 +130,7 @@ def test_radius_must_be_positive(bumpy, radius):
 
 
 def test_samples_act_like_the_vertices_of_a_coarser_mesh(bumpy):
-    """Samples of a fine mesh have nearly the descriptors of a coarse mesh whose vertices they are."""
+    """The vertices of the coarse mesh are the samples of the fine mesh, and both have similar descriptors."""
     coarse, fine = bumpy, bumpy_mesh(5)
     n = len(coarse.vertices)
     np.testing.assert_allclose(fine.vertices[:n], coarse.vertices, atol=1e-12)

@@ -34,7 +34,7 @@ def test_scale_cancels_and_several_zero_eigenvalues_are_allowed(signature):
 
 
 @pytest.mark.parametrize("signature", SIGNATURES)
-def test_a_sphere_looks_the_same_everywhere(signature):
+def test_signatures_of_a_sphere_are_nearly_constant(signature):
     spectrum = compute_spectrum(make_mesh(*sphere_mesh(4)), 36)
     values = np.asarray(signature(spectrum, dimensions=10))
     assert np.std(values, axis=0).max() < 0.06
@@ -59,7 +59,7 @@ def test_signatures_follow_their_definitions():
         heat_kernel_signature(spectrum, dimensions=8), squares @ (weights / weights.sum(1, keepdims=True)).T
     )
     low, high = np.log(values[1]), np.log(values[-1])
-    # The centres stay two widths of seven steps inside the range.
+    # The centres stay two widths inside the range, and a width is seven steps.
     step = (high - low) / (7 + 28)
     energies = low + 14 * step + np.arange(8) * step
     weights = np.exp(-((energies[:, None] - np.log(values[1:])) ** 2) / (2 * (7 * step) ** 2))

@@ -33,8 +33,8 @@ def pair():
     disturbed = x.eigenvectors[order] + 0.05 * generator.normal(size=(M, K))
     y = Spectrum(x.eigenvalues, disturbed, x.vertex_areas[order], x.mask[order])
     truth = np.argsort(order)
-    start = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
-    return x, y, jnp.asarray(start, jnp.int32)
+    initial_map = np.where(generator.random(M) < 1 / 3, generator.integers(0, M, M), truth)
+    return x, y, jnp.asarray(initial_map, jnp.int32)
 
 
 def points(m=150, n=140, d=4):
@@ -77,7 +77,7 @@ def test_rows_without_area_get_no_share_and_change_no_share(recovery):
     np.testing.assert_allclose(shares[:, :-7], dense(recovery, queries, database, a, b), atol=1e-12)
 
 
-def test_fewer_rows_with_area_than_requested():
+def test_nearest_few_allows_fewer_rows_with_area_than_requested():
     queries, database, a, b = points(n=9)
     b = b.at[3:].set(0)
     shares = dense(NearestFew(5), queries, database, a, b)
@@ -86,10 +86,10 @@ def test_fewer_rows_with_area_than_requested():
 
 
 @pytest.mark.parametrize("recovery", [Softmax(0.01), NearestFew(5, 0.01)], ids=["softmax", "few"])
-def test_the_coldest_soft_maps_are_nearest_neighbors(pair, recovery):
-    x, y, start = pair
-    soft = refine_softly(x, y, start, recovery=recovery, iterations=2)
-    hard = refine(x, y, start, iterations=3)
+def test_soft_maps_at_low_temperature_are_nearest_neighbors(pair, recovery):
+    x, y, initial_map = pair
+    soft = refine_softly(x, y, initial_map, recovery=recovery, iterations=2)
+    hard = refine(x, y, initial_map, iterations=3)
     assert soft.result == RESULTS.successful
     np.testing.assert_array_equal(soft.soft_map.pointwise_map(), hard.pointwise_map)
     np.testing.assert_allclose(soft.functional_map, hard.functional_map, atol=1e-9)
@@ -97,15 +97,15 @@ def test_the_coldest_soft_maps_are_nearest_neighbors(pair, recovery):
 
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
-    x, y, start = pair
-    one = NearestFew(1)(y.eigenvectors[start], y.eigenvectors, x.vertex_areas, y.vertex_areas)
-    np.testing.assert_array_equal(pull_back(one, y.eigenvectors), pull_back(start, y.eigenvectors))
-    hard, soft = (encode(t, x, y, convention=convention) for t in (start, one))
+    x, y, initial_map = pair
+    one = NearestFew(1)(y.eigenvectors[initial_map], y.eigenvectors, x.vertex_areas, y.vertex_areas)
+    np.testing.assert_array_equal(pull_back(one, y.eigenvectors), pull_back(initial_map, y.eigenvectors))
+    hard, soft = (encode(t, x, y, convention=convention) for t in (initial_map, one))
     np.testing.assert_allclose(soft, hard, atol=1e-14)
     g = Meyer(4)(x.eigenvalues, x.eigenvalues)
     for norm in ("area", "frobenius"):
         problem = WaveletProblem(x, y, g, g, convention)
-        energies = (problem.energy(t, norm=norm) for t in (start, one))
+        energies = (problem.energy(t, norm=norm) for t in (initial_map, one))
         expected, found = (energy(hard) for energy in energies)
         np.testing.assert_allclose(found, expected)
 
@@ -133,7 +133,7 @@ def leaves_and_directions(pair):
 
 
 def refined(pair, leaves, recovery, solution, **options):
-    x, y, start = pair
+    x, y, initial_map = pair
     x = Spectrum(leaves["eigenvalues of X"], leaves["eigenvectors of X"], x.vertex_areas, x.mask)
     y = Spectrum(leaves["eigenvalues of Y"], leaves["eigenvectors of Y"], leaves["vertex areas of Y"], y.mask)
     if solution == "descriptors":
@@ -146,7 +146,7 @@ def refined(pair, leaves, recovery, solution, **options):
         )
     refiner = WaveletPreservation(Warped(Meyer(4), Logarithm(leaves["bank"])), solution)
     recovery = eqx.tree_at(lambda r: r.temperature, recovery, leaves["temperature"])
-    return refine_softly(x, y, start, refiner=refiner, recovery=recovery, **options)
+    return refine_softly(x, y, initial_map, refiner=refiner, recovery=recovery, **options)
 
 
 CASES = {
@@ -220,19 +220,24 @@ def test_all_kinds_of_differentiation_agree_at_a_fixed_point(pair):
 
 
 def test_a_missing_fixed_point_is_reported(pair):
-    x, y, start = pair
+    x, y, initial_map = pair
     few = refine_softly(
-        x, y, start, recovery=Softmax(10.0), iterations=2, differentiation="implicit", tolerance=1e-9
+        x, y, initial_map, recovery=Softmax(10.0), iterations=2, differentiation="implicit", tolerance=1e-9
     )
     assert few.result == RESULTS.fixed_point_not_reached
 
 
 def test_there_is_no_implicit_derivative_without_a_fixed_point(pair):
-    x, y, start = pair
+    x, y, initial_map = pair
 
     def loss(temperature, iterations):
         found = refine_softly(
-            x, y, start, recovery=Softmax(temperature), iterations=iterations, differentiation="implicit"
+            x,
+            y,
+            initial_map,
+            recovery=Softmax(temperature),
+            iterations=iterations,
+            differentiation="implicit",
         )
         return jnp.sum(jnp.sin(found.functional_map)), found.result
 
@@ -253,8 +258,10 @@ def test_a_soft_initial_map_has_a_derivative(pair):
     x, y, _ = pair
 
     def loss(features):
-        start = Softmax(100.0)(features, y.eigenvectors, x.vertex_areas, y.vertex_areas)
-        return jnp.sum(refine_softly(x, y, start, recovery=Softmax(10.0), iterations=1).functional_map[0])
+        initial_map = Softmax(100.0)(features, y.eigenvectors, x.vertex_areas, y.vertex_areas)
+        return jnp.sum(
+            refine_softly(x, y, initial_map, recovery=Softmax(10.0), iterations=1).functional_map[0]
+        )
 
     assert float(jnp.abs(jax.grad(loss)(x.eigenvectors)).max()) > 1e-6
 
@@ -301,13 +308,13 @@ def test_models_of_any_library_can_use_the_layer(pair):
     assert beside == pytest.approx(float(inside))
     np.testing.assert_allclose(slope["params"]["kernel"], slopes["params"]["kernel"])
     assert 0 < float(jnp.abs(slope["params"]["kernel"]).max()) < float("inf")
-    # As a parameter, the layer is learned, too.
+    # A layer that is a parameter has a derivative, too.
     assert 0 < abs(float(slopes["layer"].recovery.temperature)) < float("inf")
 
 
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
 def test_padding_changes_nothing(pair, recovery):
-    x, y, start = pair
+    x, y, initial_map = pair
 
     def padded(spectrum: Spectrum, rows: int) -> Spectrum:
         add = lambda leaf: jnp.pad(leaf, [(0, rows)] + [(0, 0)] * (leaf.ndim - 1))  # noqa: E731
@@ -316,29 +323,29 @@ def test_padding_changes_nothing(pair, recovery):
         )
 
     options = {"recovery": recovery, "iterations": 2}
-    expected = refine_softly(x, y, start, **options)
-    found = refine_softly(padded(x, 9), padded(y, 4), jnp.pad(start, (0, 9)), **options)
+    expected = refine_softly(x, y, initial_map, **options)
+    found = refine_softly(padded(x, 9), padded(y, 4), jnp.pad(initial_map, (0, 9)), **options)
     np.testing.assert_allclose(found.functional_map, expected.functional_map, atol=1e-10)
 
 
 def test_signs_of_eigenvectors_do_not_matter(pair):
-    x, y, start = pair
+    x, y, initial_map = pair
     signs = jnp.asarray([[1.0, -1.0] * (K // 2)])
     turned = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * signs)
     options = {"recovery": Softmax(10.0), "iterations": 2}
-    expected, found = (refine_softly(x, shape, start, **options) for shape in (y, turned))
+    expected, found = (refine_softly(x, shape, initial_map, **options) for shape in (y, turned))
     np.testing.assert_allclose(found.functional_map * signs, expected.functional_map, atol=1e-12)
 
 
 @pytest.mark.parametrize("differentiation", ["checkpointed", "implicit"])
 def test_vmap_over_pairs_equals_a_loop(pair, differentiation):
-    x, y, start = pair
+    x, y, initial_map = pair
     options = {"recovery": Softmax(10.0), "iterations": 30, "differentiation": differentiation}
 
-    def loss(x, y, start):
-        return jnp.sum(refine_softly(x, y, start, **options).functional_map[0])
+    def loss(x, y, initial_map):
+        return jnp.sum(refine_softly(x, y, initial_map, **options).functional_map[0])
 
-    two = [(x, y, start), (y, x, start[::-1])]
+    two = [(x, y, initial_map), (y, x, initial_map[::-1])]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *two)
     gradient = jax.grad(lambda v, x, y, s: loss(eqx.tree_at(lambda z: z.eigenvectors, x, v), y, s))
     found = jax.vmap(gradient)(stacked[0].eigenvectors, *stacked)
@@ -364,8 +371,10 @@ def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differen
         jax.eval_shape(lambda: Spectrum(jnp.ones(k), jnp.ones((n, k)), jnp.ones(n), jnp.ones(n, bool))),
     )
 
-    def loss(x, y, start):
-        soft = refine_softly(x, y, start, recovery=recovery, iterations=8, differentiation=differentiation)
+    def loss(x, y, initial_map):
+        soft = refine_softly(
+            x, y, initial_map, recovery=recovery, iterations=8, differentiation=differentiation
+        )
         return jnp.sum(soft.soft_map.pull_back(y.eigenvectors) ** 2)
 
     program = jax.jit(jax.grad(loss, allow_int=True)).lower(
@@ -375,10 +384,11 @@ def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differen
 
 
 def test_failures_are_reported(pair):
-    x, y, start = pair
+    x, y, initial_map = pair
     damaged = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors.at[3, 2].set(jnp.nan))
-    assert refine_softly(x, damaged, start).result == RESULTS.nonfinite_spectrum
-    for nowhere in (start.at[0].set(M), -jnp.ones_like(start)):  # a failed refinement returns the latter
+    assert refine_softly(x, damaged, initial_map).result == RESULTS.nonfinite_spectrum
+    # A failed refinement returns -1 everywhere.
+    for nowhere in (initial_map.at[0].set(M), -jnp.ones_like(initial_map)):
         assert refine_softly(x, y, nowhere).result == RESULTS.invalid_initial_map
     few = NearestFew(3)(x.eigenvectors, y.eigenvectors, x.vertex_areas, y.vertex_areas)
     assert refine_softly(x, y, few).result == RESULTS.successful
@@ -386,7 +396,7 @@ def test_failures_are_reported(pair):
     assert refine_softly(x, y, elsewhere).result == RESULTS.invalid_initial_map
     # A training step can produce a negative temperature.
     below_zero = eqx.tree_at(lambda r: r.temperature, Softmax(), jnp.asarray(-0.1))
-    assert refine_softly(x, y, start, recovery=below_zero).result == RESULTS.nonfinite_functional_map
+    assert refine_softly(x, y, initial_map, recovery=below_zero).result == RESULTS.nonfinite_functional_map
 
 
 @pytest.mark.parametrize(
@@ -410,13 +420,13 @@ def test_functions_of_another_shape_are_refused(pair):
 
 
 def test_invalid_arguments_are_refused(pair):
-    x, y, start = pair
+    x, y, initial_map = pair
     with pytest.raises(ValueError, match="positive tolerance, not 0"):
-        refine_softly(x, y, start, tolerance=0.0)
+        refine_softly(x, y, initial_map, tolerance=0.0)
     with pytest.raises((TypeError, TypeCheckError)):
-        refine_softly(x, y, start, recovery=0.1)
+        refine_softly(x, y, initial_map, recovery=0.1)
     with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
-        refine_softly(x, y, start[:-3])
+        refine_softly(x, y, initial_map[:-3])
     short = Softmax()(x.eigenvectors[3:], y.eigenvectors, x.vertex_areas[3:], y.vertex_areas)
     with pytest.raises(ValueError, match="from 117 to 120 points, but the shapes have 120 and 120"):
         refine_softly(x, y, short)
@@ -425,9 +435,9 @@ def test_invalid_arguments_are_refused(pair):
     with pytest.raises((ValueError, TypeCheckError), match="features"):
         WaveletPreservationLayer()(x.eigenvectors, y.eigenvectors[:, 1:], x, y)
     with pytest.raises((ValueError, TypeCheckError), match="differentiation"):
-        refine_softly(x, y, start, differentiation="forward")
+        refine_softly(x, y, initial_map, differentiation="forward")
     with pytest.raises(ValueError, match="same jax_enable_x64"):
-        refine_softly(x, jax.tree.map(lambda a: a.astype(jnp.float32), y), start)
+        refine_softly(x, jax.tree.map(lambda a: a.astype(jnp.float32), y), initial_map)
     with pytest.raises(ValueError, match="at least 1 row"):
         NearestFew(0)
     for recovery in (Softmax, NearestFew, Sinkhorn):
@@ -437,38 +447,38 @@ def test_invalid_arguments_are_refused(pair):
 
 @pytest.mark.parametrize("loop", [refine, refine_softly])
 def test_iterations_must_be_an_integer(pair, loop):
-    x, y, start = pair
-    two = loop(x, y, start, iterations=2)
+    x, y, initial_map = pair
+    two = loop(x, y, initial_map, iterations=2)
     for integer in (np.int64(2), np.uint8(2), jnp.asarray(2)):
         np.testing.assert_array_equal(
-            loop(x, y, start, iterations=integer).functional_map, two.functional_map
+            loop(x, y, initial_map, iterations=integer).functional_map, two.functional_map
         )
     for other in (2.0, np.float64(2), "2", None):
         with pytest.raises(TypeError, match=f"{loop.__name__} needs a whole number of iterations"):
-            loop(x, y, start, iterations=other)
+            loop(x, y, initial_map, iterations=other)
     with pytest.raises(TypeError, match="known when it is compiled"):
-        jax.jit(lambda number: loop(x, y, start, iterations=number).functional_map)(2)
+        jax.jit(lambda number: loop(x, y, initial_map, iterations=number).functional_map)(2)
     for few in (0, np.int64(-1)):
         with pytest.raises(ValueError, match=f"{loop.__name__} needs at least 1 iteration, not {few}"):
-            loop(x, y, start, iterations=few)
+            loop(x, y, initial_map, iterations=few)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", [Softmax, NearestFew, Sinkhorn])
-def test_the_coldest_temperatures_have_derivatives(pair, kind, dtype):
-    x, y, start = (jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, s) for s in pair)
+def test_derivatives_exist_at_the_lowest_temperatures(pair, kind, dtype):
+    x, y, initial_map = (jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, s) for s in pair)
 
-    def size(temperature, stretch):
-        stretched = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * stretch)
+    def size(temperature, factor):
+        scaled = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * factor)
         options = {"recovery": kind(temperature=temperature), "iterations": 2}
-        return jnp.sum(refine_softly(x, stretched, start, **options).functional_map ** 2)
+        return jnp.sum(refine_softly(x, scaled, initial_map, **options).functional_map ** 2)
 
     differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
     one = jnp.asarray(1, dtype)
-    # At these temperatures all maps are nearest neighbours, so that only the factor changes the result.
+    # At these temperatures all maps are nearest neighbours, so only the factor changes the result.
     value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
     for temperature in (1e-12, 1e-30, 1e-37):
-        found, (in_temperature, in_stretch) = differentiate(jnp.asarray(temperature), one)
+        found, (in_temperature, in_factor) = differentiate(jnp.asarray(temperature), one)
         assert float(in_temperature) == 0
         np.testing.assert_allclose(found, value, rtol=1e-5)
-        np.testing.assert_allclose(in_stretch, expected, rtol=1e-4)
+        np.testing.assert_allclose(in_factor, expected, rtol=1e-4)

@@ -62,7 +62,7 @@ def solve(solution, pair, pointwise_map, *, bank=None, convention="pullback", pr
 
 
 def objective(c, pair, pointwise_map, weights, descriptors, *, convention="pullback", bank=None):
-    """Returns the objective of the docstring, summed term by term."""
+    """Returns the objective of `RegularizedLeastSquares`, summed term by term."""
     bank = CubicSpline(4) if bank is None else bank
     problem = WaveletPreservation(bank=bank, convention=convention).problem(*pair)
     eigenvalues_out, eigenvalues_in = (s.eigenvalues for s in problem.spectra)
@@ -183,7 +183,7 @@ def test_norm_changes_the_result(pair, pointwise_map):
 
 
 @pytest.mark.parametrize("solution", [LeastSquares(), RegularizedLeastSquares(**PRECISE)], ids=["exact", "regularized"])  # fmt: skip
-def test_vmap_equals_one_by_one(solution):
+def test_vmap_equals_a_loop(solution):
     pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(3)]
     maps = [jnp.asarray(np.random.default_rng(s).integers(0, N, M)) for s in range(3)]
 
@@ -203,7 +203,7 @@ def test_vmap_equals_one_by_one(solution):
 def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, descriptors):
     weights = dict.fromkeys(TERMS, 0.5)
 
-    def corner(weight, shift):
+    def loss(weight, shift):
         solution = with_weights(weights, descriptors, tolerance=1e-13)
         solution = eqx.tree_at(lambda s: s.orthogonality, solution, jnp.asarray(weight))
         x, y = pair
@@ -213,18 +213,18 @@ def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, de
 
     shift = jnp.linspace(0.1, 0.3, K_X)
     arguments = jnp.asarray(0.4), shift
-    check_grads(jax.jit(corner), arguments, order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
+    check_grads(jax.jit(loss), arguments, order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
 
 
 def test_derivative_of_the_closed_form(pair, pointwise_map):
-    def corner(eigenvectors):
+    def loss(eigenvectors):
         x = eqx.tree_at(lambda s: s.eigenvectors, pair[0], jnp.asarray(eigenvectors))
         return jnp.sum(jnp.sin(3 * solve(LeastSquares(), (x, pair[1]), pointwise_map)[0]))
 
-    check_grads(corner, (pair[0].eigenvectors,), order=1)
+    check_grads(loss, (pair[0].eigenvectors,), order=1)
 
 
-def test_starts_from_the_previous_functional_map(pair, pointwise_map):
+def test_the_solver_begins_with_the_previous_functional_map(pair, pointwise_map):
     c, _ = solve(RegularizedLeastSquares(**PRECISE), pair, pointwise_map)
     hasty = RegularizedLeastSquares(max_steps=3, tolerance=1e-6)
     _, cold = solve(hasty, pair, pointwise_map)
@@ -288,7 +288,7 @@ def test_a_map_to_too_few_vertices_is_reported(pair):
             assert refined.result == RESULTS.singular_system
 
 
-def test_the_height_of_a_bank_does_not_matter(pair, pointwise_map):
+def test_a_constant_factor_of_a_bank_does_not_matter(pair, pointwise_map):
     class Raised(FilterBank):
         def __call__(self, points, eigenvalues):
             return 3.0 * CubicSpline(4)(points, eigenvalues)
@@ -310,7 +310,7 @@ def test_new_weights_do_not_compile_again(pair, pointwise_map):
     assert len(traces) == 1 and jnp.max(jnp.abs(first - second)) > 1e-3
 
 
-def test_all_solutions_in_a_batch_of_refinements_and_on_samples():
+def test_all_solutions_on_samples_agree_with_a_loop_under_vmap():
     pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(2)]
     maps = jnp.stack([jnp.asarray(np.random.default_rng(s).integers(0, N, M)) for s in range(2)])
     samples_x, samples_y = jnp.arange(0, M, 2), jnp.arange(0, N, 2)
@@ -384,13 +384,13 @@ def test_descriptors_that_do_not_fit_are_refused(pair, pointwise_map):
         refine(x, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
 
 
-def test_descriptors_in_the_eigenbases(pair):
+def test_projected_descriptors_are_coefficients_and_symmetric_operators(pair):
     x, _ = pair
     coefficients = np.random.default_rng(0).normal(size=(K_X, 2))
     values = x.eigenvectors @ coefficients
     projected = DescriptorPair.project(values, values, x, x, operators=True)
     np.testing.assert_allclose(projected.x.coefficients, coefficients, atol=1e-12)
-    # Multiplication by a function is a symmetric matrix in the basis. For the function 1 it is the identity.
+    # Multiplication by a function is a symmetric matrix in the basis, and the identity for the function 1.
     operators = projected.x.operators
     np.testing.assert_allclose(operators, operators.transpose(0, 2, 1), atol=1e-12)
     ones = jnp.ones((M, 1))
@@ -442,12 +442,12 @@ def test_float32_stays_float32_and_agrees(pair, pointwise_map):
         ({"max_steps": 0}, "max_steps"),
     ],
 )
-def test_settings_that_cannot_work(options, message):
+def test_invalid_settings_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         RegularizedLeastSquares(**options)
 
 
-def test_descriptors_need_a_weight_and_operators_their_matrices(pair):
+def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
     values = [jnp.ones((len(s.mask), 1)) for s in pair]
     descriptors = DescriptorPair.project(*values, *pair)
     with pytest.raises(ValueError, match="descriptors need a weight"):
@@ -456,7 +456,7 @@ def test_descriptors_need_a_weight_and_operators_their_matrices(pair):
         RegularizedLeastSquares(descriptors=descriptors, descriptor_commutativity=1.0)
 
 
-def test_minimize_with_another_energy(pair):
+def test_minimize_accepts_another_energy(pair):
     """`minimize` accepts any sum of squares; the minimum of this energy is known."""
     generator = np.random.default_rng(0)
     a, target = generator.normal(size=(K_Y, 20)), generator.normal(size=(K_X, K_Y))
@@ -472,7 +472,7 @@ def test_minimize_with_another_energy(pair):
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
 @pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])
-def test_normal_equations_on_real_shapes(shared, bank, convention, norm):
+def test_normal_equations_hold_on_real_shapes(shared, bank, convention, norm):
     """The residual of the stacked system of all scales and vertices is orthogonal to the inputs of C."""
     reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
     x, y = (

@@ -61,7 +61,7 @@ def test_up_does_not_depend_on_vertex_numbers_units_or_unreferenced_vertices() -
         assert guess_up(same) == "-y"
 
 
-def test_bodies_without_limbs_stand_as_usual() -> None:
+def test_up_is_guessed_for_bodies_without_limbs() -> None:
     vertices, faces = grid_mesh(9, 9)
     assert guess_up(Mesh(vertices, faces)) == "y"
     assert guess_up(Mesh(vertices[:, [0, 2, 1]], faces)) == "z"
@@ -95,7 +95,7 @@ def test_real_animals_stand_upright_in_every_convention(shared: Path, up: str) -
         assert guess_up(in_convention(y_up, up)) == up
 
 
-def test_stand_makes_faces_agree() -> None:
+def test_stand_orients_faces_consistently() -> None:
     mixed = TALL.faces.copy()
     mixed[::3] = mixed[::3, ::-1]
     for faces in (TALL.faces, mixed):
@@ -113,7 +113,7 @@ def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
         stand(TALL, "w")  # type: ignore[arg-type]
 
 
-def test_a_partial_shape_stays_small_beside_the_full_shape() -> None:
+def test_a_partial_shape_keeps_its_size_next_to_the_full_shape() -> None:
     part = replace(TALL, faces=TALL.faces[TALL.vertices[TALL.faces, 1].min(axis=1) > 0])
     assert part.area < 0.5 * TALL.area
     whole = stand(TALL)

@@ -60,7 +60,7 @@ def test_agrees_with_brute_force_in_any_dimension(generator, dimensions):
     np.testing.assert_allclose(distance, by_brute_force(queries, points, faces), atol=1e-6)
 
 
-def test_finds_points_of_the_surface_again(generator):
+def test_points_of_the_surface_are_their_own_nearest_points(generator):
     mesh = bumpy_mesh(3)
     points = np.hstack([mesh.vertices, generator.normal(size=(len(mesh.vertices), 4))])
     faces = generator.integers(len(mesh.faces), size=200)
@@ -73,7 +73,7 @@ def test_finds_points_of_the_surface_again(generator):
 
 
 @pytest.mark.parametrize("corners", [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [0, 1, 3]])
-def test_triangles_without_area(corners):
+def test_distances_to_triangles_without_area_are_exact(corners):
     """The triangles degenerate to a point, to a segment, and to three points in a row."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 5, 0], [2, 0, 0]])
     queries = np.array([[0.4, 1, 0], [-1, 0, 0], [3, 0, 0]])

@@ -1,4 +1,4 @@
-"""The page in a browser: it does what users ask of it with mouse, keys and touch."""
+"""The page in a browser, used with mouse, keyboard and touch."""
 
 import io
 import os
@@ -139,7 +139,7 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean(np.abs(a - b).max(axis=2) > 8)) if a.shape == b.shape else 1.0
 
 
-# Lumpy, so that views and vertices differ clearly.
+# A lumpy shape, whose views and vertices differ clearly.
 SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.vertices[:, [1]])), name="X.off")
 TARGET, NUMBER = renumbered(replace(TALL, name="Y.off"), seed=1)
 
@@ -156,7 +156,7 @@ def visible_vertices() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    # Three source vertices share a target vertex, so that two target vertices have no source vertex.
+    # Three source vertices share a target vertex, so two target vertices have no source vertex.
     path = tmp_path_factory.mktemp("page") / "page.html"
     errors = np.linspace(0, 0.2, len(NUMBER))
     errors[visible_vertices()[1]] = np.nan
@@ -196,7 +196,7 @@ def test_page_draws_both_bodies(page: OpenPage) -> None:
     assert page.find("dt").text == "Mean" and page.find("dd").text == "0.1"
 
 
-def test_clicks_on_the_source(page: OpenPage) -> None:
+def test_clicks_on_the_source_show_matches_and_errors(page: OpenPage) -> None:
     before = {side: page.view(side) for side in "xy"}
     for vertex in visible_vertices()[[0, 1, 9, 16]].tolist():
         page.point_at(*page.place("x", vertex), click=True)
@@ -239,13 +239,13 @@ def test_pointing_marks_until_a_click_pins(page: OpenPage) -> None:
     page.point_at(*page.place("x", first), click=True)
     page.point_at(*page.place("x", second), click=False)
     assert page.state["source"] == [first] and page.state["pinned"]
-    # A click beside the body removes the mark.
+    # A click next to the body removes the mark.
     box = page.find("#canvas-x").rect
     page.point_at(int(box["x"]) + 8, int(box["y"] + box["height"]) - 8, click=True)
     assert page.state["source"] == [] and not page.state["pinned"]
 
 
-def test_colorings(page: OpenPage) -> None:
+def test_modes_change_the_colors(page: OpenPage) -> None:
     transfer = {side: page.view(side) for side in "xy"}
     assert not page.find(".scale").is_displayed()
     page.choose("error-0")
@@ -288,7 +288,7 @@ def test_cameras_turn_together_or_alone(page: OpenPage) -> None:
     assert all(differ(page.view(side), start[side]) == 0 for side in "xy")
 
 
-def test_keyboard(page: OpenPage) -> None:
+def test_keys_move_the_camera_and_select_vertices(page: OpenPage) -> None:
     from selenium.webdriver.common.keys import Keys
 
     start = page.view("x")
@@ -313,7 +313,7 @@ def test_keyboard(page: OpenPage) -> None:
     assert page.state["source"] == [] and field.get_property("value") == ""
 
 
-def test_touch(page: OpenPage) -> None:
+def test_touch_pins_a_vertex(page: OpenPage) -> None:
     vertex = int(visible_vertices()[2])
     x, y = page.place("x", vertex)
     touch = {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]}
@@ -324,7 +324,7 @@ def test_touch(page: OpenPage) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_small_screens_and_both_schemes(browser: Any, page_file: Path, scheme: str) -> None:
+def test_page_fits_small_screens_in_both_color_schemes(browser: Any, page_file: Path, scheme: str) -> None:
     feature = {"name": "prefers-color-scheme", "value": scheme}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     page = OpenPage(browser, page_file, width=375, height=667)
@@ -341,7 +341,7 @@ def test_small_screens_and_both_schemes(browser: Any, page_file: Path, scheme: s
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
-def test_hostile_texts_are_only_texts(browser: Any, tmp_path: Path) -> None:
+def test_hostile_texts_are_shown_as_plain_text(browser: Any, tmp_path: Path) -> None:
     from matplotlib.image import imsave
 
     png = io.BytesIO()
@@ -412,7 +412,7 @@ def comparison(browser: Any, comparison_file: Path) -> Iterator[OpenPage]:
 
 
 def rounding(values: np.ndarray) -> np.ndarray:
-    """The largest difference between eigenvectors (n, k) and those on the page: half a level, which varies."""
+    """A bound (n, k) on the rounding errors of eigenvectors on the page: half a level, which varies."""
     largest, half = np.abs(values).max(axis=0), 0.5 / 127
     return largest * (2 * half * np.sqrt(np.abs(values) / largest) + half**2) + 1e-6 * largest
 
@@ -427,7 +427,7 @@ def wavelets(spectrum: Spectrum, vertex: int) -> tuple[np.ndarray, np.ndarray]:
     return coefficients @ values.T, bound + 1e-4
 
 
-def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, Spectrum]) -> None:
+def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, Spectrum]) -> None:
     from selenium.webdriver.common.keys import Keys
 
     comparison.choose("wavelets")
@@ -453,7 +453,7 @@ def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, 
             exact, bound = (array[scale] for array in expected[side])
             error = np.abs(np.array(shown[side]) - exact)
             assert np.all(error <= bound)
-            # Visible differences: below a twentieth of the scale everywhere, usually below a hundredth.
+            # Invisible errors are below a twentieth of the scale everywhere and a hundredth in the mean square.
             assert error.max() < 0.05 * limit and np.sqrt(np.mean(error**2)) < 0.01 * limit
             color = np.reshape(comparison.run("return jaxsmw.colors(arguments[0])", side), (-1, 3))
             expected_color = 255 * colors.signed_colors(np.array(shown[side]), limit)
@@ -473,7 +473,7 @@ def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, 
     assert comparison.state["filter"] == FILTERS - 1
     assert comparison.find("#filter-name").text == f"wavelet {FILTERS - 1} of {FILTERS - 1} (narrowest)"
     assert all(differ(a, b) > 0.02 for a, b in pairwise(views))
-    # If a target vertex is picked, the wavelet on the source is around the vertex that is mapped there.
+    # If a target vertex is picked, the wavelet on the source is around the vertex with this match.
     target = int(NUMBER[first])
     comparison.point_at(*comparison.place("y", target), click=True)
     exact, bound = wavelets(spectra[0], first)
@@ -481,7 +481,7 @@ def test_wavelets_on_both_bodies(comparison: OpenPage, spectra: tuple[Spectrum, 
 
 
 def test_real_wavelets_look_the_same_on_the_page(shared: Path) -> None:
-    """Rounding is hardest for eigenvectors that are large on a limb and small elsewhere."""
+    """Rounding affects most the eigenvectors that are large on a limb and small elsewhere."""
     spectrum = compute_spectrum(read_mesh(shared / "data/faust_r/off/tr_reg_062.off"), 100)
     values = np.asarray(spectrum.eigenvectors)
     shown = encode_rounded(values.T)
@@ -508,7 +508,7 @@ def matrix_colors(page: OpenPage) -> np.ndarray:
     return np.reshape(pixels[2], (*pixels[:2], 4))[..., :3]
 
 
-def test_the_functional_map_and_its_eigenfunctions(
+def test_entries_of_the_functional_map_show_their_eigenfunctions(
     comparison: OpenPage, spectra: tuple[Spectrum, Spectrum]
 ) -> None:
     from selenium.webdriver.common.keys import Keys
@@ -559,7 +559,7 @@ def test_the_functional_map_and_its_eigenfunctions(
 
 
 def check_mode(page: OpenPage, mode: str) -> None:
-    """Buttons, explanation and legend all belong to what the bodies show."""
+    """Checks that buttons, explanation and legend belong to what the bodies show."""
     checked = "return [...document.querySelectorAll('input[name=mode]:checked')].map(e => e.value)"
     explained = (
         "return [...document.querySelectorAll('[data-for]')].filter(e => "
@@ -573,7 +573,7 @@ def check_mode(page: OpenPage, mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", ["transfer", "error-0", "wavelets", "plain"])
-def test_the_buttons_show_what_the_bodies_show(comparison: OpenPage, mode: str) -> None:
+def test_buttons_explanation_and_legend_follow_the_mode(comparison: OpenPage, mode: str) -> None:
     from selenium.webdriver.common.keys import Keys
 
     comparison.run("jaxsmw.pick(arguments[0])", int(visible_vertices()[2]))
@@ -592,7 +592,7 @@ def test_the_buttons_show_what_the_bodies_show(comparison: OpenPage, mode: str) 
     check_mode(comparison, "eigenfunctions")
     matrix.send_keys(Keys.ESCAPE)
     check_mode(comparison, mode)
-    # The button leads to the entry that was chosen last.
+    # The button selects the entry that was chosen last.
     comparison.choose("eigenfunctions")
     check_mode(comparison, "eigenfunctions")
     assert comparison.state["entry"] == [0, 0]
@@ -609,7 +609,7 @@ def test_the_first_eigenfunctions_are_not_constant(comparison: OpenPage) -> None
         assert np.ptp(values) > 0.1
 
 
-def test_the_functional_map_on_a_dark_page(browser: Any, comparison_file: Path) -> None:
+def test_the_functional_map_is_dark_on_a_dark_page(browser: Any, comparison_file: Path) -> None:
     def emulate(*features: dict[str, str]) -> None:
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": list(features)})
 
@@ -622,7 +622,7 @@ def test_the_functional_map_on_a_dark_page(browser: Any, comparison_file: Path) 
     emulate()
 
 
-def test_switching_between_maps(comparison: OpenPage) -> None:
+def test_switching_between_maps_changes_everything_that_depends_on_the_map(comparison: OpenPage) -> None:
     vertex = int(visible_vertices()[4])
     comparison.run("jaxsmw.pick(arguments[0])", vertex)
     maps = two_maps()
@@ -661,7 +661,7 @@ def test_switching_between_maps(comparison: OpenPage) -> None:
     assert similarities[0] > similarities[1] + 0.2
 
 
-def test_maps_of_different_sizes_and_without_functional_map(browser: Any, tmp_path: Path) -> None:
+def test_maps_of_different_sizes_and_without_functional_map_are_shown(browser: Any, tmp_path: Path) -> None:
     n = len(NUMBER)
     errors = {"Error": np.where(np.arange(n) == 3, np.inf, np.where(np.arange(n) == 4, np.nan, 0.01))}
     large = ShownMap(NUMBER, errors, np.diag(np.arange(1.0, 7)))
@@ -690,7 +690,7 @@ def test_maps_of_different_sizes_and_without_functional_map(browser: Any, tmp_pa
     assert browser.get_log("browser") == []
 
 
-def test_every_control_is_reached_and_worked_by_keys(comparison: OpenPage) -> None:
+def test_every_control_works_with_the_keyboard(comparison: OpenPage) -> None:
     from selenium.webdriver.common.keys import Keys
 
     comparison.choose("wavelets")
@@ -731,7 +731,7 @@ def test_every_control_is_reached_and_worked_by_keys(comparison: OpenPage) -> No
 
 
 @pytest.mark.parametrize("mode", ["transfer", "error-0", "wavelets", "eigenfunctions"])
-def test_a_phone_of_360_pixels(browser: Any, comparison_file: Path, mode: str) -> None:
+def test_page_works_on_a_phone_of_360_pixels(browser: Any, comparison_file: Path, mode: str) -> None:
     feature = {"name": "prefers-reduced-motion", "value": "reduce"}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     browser.get_log("browser")

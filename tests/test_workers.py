@@ -1,4 +1,4 @@
-"""Workers run with one core each, and the calling process stays as it is."""
+"""Workers use one core each, and the calling process does not change."""
 
 import ast
 import multiprocessing
@@ -43,7 +43,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="only Linux lists the threads of a process")
-def test_workers_have_one_thread_and_the_environment_stays(tmp_path):
+def test_workers_have_one_thread_and_the_environment_does_not_change(tmp_path):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PJRT_NPROC", "JAX_PLATFORMS")
@@ -66,7 +66,7 @@ def give_up(workers: Workers) -> None:
         raise RuntimeError("given up")
 
 
-def test_giving_up_ends_the_workers_and_no_other_process():
+def test_an_exception_ends_the_workers_and_no_other_process():
     other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(300,))
     other.start()
     try:
@@ -82,7 +82,7 @@ def test_giving_up_ends_the_workers_and_no_other_process():
 
 
 def fill() -> int:
-    """Compiles a program in the worker, and lets the next call release all programs."""
+    """Compiles a program in the worker, and makes the next task release all programs."""
     compilation._LARGEST_SHARE = 0.0
     global double
     double = jax.jit(lambda x: 2 * x)
