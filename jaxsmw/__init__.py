@@ -1,7 +1,7 @@
 """Deformable shape correspondence in JAX by multiscale spectral manifold wavelets preservation.
 
-`__init__.pyi` lists the public names. A name is loaded at its first use, so `jaxsmw --help` need not wait for
-JAX. This module imports hardly anything, so the command line handles Ctrl-C soon after its start.
+`__init__.pyi` lists the public names. A name is loaded at its first use, so `jaxsmw --help` does not import
+JAX. This module itself imports almost nothing, so the command line handles Ctrl-C soon after it starts.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ def __dir__() -> list[str]:
 
 @cache
 def _public() -> tuple:
-    """Returns the module's `__getattr__`, `__dir__` and `__all__` for the public names."""
+    """Return the module's `__getattr__`, `__dir__` and `__all__` for the public names."""
     import lazy_loader
 
     return lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""`python -m jaxsmw`."""
+"""The entry point of `python -m jaxsmw`, which runs the command line."""
 
 from jaxsmw.cli import main
 

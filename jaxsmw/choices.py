@@ -1,35 +1,35 @@
-"""The names that settings accept, and default sizes.
+"""The names that settings accept, and the default settings.
 
-The help of the command line shows these names. This module imports nothing heavy, so the help need not wait
-for JAX, NumPy and SciPy.
+The help of the command line shows these names. This module does not import JAX, NumPy or SciPy, because these
+imports would delay the help.
 """
 
 from typing import Literal
 
 PresetName = Literal["fast", "paper", "accurate"]
-"""See `jaxsmw.PRESETS`."""
+"""The names of the presets; see `jaxsmw.PRESETS`."""
 DEFAULT_PRESET: PresetName = "accurate"
 
 InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional"]
-"""See `jaxsmw.initial_map`."""
+"""The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
 
 Laplacian = Literal["auto", "cotangent", "robust"]
-"""See `jaxsmw.compute_spectrum`."""
+"""The discretizations of the Laplacian; see `jaxsmw.compute_spectrum`."""
 
 Eigensolver = Literal["auto", "exact", "approximate"]
-"""See `jaxsmw.compute_spectrum`."""
+"""The methods that compute eigenvectors; see `jaxsmw.compute_spectrum`."""
 APPROXIMATE_FROM = 50_000
-"""The number of vertices from which the eigensolver `"auto"` is approximate."""
+"""The smallest number of vertices for which the eigensolver `"auto"` chooses `"approximate"`."""
 
 Search = Literal["auto", "exhaustive", "patches"]
-"""How nearest neighbours are found. All settings find the same; `"auto"` chooses the faster search."""
+"""The methods that find nearest neighbours. All give the same result; `"auto"` chooses the faster method."""
 
 GeodesicMethod = Literal["strips", "exact"]
-"""See `jaxsmw.geodesic_distances`."""
+"""The methods that compute geodesic distances; see `jaxsmw.geodesic_distances`."""
 
 IndexBase = Literal[0, 1]
-"""The number of the first vertex in a file."""
+"""The index of the first vertex in a file."""
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
@@ -49,7 +49,7 @@ MethodName = Literal[
 ]
 """The methods of a benchmark; see `jaxsmw.evaluation.opponents.opponents.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""The methods of other libraries, for a benchmark where these libraries are installed."""
+"""The methods of other libraries in a benchmark. They are available if these libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

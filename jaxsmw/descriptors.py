@@ -1,4 +1,4 @@
-"""Descriptors of a pair: SHOT where vertices are compared, and principal components of SHOT everywhere."""
+"""Descriptors of a pair: SHOT at all vertices or at samples, and principal components of SHOT."""
 
 from __future__ import annotations
 
@@ -19,23 +19,25 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
 
-# Descriptors do not tell vertices apart that are a few hundredths of the square root of the area away from
-# each other. Ten thousand vertices are dense enough for that.
+# Descriptors do not distinguish vertices whose distance is a few hundredths of the square root of the area.
+# Ten thousand vertices are dense enough for this resolution.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
-# From this number of vertices on, the smaller neighbourhoods hold ten vertices.
+# On meshes with at least this number of vertices, the smaller neighbourhoods contain about ten vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# Descriptors of larger neighbourhoods vary more slowly, so fewer of them suffice.
+# The number of samples for larger neighbourhoods, whose descriptors vary more slowly over the surface.
 _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
-    """A shape at the vertices where descriptors are compared: all vertices, or samples of a large mesh.
+    """A shape with the vertices at which descriptors are compared, called the compared vertices.
+
+    The compared vertices are all vertices of the mesh, or samples of a large mesh.
 
     **Attributes:**
 
-    - `mesh`: the shape.
-    - `samples`: the samples; None for all vertices.
-    - `spectrum`: the spectrum at these vertices.
+    - `mesh`: the mesh with n vertices.
+    - `samples`: the samples, or None if all vertices are compared.
+    - `spectrum`: the spectrum at the compared vertices.
     """
 
     mesh: Mesh
@@ -44,7 +46,10 @@ class SampledShape(NamedTuple):
 
     @classmethod
     def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
-        """**Raises:** `InputError` if the spectrum belongs to another mesh."""
+        """Make a sampled shape from the spectrum at all n vertices of a mesh.
+
+        **Raises:** `InputError` if the spectrum has another number of vertices.
+        """
         if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
             raise InputError(
                 f"{mesh.name}: the mesh has {n} vertices, but its spectrum has {rows}: give the mesh's own "
@@ -55,12 +60,21 @@ class SampledShape(NamedTuple):
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """The rows of vertices, or of the samples nearest to them, in arrays over the compared vertices."""
+        """Return the rows of given vertices (v,) in arrays over the compared vertices.
+
+        The row of a vertex is that of the nearest sample, or that of the vertex itself without samples.
+        """
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
 
 class SampledPair(NamedTuple):
-    """A pair at the vertices where descriptors are compared."""
+    """A pair with the vertices at which descriptors are compared.
+
+    **Attributes:**
+
+    - `pair`: the source X and the target Y.
+    - `x`, `y`: X and Y with their compared vertices.
+    """
 
     pair: Pair
     x: SampledShape
@@ -68,14 +82,24 @@ class SampledPair(NamedTuple):
 
     @property
     def sides(self) -> tuple[SampledShape, SampledShape]:
-        """X and Y."""
+        """X and Y with their compared vertices."""
         return self.x, self.y
 
 
 def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
-    """A pair at all vertices, or at 10 000 evenly spread vertices of each mesh with more than 15 000.
+    """Choose the vertices of both shapes at which descriptors are compared.
 
-    **Raises:** `InputError` if a spectrum belongs to another mesh.
+    These are about 10 000 evenly spread samples of a mesh with more than 15 000 vertices, and all vertices of
+    any other mesh.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra at all vertices of X and of Y.
+
+    **Returns:** The sampled pair.
+
+    **Raises:** `InputError` if a spectrum has another number of vertices than its mesh.
     """
     samples_x, samples_y = side_by_side(_samples, *pair.meshes)
     return SampledPair(
@@ -92,22 +116,26 @@ def _samples(mesh: Mesh) -> SurfaceSamples | None:
 def describe(
     pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum, number_of_descriptors: int
 ) -> tuple[Spectrum, Spectrum]:
-    """Both spectra with descriptors: principal components of SHOT on both shapes together, of mean square 1.
+    """Add descriptors to both spectra: principal components of SHOT, computed for both shapes together.
 
-    SHOT is computed with the usual radius, and on fine meshes also with two thirds of that radius.
+    SHOT is computed with the usual radius. If both meshes have at least 2000 vertices, SHOT is also computed
+    with two thirds of this radius. Each component has mean square 1 over the areas of both shapes.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: see `paired_spectra`.
-    - `number_of_descriptors`: d, from 1 to 352; the components in which the vertices differ most.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y; see `paired_spectra`.
+    - `number_of_descriptors`: the number d of components, from 1 to 352. These are the components of largest
+      variance.
 
-    **Returns:** Both spectra with `descriptors`, (m, d) and (n, d).
+    **Returns:** Both spectra with `descriptors`, (m, d) and (n, d), without unit.
 
-    **Raises:** `InputError` for another number, or a mesh that is too coarse for SHOT.
+    **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT, or a
+    spectrum of another mesh.
     """
     if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
         raise InputError(
-            f"{number_of_descriptors} descriptors were requested; SHOT has from 1 to {SHOT_DIMENSION}."
+            f"{number_of_descriptors} descriptors were requested: give a number from 1 to {SHOT_DIMENSION}."
         )
     sampled = sample_pair(pair, spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype
@@ -127,13 +155,12 @@ def describe(
 def _shot_at_all_radii(
     sampled: SampledPair,
 ) -> list[tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]]:
-    """SHOT of both shapes with the usual radius, and with a smaller radius if both meshes are fine enough."""
+    """Compute SHOT of both shapes with the usual radius, and if possible with the smaller radius."""
     shot = [paired_shot(sampled)]
     if min(len(mesh.vertices) for mesh in sampled.pair.meshes) >= _FINE:
         with suppress(InputError), warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # the usual radius suffices for a mesh too coarse for the smaller one
+            # A mesh that is too coarse for the smaller radius still has descriptors of the usual radius.
+            warnings.simplefilter("ignore")
             shot.append(paired_shot(sampled, _FINE_RADIUS))
     return shot
 
@@ -141,7 +168,7 @@ def _shot_at_all_radii(
 def _principal_components(
     values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
 ) -> Float[np.ndarray, "n d"]:
-    """The first principal components of weighted rows, scaled to mean square 1."""
+    """Compute the first principal components of weighted rows, scaled to mean square 1."""
     centered = values - weight @ values
     covariance = centered.T @ (weight[:, None] * centered)
     variances, directions = np.linalg.eigh(covariance.astype(np.float64))
@@ -153,7 +180,15 @@ def _principal_components(
 def paired_shot(
     sampled: SampledPair, radius: float = SHOT_RADIUS
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """SHOT of both shapes at the compared vertices, with a radius in `Pair.units_of_length`.
+    """Compute SHOT of both shapes at the compared vertices.
+
+    **Arguments:**
+
+    - `sampled`: the pair.
+    - `radius`: the radius of the neighbourhoods, in `Pair.units_of_length`.
+
+    **Returns:** The descriptors of X (m, 352) and of Y (n, 352), where m and n are the numbers of compared
+    vertices.
 
     **Raises:** `InputError` if a mesh is too coarse for the radius.
     """

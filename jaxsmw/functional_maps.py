@@ -1,4 +1,7 @@
-"""Functional maps: solutions, energies, searches and spectral signatures; see `docs/mathematics.md`."""
+"""Functional maps: solutions, energies, nearest-neighbour searches and spectral signatures.
+
+`docs/mathematics.md` explains the equations.
+"""
 
 from jaxsmw.core.functional_map import QuadraticEnergy, WaveletProblem, encode, multiscale_kernel
 from jaxsmw.core.pointwise_map import decode, decode_to_triangles, search_patches

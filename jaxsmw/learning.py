@@ -1,4 +1,4 @@
-"""Soft maps and refinement that can be differentiated; see `docs/gradients.md`."""
+"""Differentiable soft maps and differentiable refinement; see `docs/gradients.md`."""
 
 from jaxsmw.core.soft_maps import (
     NearestFew,

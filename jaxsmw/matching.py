@@ -1,4 +1,4 @@
-"""One pair from meshes to correspondence: the pieces of the library in their usual order."""
+"""The function `match`, which computes the correspondence of two meshes, and its result."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
 from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
-from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare, program_size
+from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
@@ -42,27 +42,29 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correspondence:
-    """The outcome of `match`: for every vertex of X its match, a vertex of Y.
+    """The result of `match`: for every vertex of X its match, which is a vertex of Y.
 
     **Attributes:**
 
-    - `pair`: source X (m vertices) and target Y (n vertices), and whether one is partial.
+    - `pair`: the source X (m vertices), the target Y (n vertices), and whether one of them is a partial
+      shape.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `initial_map`: the map from which refinement started, (m,).
-    - `stages`: the stages of refinement, as fitted to the meshes.
+    - `initial_map`: the map from which refinement started (m,), 0-based vertices of Y.
+    - `preset`: the stages of refinement and the settings of the repair, adapted to the size of the meshes.
     - `spectrum_x`, `spectrum_y`: the spectra of the last stage, in `Pair.units_of_length`.
     - `refinement`: the outcome of the last stage, with its history if requested.
-    - `iterations`: the number of iterations of all stages.
+    - `iterations`: the total number of iterations of all stages.
     - `distortion`: `jaxsmw.repair.scores.distortion` of the map, 1 for isometries; None if the preset has no
       repair.
     - `suspicious`: whether limbs look swapped, or the body looks upside down.
-    - `seconds`: the wall time of each step. The first refinement of a size includes compilation.
+    - `seconds`: the wall time of each step, by its name. The first refinement of meshes of a given size
+      includes compilation.
     """
 
     pair: Pair
     pointwise_map: Int64[np.ndarray, " m"]
     initial_map: Int64[np.ndarray, " m"]
-    stages: tuple[Stage, ...]
+    preset: Preset
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     refinement: Refinement
@@ -74,8 +76,8 @@ class Correspondence:
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
         judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
-        doubt = ", suspicious" if self.suspicious else ""
-        return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{doubt})"
+        flag = ", suspicious" if self.suspicious else ""
+        return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{flag})"
 
     @property
     def mesh_x(self) -> Mesh:
@@ -89,15 +91,20 @@ class Correspondence:
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
-        """The last functional map, in the convention of the last refiner (pullback: Y to X)."""
+        """The last functional map, in the convention of the last refiner.
+
+        Its shape is (k_X, k_Y) for a pullback and (k_Y, k_X) for a pushforward.
+        """
         return np.asarray(self.refinement.functional_map)
 
     def surface_points(self) -> SurfacePoints:
-        """The match of every vertex of X as a point anywhere on the triangles of Y (m points).
+        """Compute the match of every vertex of X as a point on a triangle of Y.
 
-        Matches are found as for `pointwise_map`, but between the vertices of Y; see
-        `jaxsmw.functional_maps.decode_to_triangles`. Faces are rows of `mesh_y.faces`. A vertex of X that no
-        face uses gets the point of the nearest vertex that a face uses.
+        The point is the nearest point on the triangles of Y in the embeddings of the last stage, whereas
+        `pointwise_map` contains the nearest vertex; see `jaxsmw.functional_maps.decode_to_triangles`. An
+        unreferenced vertex of X gets the point of the nearest referenced vertex.
+
+        **Returns:** m surface points on Y. Their faces are rows of `mesh_y.faces`.
         """
         with self._precision():
             faces, traced_weights = compiled(nearest_point_on_triangles)(
@@ -107,13 +114,16 @@ class Correspondence:
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def one_to_one(self) -> Int64[np.ndarray, " m"]:
-        """A map in which no two vertices of X share a match (m,); see `jaxsmw.geometry.one_to_one_map`.
+        """Compute a map in which no two vertices of X share a match; see `jaxsmw.geometry.one_to_one_map`.
 
-        The map suits shapes with the same triangulation. Between different triangulations `pointwise_map` is
-        much nearer to the truth. A vertex of X that no face uses shares the match of the nearest vertex that
-        a face uses.
+        The map is intended for shapes with the same triangulation. Between different triangulations,
+        `pointwise_map` has much smaller errors. As an exception, an unreferenced vertex of X shares the match
+        of the nearest referenced vertex.
 
-        **Raises:** `InputError` if faces of X use more vertices than faces of Y.
+        **Returns:** The map X -> Y (m,), 0-based vertices of Y.
+
+        **Raises:** `InputError` if X has more referenced vertices than Y, or both have too many (see
+        `jaxsmw.geometry.one_to_one_map`).
         """
         queries, database = (np.asarray(points) for points in self._embeddings())
         used = self.mesh_x.referenced_vertices
@@ -121,20 +131,26 @@ class Correspondence:
         return extend_to_unreferenced(self.mesh_x, found)
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
-        """A transport plan that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
+        """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
-        The plan carries functions smoothly from Y to X (`SoftMap.pull_back`), and its pointwise map covers
-        more of Y: on four remeshed FAUST pairs 76 to 82 % of the vertices instead of 69 to 75 %, with
-        errors from 4 % less to 2 % more. An iteration takes 0.2 seconds for 5000 vertices, and 20 are needed.
+        The soft map transfers functions smoothly from Y to X (`SoftMap.pull_back`), and its pointwise map
+        covers more of Y. On four remeshed FAUST pairs, it covers 76 to 82 % of the vertices instead of 69 to
+        75 %, and its errors are between 4 % smaller and 2 % larger. One iteration takes 0.2 seconds for 5000
+        vertices, and 20 iterations are needed.
 
-        A vertex of X that no face uses is mapped like the nearest vertex that a face uses. A warning says if
-        more area than `tolerance` is still misplaced.
+        An unreferenced vertex of X is mapped like the nearest referenced vertex. A warning is given if the
+        share of misplaced area is larger than `tolerance` after the last iteration.
 
         **Arguments:**
 
-        - `temperature`: 0.1 gives a sharper map and takes more iterations, 1 gives a softer map.
-        - `iterations`, `tolerance`: see `jaxsmw.learning.sinkhorn`. Below a few hundredths, further
-          iterations only move area across the body, which gains nothing if the bodies differ.
+        - `temperature`: a positive number, in the unit of `jaxsmw.learning.sinkhorn`. 0.1 gives a sharper map
+          and needs more iterations, 1 gives a softer map.
+        - `iterations`: the largest number of iterations, at least 1.
+        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. With tolerances
+          below a few hundredths, further iterations only move area across the body. This does not improve the
+          map of two different bodies.
+
+        **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y.
 
         **Raises:** `InputError` if the temperature or the number of iterations is not positive.
         """
@@ -154,18 +170,20 @@ class Correspondence:
             )
         if not found.converged:
             warnings.warn(
-                f"the soft map is unfinished: after {iterations} iterations {float(found.residual):.3g} of "
-                f"the area is misplaced, more than {tolerance:g}; allow more iterations, a higher "
-                "temperature or a larger tolerance",
+                f"the soft map has not converged: after {iterations} iterations, the share of misplaced area "
+                f"is {float(found.residual):.3g}, more than the tolerance {tolerance:g}: allow more "
+                "iterations, a higher temperature or a larger tolerance.",
                 stacklevel=2,
             )
         return found
 
     def expected_error(self) -> Float[np.ndarray, " m"]:
-        """The expected distance of every match from the truth (m,), in square roots of Y's area.
+        """Estimate the geodesic error of every match without ground truth.
 
-        The estimate needs no ground truth; `jaxsmw.repair.expected_error` explains it. A vertex of X that no
-        face uses gets the value of the nearest vertex that a face uses.
+        `jaxsmw.repair.expected_error` explains the estimate. An unreferenced vertex of X gets the value of
+        the nearest referenced vertex.
+
+        **Returns:** The expected error of every match (m,), divided by the square root of Y's area.
         """
         with self._precision():
             reverse_map = compiled(_reverse_map)(*self._last_stage())
@@ -175,17 +193,20 @@ class Correspondence:
         return extend_to_unreferenced(self.mesh_x, expected)
 
     def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """The embeddings of the last stage; vertices of X that no face uses lie where the nearest ones do."""
+        """The embeddings of the last stage, in which nearest neighbours are matches.
+
+        An unreferenced vertex of X has the position of the nearest referenced vertex.
+        """
         with self._precision():
             queries, database = compiled(_embeddings)(*self._last_stage())
             return jax.device_put(extend_to_unreferenced(self.mesh_x, np.asarray(queries))), database
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
         problem = Problem(self.spectrum_x, self.spectrum_y, partial=self.pair.partial)
-        return self.stages[-1].refiner, problem, self.refinement.state
+        return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
-        """The float type in which the map was computed."""
+        """A context in which JAX uses the float type with which the map was computed."""
         return jax.enable_x64(self.functional_map.dtype == np.float64)
 
 
@@ -210,36 +231,44 @@ def match(
     partial: bool = False,
     history: bool = False,
 ) -> Correspondence:
-    """Find for every vertex of X the vertex of Y that is the same point of the body.
+    """Find for every vertex of X the vertex of Y at the same point of the body.
+
+    A warning is given if the map still looks wrong after repair.
 
     **Arguments:**
 
-    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices); or meshes of trimesh, pyFM, geomfum
-      or PyVista, or tuples of vertices and faces, as for `make_mesh`.
-    - `preset`: how the map is refined: `"accurate"`; `"paper"`, the method of the MWP paper; `"fast"`, the
-      same method on samples; or stages of your own, for example
-      `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`. See `jaxsmw.PRESETS`. Presets
-      adapt to small meshes, with fewer eigenvectors and samples; stages of your own are taken literally.
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
+      may also be a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
+      `make_mesh`.
+    - `preset`: the method of refinement (see `jaxsmw.PRESETS`). Presets use fewer eigenvectors and samples on
+      small meshes. Stages are used with exactly the given sizes.
+        - `"accurate"`: three stages, with repair.
+        - `"paper"`: the method of the MWP paper.
+        - `"fast"`: the method of the MWP paper on samples.
+        - a `Preset`.
+        - a `Stage` or several stages, for example
+          `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`.
     - `init`: the initial map.
-        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: nearest neighbours of that descriptor. Only SHOT tells
-          left from right. With `"shot"`, presets with repair also try alternative initial maps.
+        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: nearest neighbours in this descriptor. Only SHOT
+          distinguishes left from right. With `"shot"`, presets with repair also try alternative initial maps.
         - `"functional"`: the functional map that preserves SHOT and commutes with the Laplacian (section 3.2
-          of the MWP paper). This map is smoother and has much smaller errors.
-        - an array (m,) of vertices of Y, or m `SurfacePoints`: a map of your own.
+          of the MWP paper). This initial map is smoother and has much smaller errors.
+        - an array (m,) of vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an array (l, 2) of landmarks, each row a vertex of X and its match on Y: nearest neighbours in SHOT
-          and in geodesic distance to the landmarks. Give a few, on both sides of the body.
-    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
-    - `partial`: one mesh shows only a part of the other, in the same unit of length: see `paired_spectra`.
-    - `history`: record the iterations of the last stage; see `jaxsmw.refine`.
+          and in geodesic distances to the landmarks. Give a few landmarks on both sides of the body.
+    - `laplacian`, `eigensolver`: the computation of the eigenbases; see `jaxsmw.compute_spectrum`.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length; see `paired_spectra`.
+    - `history`: whether to record the iterations of the last stage; see `jaxsmw.refine`.
 
-    **Returns:** A `Correspondence`. A vertex of X that no face uses gets the match of the nearest vertex that
-    a face uses; vertices of Y that no face uses are never matched.
+    **Returns:** A `Correspondence`. An unreferenced vertex of X (in no face) gets the match of the nearest
+    referenced vertex. Unreferenced vertices of Y are never matched.
 
-    **Raises:** `InputError` for arguments that cannot work; `ArithmeticError` if a computation fails.
+    **Raises:** `InputError` for arguments that cannot be used. `ArithmeticError` if a computation fails.
     """
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
-    adapts = isinstance(preset, str | Preset)  # stages of the user's own are taken literally
-    chosen, fewest = choose_preset(preset), fewest_vertices(pair)
+    adapts = isinstance(preset, str | Preset)  # given stages keep their sizes
+    chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
     compiling = _compile_ahead(pair, chosen, history)
@@ -264,22 +293,22 @@ def match(
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
-    """Compiles the programs of all stages in the background.
+    """Compile the programs of all stages in the background.
 
-    Not for partial pairs, whose numbers of eigenvectors are known only later. Not for more eigenvectors than
-    vertices, which are refused immediately.
+    Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
+    compiled for more eigenvectors than vertices either, because such settings cause an error soon.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []
     sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
-    # The last stages take longest.
+    # The last stages are compiled first, because their compilation takes longest.
     return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
 
 
 def _correspondence(
     prepared: PreparedPair, preset: Preset, outcome: Outcome, seconds: dict[str, float]
 ) -> Correspondence:
-    """The result of a match, with a warning if the map looks wrong.
+    """Make the result of `match`, and give a warning if the map looks wrong.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -297,7 +326,7 @@ def _correspondence(
         pair=pair,
         pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
-        stages=preset.stages,
+        preset=preset,
         spectrum_x=spectrum_x,
         spectrum_y=spectrum_y,
         refinement=last,
@@ -309,22 +338,23 @@ def _correspondence(
 
 
 def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -> str:
-    """What looks wrong about a map, and what may help."""
+    """Return the text of the warning that a map looks wrong: the symptoms and possible remedies."""
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
     found = np.asarray(outcome.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
     areas = pair.mesh_x.vertex_areas / pair.mesh_x.area
     mirrored = areas[orientation_reversal(pair, found, spectrum_x, repair.scores)].sum()
     cut_off = areas[discontinuous_parts(pair, found, repair.scores)].sum()
     more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
-    cure = f"start from {'more' if more else 'a few'} landmarks"
+    cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
     if pair.partial:
         cure += ", and check that both meshes have the same unit of length"
     else:
-        cure += ", or say that one mesh is a part of the other if it is (partial=True, --partial)"
+        cure += "; if one mesh is a partial shape, set partial=True (--partial)"
     return (
-        f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down: the map has "
-        f"distortion {outcome.distortion:.3f}, mirrors {mirrored:.0%} of the source and cuts off "
-        f"{cut_off:.0%}. Right maps have distortion up to {repair.suspicious} (more between non-isometric "
-        "shapes, with topological noise, or for a mirror image). Look at the map (--report, in Python "
-        f"jaxsmw.report.summary.write_report), and if it is wrong, {cure}"
+        f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
+        f"distortion {outcome.distortion:.3f}, reverses the orientation of {mirrored:.0%} of the source's "
+        f"area, and separates {cut_off:.0%} of it by discontinuities. Correct maps have distortions up to "
+        f"{repair.suspicious} (more between non-isometric shapes, with topological noise, or for a mirror "
+        "image). Look at the map (--report, in Python jaxsmw.report.summary.write_report). If the map is "
+        f"wrong, {cure}."
     )

@@ -1,4 +1,4 @@
-"""A pair of surfaces to be matched, and their spectra in comparable units."""
+"""A pair of meshes to be matched, and their spectra in comparable units."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
 from jaxsmw.runtime.threads import side_by_side
 
-# A thousandth of a body's area shows nothing of its shape.
+# The smallest number of vertices with two eigenvectors, because presets use at most half as many eigenvectors
+# as vertices.
+_FEWEST_VERTICES = 4
+# The smallest ratio of the areas of a partial pair. A thousandth of a body's area does not show its shape.
 _SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Source X and target Y, and whether one of them shows only a part of the other.
+    """The source X and the target Y, and whether one of them is a partial shape.
 
     **Attributes:**
 
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
-    - `partial`: one mesh is a partial view of the other, in the same unit of length.
+    - `mesh_x`, `mesh_y`: the meshes X (m vertices) and Y (n vertices).
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length.
     """
 
     mesh_x: Mesh
@@ -33,12 +37,19 @@ class Pair:
 
     @classmethod
     def make(cls, mesh_x: Mesh | MeshLike, mesh_y: Mesh | MeshLike, *, partial: bool = False) -> Pair:
-        """A pair of meshes of this or other libraries; see `jaxsmw.make_mesh`.
+        """Make a pair from meshes of this library or of other libraries.
 
-        **Raises:** `InputError` if an argument is not a mesh, or `partial` is not a truth value.
+        **Arguments:**
+
+        - `mesh_x`, `mesh_y`: the source X and the target Y, each as a `Mesh` or as any mesh that
+          `jaxsmw.make_mesh` accepts.
+        - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit
+          of length.
+
+        **Raises:** `InputError` if `jaxsmw.make_mesh` refuses a mesh, or `partial` is not a Boolean.
         """
         if not isinstance(partial, bool | np.bool):
-            raise InputError(f"partial is {partial!r}; give True or False.")
+            raise InputError(f"partial is {partial!r}: give True or False.")
         mesh_x, mesh_y = (
             mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
             for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
@@ -47,26 +58,40 @@ class Pair:
 
     @property
     def meshes(self) -> tuple[Mesh, Mesh]:
-        """X and Y."""
+        """The meshes X and Y."""
         return self.mesh_x, self.mesh_y
 
     @property
     def name(self) -> str:
-        """Both names, for messages."""
+        """The names of both meshes, as text for messages."""
         return f"{self.mesh_x.name} to {self.mesh_y.name}"
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The lengths that count as 1 on X and on Y: square roots of areas.
+        """The lengths that count as 1 on X and on Y, in the units of the meshes.
 
-        Full shapes have each their own unit, so that a difference in size cancels. For a partial pair both
-        units are that of the larger shape.
+        For two full shapes, these are the square roots of the areas of X and of Y, which compensates for a
+        difference in size. For a partial pair, both lengths are the square root of the larger area.
         """
         roots = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         return (max(roots),) * 2 if self.partial else roots
 
+    def fewest_vertices(self) -> int:
+        """Return the smaller of the numbers of referenced vertices of X and of Y.
+
+        **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which is too few for a match.
+        """
+        used = [int(mesh.referenced_vertices.sum()) for mesh in self.meshes]
+        for mesh, number in zip(self.meshes, used, strict=True):
+            if number < _FEWEST_VERTICES:
+                raise InputError(
+                    f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a "
+                    f"mesh with at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
+                )
+        return min(used)
+
     def reversed(self) -> Pair:
-        """The pair with X and Y exchanged."""
+        """Return the pair with X and Y exchanged."""
         return Pair(self.mesh_y, self.mesh_x, self.partial)
 
 
@@ -77,35 +102,40 @@ def paired_spectra(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Spectrum, Spectrum]:
-    """The spectra of both meshes, in the units in which the meshes are matched.
+    """Compute the spectra of both meshes in comparable units.
 
-    Full shapes are each scaled to area 1, so that a difference in size cancels. A partial pair is scaled
-    by one factor, which takes the larger shape to area 1. The spectra of a partial pair are then cut to
-    their `common_range`, so that k_X and k_Y differ.
+    Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
+    partial pair are scaled by the same factor, which gives the larger shape area 1. The spectra of a partial
+    pair are then cut to their `common_range`, so k_X and k_Y usually differ.
 
     **Arguments:**
 
-    - `number_of_eigenvectors`: k.
-    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh.
+    - `laplacian`, `eigensolver`: the method; see `jaxsmw.compute_spectrum`. For `eigensolver="auto"`, both
+      meshes get the same eigensolver.
 
-    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or a mesh is
-    too small to be a part of the other mesh.
+    **Returns:** The spectra of X (m vertices, k_X eigenvectors) and of Y (n vertices, k_Y eigenvectors), in
+    `Pair.units_of_length`.
+
+    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if the area
+    of one mesh of a partial pair is less than a thousandth of the other area.
     """
-    if eigensolver == "auto":  # the same for both shapes, because their spectra are compared
+    if eigensolver == "auto":  # both shapes need the same eigensolver, because their spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
     eigenpairs_x, eigenpairs_y = side_by_side(
         lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
         *pair.meshes,
     )
-    # Outside of the threads, which do not inherit `jax.enable_x64`.
+    # This conversion runs outside of the threads, because they do not inherit `jax.enable_x64`.
     spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
     if not pair.partial:
         return spectrum_x, spectrum_y
     areas = pair.mesh_x.area, pair.mesh_y.area
     if min(areas) < _SMALLEST_PART * max(areas):
         raise InputError(
-            f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} {areas[1]:.3g}, so neither "
-            "is a part of the other in the same unit of length: scale one of them."
+            f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
+            "neither is a part of the other in the same unit of length: scale one of the meshes."
         )
     scales = (area / max(areas) for area in areas)
     return common_range(
@@ -114,7 +144,14 @@ def paired_spectra(
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Both spectra cut at the smaller of their largest eigenvalues (MWP paper, partial shapes)."""
+    """Remove the eigenpairs above the smaller of the two largest eigenvalues (MWP paper, partial shapes).
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
+
+    **Returns:** The spectra with k_X and k_Y eigenvectors. At least one of the spectra is unchanged.
+    """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
     cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]

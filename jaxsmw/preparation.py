@@ -1,4 +1,4 @@
-"""From a pair of meshes to everything that refinement needs, for `match`, benchmarks and studies alike."""
+"""The computation of everything that refinement needs, for `match`, benchmarks and studies."""
 
 from __future__ import annotations
 
@@ -27,31 +27,19 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-# Larger shapes are not padded: their padding costs more memory than compiled programs cost time.
+# Shapes with more vertices are not padded, because the memory for their padding outweighs the saved
+# compilation.
 _PADDED_UP_TO = 50_000
-# The smallest mesh with two eigenvectors, for half as many eigenvectors as vertices.
-_FEWEST_VERTICES = 4
 
 
 def program_size(mesh: Mesh) -> int:
-    """The number of vertices to which a mesh is padded, so that one compiled program serves similar sizes."""
+    """Return the number of vertices to which a mesh is padded.
+
+    Meshes of similar sizes are padded to the same number, so they share compiled programs. Meshes with more
+    than 50 000 vertices are not padded.
+    """
     n = len(mesh.vertices)
     return n if n > _PADDED_UP_TO else padded_size(n)
-
-
-def fewest_vertices(pair: Pair) -> int:
-    """The number of vertices that faces use, on the mesh with fewer of them.
-
-    **Raises:** `InputError` if a mesh has too few to be matched.
-    """
-    used = [int(mesh.referenced_vertices.sum()) for mesh in pair.meshes]
-    for mesh, number in zip(pair.meshes, used, strict=True):
-        if number < _FEWEST_VERTICES:
-            raise InputError(
-                f"{mesh.name}: its faces use {number} vertices, too few to be matched by shape: give a mesh "
-                f"of at least {_FEWEST_VERTICES} vertices, or of hundreds for a meaningful result."
-            )
-    return min(used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +48,13 @@ class PreparedPair:
 
     **Attributes:**
 
-    - `pair`: the meshes.
-    - `spectrum_x`, `spectrum_y`: their spectra, with descriptors if requested.
-    - `init`: what was asked for as the initial map.
-    - `initial_map`: T: X -> Y (m,).
-    - `samples`: vertices of X and Y in farthest-point order, or None.
-    - `seconds`: the wall time of each step of the preparation.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, with descriptors if
+      requested.
+    - `init`: the argument `init` of `prepare`, from which the initial map was computed.
+    - `initial_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `samples`: samples of X (s,) and of Y (s,) in farthest-point order, or None.
+    - `seconds`: the wall time of each step of the preparation, by its name.
     """
 
     pair: Pair
@@ -78,7 +67,7 @@ class PreparedPair:
 
     @cached_property
     def padded(self) -> tuple[Spectrum, Spectrum]:
-        """Both spectra, padded to the sizes of compiled programs."""
+        """Both spectra, padded to the sizes that `program_size` returns."""
         pad = compiled(Spectrum.pad)
         return (
             pad(self.spectrum_x, program_size(self.pair.mesh_x)),
@@ -86,13 +75,13 @@ class PreparedPair:
         )
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
-        """A map of X's vertices on the device, padded like X."""
-        # The type of every later map, so that one program serves all stages.
+        """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
+        # All later maps have this type, so one compiled program serves all stages.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """The padded spectra as a stage sees them."""
+        """Return the padded spectra with the eigenvectors and descriptors of a stage; see `Stage.view`."""
         return stage.view(*self.padded, partial=self.pair.partial)
 
 
@@ -107,17 +96,21 @@ def prepare(
     eigensolver: Eigensolver = "auto",
     descriptors_required: bool = False,
 ) -> PreparedPair:
-    """Computes spectra, initial map, descriptors and samples of a pair.
+    """Compute the spectra, the initial map, the descriptors and the samples of a pair.
 
     **Arguments:**
 
-    - `number_of_eigenvectors`, `number_of_descriptors`, `number_of_samples`: the largest number that any
-      stage uses.
-    - `init`: see `match`.
-    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
-    - `descriptors_required`: raise an error if a mesh is too coarse for descriptors, instead of a warning.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `number_of_eigenvectors`, `number_of_descriptors`, `number_of_samples`: the largest numbers that any
+      stage uses. 0 descriptors or 0 samples means that none are computed.
+    - `init`: the initial map; see `match`.
+    - `laplacian`, `eigensolver`: the computation of the eigenbases; see `jaxsmw.compute_spectrum`.
+    - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. Otherwise a
+      warning is given, and the spectra have no descriptors.
 
-    **Raises:** `InputError` for arguments that cannot work; `ArithmeticError` if the initial map cannot be
+    **Returns:** The prepared pair.
+
+    **Raises:** `InputError` for arguments that cannot be used. `ArithmeticError` if the initial map cannot be
     computed.
     """
     seconds: dict[str, float] = {}
@@ -126,9 +119,9 @@ def prepare(
     for mesh, spectrum in zip(pair.meshes, spectra, strict=True):
         if np.asarray(spectrum.eigenvalues)[-1] == 0:
             raise InputError(
-                f"{mesh.name}: {number_of_eigenvectors} eigenvectors only tell to which connected component "
-                "a vertex belongs; ask for more eigenvectors than components, or join vertices at the same "
-                "position (weld=True, on the command line --weld)."
+                f"{mesh.name}: {number_of_eigenvectors} eigenvectors only distinguish connected components: "
+                "compute more eigenvectors than components, or join vertices at the same position "
+                "(weld=True, on the command line --weld)."
             )
     with timed("initial map", seconds):
         start = initial_map(pair, *spectra, init=init)
@@ -139,7 +132,7 @@ def prepare(
             except InputError as error:
                 if descriptors_required:
                     raise
-                warnings.warn(f"refinement goes on without descriptors: {error}", stacklevel=3)
+                warnings.warn(f"refinement continues without descriptors: {error}", stacklevel=3)
     samples = None
     if number_of_samples:
         with timed("samples", seconds):

@@ -16,14 +16,15 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True)
 class Preset:
-    """Stages of refinement, and the repair of maps that look wrong.
+    """Stages of refinement, and the settings of the repair of maps that look wrong.
 
     **Attributes:**
 
-    - `stages`: run in this order.
-    - `repair`: when and how a wrong map is repaired; None for no repair.
+    - `stages`: a tuple of at least one stage. The stages run in this order.
+    - `repair`: the settings that determine when and how a map is repaired; None for no repair.
 
-    **Raises:** `InputError` if there is no stage, or the stage to be repaired has no levels.
+    **Raises:** `InputError` if there is no stage, an attribute has another type, or the stage that repair
+    repeats does not exist or has no levels.
     """
 
     stages: tuple[Stage, ...]
@@ -31,13 +32,13 @@ class Preset:
 
     def __post_init__(self) -> None:
         if not isinstance(self.stages, tuple) or not all(isinstance(stage, Stage) for stage in self.stages):
-            raise InputError(f"stages is {self.stages!r}; give a tuple of stages.")
+            raise InputError(f"stages is {self.stages!r}: give a tuple of stages.")
         if not self.stages:
-            raise InputError("a preset without stages cannot refine a map; give at least one stage.")
+            raise InputError("a preset without stages cannot refine a map: give at least one stage.")
         if self.repair is None:
             return
         if not isinstance(self.repair, RepairSettings):
-            raise InputError(f"repair is {self.repair!r}; give RepairSettings.")
+            raise InputError(f"repair is {self.repair!r}: give RepairSettings or None.")
         if not 0 <= self.repair.stage < len(self.stages):
             raise InputError(
                 f"repair repeats stage {self.repair.stage}, but the stages are 0 to {len(self.stages) - 1}: "
@@ -46,26 +47,26 @@ class Preset:
         self.stages[self.repair.stage].with_levels(self.repair.fallback_levels)
 
     def fitted(self, number_of_vertices: int) -> Preset:
-        """The preset for small meshes; see `Stage.fitted`."""
+        """Return the preset adapted to small meshes; see `Stage.fitted`."""
         return replace(self, stages=tuple(stage.fitted(number_of_vertices) for stage in self.stages))
 
     def without_descriptors(self) -> Preset:
-        """The preset with eigenvectors alone."""
+        """Return the preset with stages that use no descriptors."""
         return replace(self, stages=tuple(stage.without_descriptors() for stage in self.stages))
 
     @property
     def number_of_eigenvectors(self) -> int:
-        """The largest number that a stage uses."""
+        """The largest number of eigenvectors that a stage uses."""
         return max(stage.number_of_eigenvectors for stage in self.stages)
 
     @property
     def number_of_descriptors(self) -> int:
-        """The largest number that a stage uses."""
+        """The largest number of descriptors that a stage uses."""
         return max(stage.number_of_descriptors for stage in self.stages)
 
     @property
     def number_of_samples(self) -> int:
-        """The largest number that a stage uses; 0 if no stage uses samples."""
+        """The largest number of samples that a stage uses; 0 if no stage uses samples."""
         return max(stage.number_of_samples or 0 for stage in self.stages)
 
 
@@ -83,13 +84,21 @@ PRESETS: dict[PresetName, Preset] = {
         RepairSettings(stage=1),
     ),
 }
-"""The MWP authors' fast variant, the paper's setting, and the stages that docs/accuracy.md measures."""
+"""The presets by name.
+
+`"fast"` is the fast variant of the MWP authors, on samples. `"paper"` has the settings of the MWP paper.
+`"accurate"` has three stages and repair; `docs/accuracy.md` measures its accuracy.
+"""
 
 
 def choose_preset(preset: str | Preset | Stage | Sequence[Stage]) -> Preset:
-    """A preset by its name, or from stages of one's own.
+    """Return the preset with a given name, or a preset of given stages.
 
-    **Raises:** `InputError` if the name is unknown, or the argument holds no stages.
+    **Arguments:**
+
+    - `preset`: a key of `PRESETS`, a `Preset` (which is returned unchanged), a stage, or several stages.
+
+    **Raises:** `InputError` if the name is unknown, or the argument contains no stages.
     """
     if isinstance(preset, Preset):
         return preset
@@ -99,5 +108,5 @@ def choose_preset(preset: str | Preset | Stage | Sequence[Stage]) -> Preset:
         return PRESETS[preset]  # type: ignore[index]
     stages = tuple(preset) if isinstance(preset, Iterable) else (preset,)
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
-        raise InputError(f"preset is {preset!r}; give one of {', '.join(PRESETS)}, or stages.")
+        raise InputError(f"preset is {preset!r}: give one of {', '.join(PRESETS)}, or stages.")
     return Preset(stages)

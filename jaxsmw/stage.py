@@ -1,4 +1,4 @@
-"""One stage of refinement: a refiner and its sizes, run as one compiled program."""
+"""A stage of refinement: a refiner and its sizes, which runs as one compiled program."""
 
 from __future__ import annotations
 
@@ -24,21 +24,23 @@ from jaxsmw.runtime.compilation import compile_ahead, compiled
 
 @dataclass(frozen=True, init=False)
 class Stage:
-    """A refiner, and the sizes at which `jaxsmw.refine` runs it.
+    """A refiner and the sizes with which `jaxsmw.refine` runs the refiner.
 
     **Attributes:**
 
     - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
-    - `number_of_eigenvectors`: k of both shapes. The levels of a refiner determine the number; without levels
-      the default is 100.
-    - `iterations`: at least 1. A refiner with levels does one iteration per level; without levels the default
-      is 3.
-    - `number_of_descriptors`: the number of principal components of SHOT that the refiner gets.
-    - `number_of_samples`: iterate on this number of samples of each shape, and search all vertices in the
-      last step; None iterates on all vertices.
-    - `stop_when_unchanged`: see `jaxsmw.refine`.
+    - `number_of_eigenvectors`: the number of eigenvectors of each shape. For a refiner with levels, it is the
+      largest level. For other refiners, the default is 100.
+    - `iterations`: the number of iterations, at least 1. For a refiner with levels, it is the number of
+      levels. For other refiners, the default is 3.
+    - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
+      352.
+    - `number_of_samples`: the number of samples of each shape on which the refiner iterates. The last step
+      searches all vertices. None means that all iterations use all vertices.
+    - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; see `jaxsmw.refine`.
 
-    **Raises:** `InputError` for settings that cannot work.
+    **Raises:** `InputError` for a refiner of another type, a size that is not a whole number, is out of range
+    or contradicts the refiner's levels, or fewer samples than eigenvectors.
     """
 
     refiner: Refiner
@@ -60,7 +62,7 @@ class Stage:
     ) -> None:
         if not isinstance(refiner, Refiner):
             raise InputError(
-                f"refiner is {refiner!r}; give a Refiner such as WaveletPreservation(bank=Meyer(8))."
+                f"refiner is {refiner!r}: give a Refiner such as WaveletPreservation(bank=Meyer(8))."
             )
         largest, count = max(refiner.levels, default=None), len(refiner.levels) or None
         sizes = {
@@ -80,22 +82,23 @@ class Stage:
 
     def _check_sizes(self) -> None:
         if self.number_of_eigenvectors < 1:
-            raise InputError(f"{self.number_of_eigenvectors} eigenvectors were requested; give at least 1.")
+            raise InputError(f"{self.number_of_eigenvectors} eigenvectors were requested: give at least 1.")
         if self.iterations < 1:
-            raise InputError(f"{self.iterations} iterations were requested; give at least 1.")
+            raise InputError(f"{self.iterations} iterations were requested: give at least 1.")
         if not 0 <= self.number_of_descriptors <= SHOT_DIMENSION:
             raise InputError(
-                f"{self.number_of_descriptors} descriptors were requested; SHOT has {SHOT_DIMENSION}."
+                f"{self.number_of_descriptors} descriptors were requested, but SHOT has {SHOT_DIMENSION}: "
+                f"give a number from 0 to {SHOT_DIMENSION}."
             )
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
-                f"{self.number_of_samples} samples cannot tell {self.number_of_eigenvectors} eigenvectors "
-                "apart; use more samples (five per eigenvector is usual) or fewer eigenvectors."
+                f"{self.number_of_samples} samples cannot distinguish {self.number_of_eigenvectors} "
+                "eigenvectors: use more samples (usually five per eigenvector) or fewer eigenvectors."
             )
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The arguments of `jaxsmw.refine` that are not arrays."""
+        """The keyword arguments of `jaxsmw.refine` that are not arrays."""
         return {
             "refiner": self.refiner,
             "iterations": self.iterations,
@@ -103,24 +106,35 @@ class Stage:
         }
 
     def with_levels(self, levels: tuple[int, ...]) -> Stage:
-        """The same stage with other levels, and the sizes that follow from these.
+        """Return the stage with other levels.
 
-        **Raises:** `InputError` if the refiner has no levels.
+        The number of eigenvectors becomes the largest level, and the number of iterations becomes the number
+        of levels.
+
+        **Raises:** `InputError` if the refiner has no levels, or there are fewer samples than eigenvectors.
         """
         if not isinstance(self.refiner, CoarseToFine):
             raise InputError(
-                f"{type(self.refiner).__name__} has no levels; use FeatureRegression or Registration."
+                f"{type(self.refiner).__name__} has no levels: use FeatureRegression or Registration."
             )
         refiner = replace(self.refiner, levels=levels)
         derived: dict[str, Any] = {"number_of_eigenvectors": None, "iterations": None}
         return replace(self, refiner=refiner, **derived)
 
     def without_descriptors(self) -> Stage:
-        """The same stage with eigenvectors alone."""
+        """Return the stage without descriptors."""
         return replace(self, number_of_descriptors=0)
 
     def fitted(self, number_of_vertices: int) -> Stage:
-        """The stage for a small mesh: at most half as many eigenvectors as vertices, and fewer samples."""
+        """Return the stage adapted to a small mesh.
+
+        The number of eigenvectors becomes at most half the number of vertices. If the mesh has no more
+        vertices than the number of samples, the stage uses all vertices instead of samples.
+
+        **Arguments:**
+
+        - `number_of_vertices`: the number of referenced vertices of the smaller mesh.
+        """
         most = max(1, number_of_vertices // 2)
         samples = self.number_of_samples
         if samples is not None and samples >= number_of_vertices:
@@ -135,9 +149,14 @@ class Stage:
     def view(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
     ) -> tuple[Spectrum, Spectrum]:
-        """Both spectra with the eigenvectors and descriptors of this stage.
+        """Return both spectra with the eigenvectors and descriptors that this stage uses.
 
         The spectra of a partial pair are cut to their `common_range`.
+
+        **Arguments:**
+
+        - `spectrum_x`, `spectrum_y`: the spectra of X and Y.
+        - `partial`: whether the pair is partial.
         """
         spectra, seen = (spectrum_x, spectrum_y), []
         for spectrum in spectra:
@@ -158,26 +177,32 @@ class Stage:
         partial: bool = False,
         history: bool = False,
     ) -> Refinement:
-        """Refines a pointwise map (m,).
+        """Refine a pointwise map.
 
         **Arguments:**
 
-        - `spectrum_x`, `spectrum_y`: the `view` of this stage.
-        - `pointwise_map`: the map from which the stage starts, (m,).
-        - `samples`: vertices of X and Y in farthest-point order, at least `number_of_samples` of each.
-        - `partial`, `history`: see `jaxsmw.refine`.
+        - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
+        - `pointwise_map`: the map from which the stage starts (m,), 0-based vertices of Y.
+        - `samples`: samples of X and of Y in farthest-point order, at least `number_of_samples` of each. None
+          if the stage uses no samples.
+        - `partial`: whether the pair is partial.
+        - `history`: whether to record the iterations; see `jaxsmw.refine`.
+
+        **Returns:** The `Refinement`. Its `result` says whether refinement succeeded.
         """
         arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
         settings = {**options, **self.settings, "partial": partial, "history": history}
         return compiled(refine)(*arrays, **settings)
 
     def compile_ahead(self, number_x: int, number_y: int, *, history: bool = False) -> Future[object]:
-        """Compiles in the background the program that `run` needs for two full shapes.
+        """Compile in the background the program that `run` needs for two full shapes.
 
         **Arguments:**
 
-        - `number_x`, `number_y`: the numbers of vertices, padding included.
-        - `history`: see `jaxsmw.refine`.
+        - `number_x`, `number_y`: the numbers of vertices of X and of Y, including padding.
+        - `history`: whether the program records the iterations; see `jaxsmw.refine`.
+
+        **Returns:** A future that is done when the program is compiled.
         """
 
         def arguments() -> tuple[tuple, dict[str, Any]]:
@@ -190,7 +215,7 @@ class Stage:
         return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
 
     def _outline(self, number_of_vertices: int) -> Spectrum:
-        """A spectrum of the right sizes; only its shapes are used."""
+        """Return a spectrum with arrays of the right shapes. Its values are not used."""
         n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
         descriptors = jnp.zeros((n, d)) if d else None
         places = {"positions": jnp.zeros((n, 3)), "normals": jnp.zeros((n, 3))}
@@ -205,7 +230,10 @@ class Stage:
         pointwise_map: Int[Array, " m"],
         samples: Samples | None,
     ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Any]]:
-        """The arrays for `jaxsmw.refine`, by position and by name, for `run` and `compile_ahead` alike."""
+        """Return the positional and keyword arguments of `jaxsmw.refine` that are arrays.
+
+        `run` and `compile_ahead` share this method, so they use the same compiled program.
+        """
         chosen = None
         if self.number_of_samples is not None and samples is not None:
             chosen = samples[0][: self.number_of_samples], samples[1][: self.number_of_samples]
@@ -213,15 +241,17 @@ class Stage:
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """A size that the refiner's levels determine, or else the given size, or else the default."""
+    """Return the size that the refiner's levels determine, or else the given size, or else the default."""
     if derived is None:
         return default if given is None else given
     if given is not None and given != derived:
-        raise InputError(f"{name} is {given!r}, but the refiner's levels mean {derived}: leave {name} out.")
+        raise InputError(
+            f"{name} is {given!r}, but the refiner's levels require {derived}: leave {name} out."
+        )
     return derived
 
 
 def _whole_number(name: str, value: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} is {value!r}; give a whole number.")
+        raise InputError(f"{name} is {value!r}: give a whole number.")
     return int(value)

@@ -32,7 +32,9 @@ def test_every_way_to_refine_a_batch_is_measured(monkeypatch, capsys):
     assert rows[1:] == ["products alone", "loop", "lax.map", "vmap of 2", "vmap of 8", "refine_pairs"]
 
 
-@pytest.mark.parametrize("part", [benchmark_speed.refinement, benchmark_speed.eigenbasis, benchmark_speed.stages])
+@pytest.mark.parametrize(
+    "part", [benchmark_speed.refinement, benchmark_speed.eigenbasis, benchmark_speed.stages]
+)
 def test_each_part_of_the_speed_benchmark_measures_positive_times(part, monkeypatch):
     monkeypatch.setattr(benchmark_speed, "EIGENVECTORS", 30)
     monkeypatch.setattr(benchmark_speed, "SAMPLES", 100)

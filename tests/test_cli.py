@@ -72,7 +72,7 @@ def test_the_help_states_the_defaults_of_the_library(run):
     """Names and sizes come from `jaxsmw.choices`, and the defaults there are those of the functions."""
     words = {command: " ".join(run(command, "--help").output.split()) for command in COMMANDS}
     defaults = {name: entry.default for name, entry in inspect.signature(match).parameters.items()}
-    assert f"(default: {defaults['preset']}; paper with" in words["match"]
+    assert f"(default: {defaults['preset']}, or paper if" in words["match"]
     assert f"map:FILE (default: {defaults['init']})" in words["match"]
     assert f"X_Y.map (default: {Settings().init})" in words["benchmark"]
     assert words["match"].count("(default: auto)") == 3
@@ -87,7 +87,7 @@ def test_the_help_states_the_defaults_of_the_library(run):
     solution = re.search(r"orthogonality \(default: (\S+)\)", words["match"])[1]
     assert solution == "filtering" and isinstance(WaveletPreservation().solution, Filtering)
     geodesics = inspect.signature(geodesic_error).parameters
-    assert f"faster (default: {geodesics['method'].default})" in words["evaluate"]
+    assert f"within 0.5 % of it (default: {geodesics['method'].default})" in words["evaluate"]
     assert f"--evaluation-samples (default: {geodesics['seed'].default})" in words["evaluate"]
 
 
@@ -562,8 +562,8 @@ def test_output_that_cannot_be_written_is_reported(pair, arguments, unbuffered):
         result = subprocess.run(call, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
     assert result.returncode == 2
     assert result.stderr == (
-        "jaxsmw: standard output: cannot be written (No space left on device): redirect it to a place with "
-        "free space.\n"
+        "jaxsmw: standard output: cannot be written (No space left on device): redirect standard output to "
+        "a disk with free space.\n"
     )
 
 

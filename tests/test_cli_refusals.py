@@ -29,7 +29,7 @@ def test_a_tiny_mesh_is_refused(run, tmp_path):
     assert_refused(run(*call, "--eigenvectors", "100"), naming="choose a number from 1 to 3")
     assert_refused(
         run(*call, "--eigenvectors", "1", "--init", "hks"),
-        naming="1 eigenvectors only tell to which connected component",
+        naming="1 eigenvectors only distinguish connected components",
     )
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
@@ -218,7 +218,7 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --bank half-cosine --filters 2", "at least 3 filters"),
         ("match {x} {y} --output {t}/m --solution guess", "guess"),
         ("match {x} {y} --output {t}/m --iterations 0", "at least 1"),
-        ("match {x} {y} --output {t}/m --samples 5", "cannot tell"),
+        ("match {x} {y} --output {t}/m --samples 5", "cannot distinguish"),
         ("match {x} {y} --output {t}/m --samples 5000 --eigenvectors 20", "from 642 referenced vertices"),
         ("match {x} {y} --output {t}/m --init shout", "'shout' is not an initial map: choose from shot, wks"),
         ("match {x} {y} --output {t}/m --init map:", "map:"),

@@ -335,7 +335,7 @@ def test_invalid_arguments_are_refused(pair, options, fault):
 
 def test_partial_must_be_a_truth_value(pair):
     untyped = inspect.unwrap(Pair.make.__func__)  # without the run-time type checks of the tests
-    with pytest.raises(InputError, match="partial is 'yes'; give True or False"):
+    with pytest.raises(InputError, match="partial is 'yes': give True or False"):
         untyped(Pair, *pair[:2], partial="yes")
 
 
@@ -421,7 +421,7 @@ def test_the_functional_initial_map_is_better_than_nearest_neighbours(pair):
     [
         ({"refiner": Meyer()}, "refiner"),
         ({"iterations": 0}, "at least 1"),
-        ({"number_of_samples": 10}, "cannot tell 100 eigenvectors apart"),
+        ({"number_of_samples": 10}, "cannot distinguish 100 eigenvectors"),
         ({"number_of_descriptors": 353}, "SHOT has 352"),
     ],
     ids=str,
@@ -449,7 +449,7 @@ def test_presets_fit_small_meshes(monkeypatch):
     # Beartype, which only tests use, captures warnings. In a compilation thread it would capture ours, too.
     monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
-    with pytest.warns(UserWarning, match="goes on without descriptors: .* coarse"):
+    with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):
         found = match(mesh, mesh, init=np.arange(162))
     assert found.functional_map.shape == (81, 81)
     last = found.preset.stages[-1]
@@ -493,7 +493,7 @@ def test_a_mesh_of_one_triangle_is_refused(pair):
 def test_triangle_soup_is_refused_with_a_hint_to_weld(pair):
     mesh = pair[0]
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
-    with pytest.raises(InputError, match=r"30 eigenvectors only tell to which connected component .* --weld"):
+    with pytest.raises(InputError, match=r"30 eigenvectors only distinguish connected components.* --weld"):
         match(soup, mesh, preset=Stage(number_of_eigenvectors=30))
 
 
@@ -607,7 +607,7 @@ def test_soft_map_transfers_positions(pair):
     assert np.median(errors) < 0.02
     np.testing.assert_array_equal(carried[-1], carried[0])
     assert mean_error(mesh_y, np.asarray(soft.pointwise_map())[:-1], truth) < 0.02
-    with pytest.warns(UserWarning, match="unfinished: after 1 iterations"):
+    with pytest.warns(UserWarning, match="not converged: after 1 iterations"):
         result.soft_map(iterations=1, tolerance=1e-9)
     for settings in ({"temperature": 0.0}, {"temperature": np.nan}, {"iterations": 0}):
         with pytest.raises(InputError, match="cannot have"):

@@ -126,7 +126,8 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     mesh, _ = body
     preset = Preset((STAGE,), REPAIR)
     with pytest.warns(
-        UserWarning, match=r"limbs may be swapped or mirrored.* mirrors 100% of the source and cuts off 0%"
+        UserWarning,
+        match=r"limbs may be swapped or mirrored.* reverses the orientation of 100% .* separates 0%",
     ):
         found = match(mesh, mesh, preset=preset, init=mirrored)
     assert found.suspicious and found.distortion > 1.3
@@ -149,8 +150,8 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
         (lambda: Preset(()), "at least one stage"),
         (lambda: Preset((STAGE,), RepairSettings()), "repair repeats stage 1, but the stages are 0 to 0"),
         (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
-        (lambda: Stage(FeatureRegression(LEVELS), number_of_eigenvectors=60), "mean 40: leave .* out"),
-        (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "mean 4: leave iterations out"),
+        (lambda: Stage(FeatureRegression(LEVELS), number_of_eigenvectors=60), "require 40: leave .* out"),
+        (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "require 4: leave iterations out"),
         (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),
     ],
 )

@@ -14,6 +14,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
 from jaxsmw.matching import Correspondence, match
+from jaxsmw.presets import PRESETS
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
 from jaxsmw.stage import Stage
 
@@ -64,7 +65,7 @@ def test_the_report_states_the_times_of_match_by_default(found: Correspondence, 
     assert set(REPORT_FILES) - {path.name for path in tmp_path.iterdir()} == {"quality.png"}
     # Without ground truth there is only the expected error, which is explained as an estimate.
     assert embedded(page)["error_names"] == ["Expected error"]
-    assert re.search(r'<p data-for="error-0">An estimate of the distance .* without knowing', page)
+    assert re.search(r'<p data-for="error-0">An estimate of the distance .* not use the true points', page)
 
 
 def test_the_summary_states_the_results_of_the_match(
@@ -87,7 +88,9 @@ def test_the_summary_states_the_results_of_the_match(
     assert facts["error at most 0.05, initial map"] == "100.0%"
     assert facts["expected error, mean"] == f"{expected.mean():.4f} √area"
     assert facts["time, total"] == f"{sum(found.seconds.values()):.2f} s"
-    judged = summarize(replace(found, distortion=1.3, suspicious=True), {}, expected)
+    judged = summarize(
+        replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {}, expected
+    )
     assert judged["distortion (1 is none)"] == "1.30; above 1.12 limbs may be swapped"
     # Both maps are shown in the convention of the refiner.
     refined, initial = embedded(page)["maps"]
@@ -100,5 +103,5 @@ def test_a_comparison_explains_its_errors(errors: dict[str, GeodesicError], tmp_
         tmp_path / "page.html", SOURCE, TARGET, {"initial": NUMBER}, errors={"initial": errors["initial"]}
     )
     page = (tmp_path / "page.html").read_text("utf-8")
-    assert re.search(r'<p data-for="error-0">The distance along the surface between every match', page)
+    assert re.search(r'<p data-for="error-0">The distance along the surface between each match', page)
     assert embedded(page)["limit"] == 0.1

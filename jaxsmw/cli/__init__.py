@@ -1,4 +1,4 @@
-"""The command line `jaxsmw`, with one module per command."""
+"""The command line `jaxsmw`. Each command has its own module."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ if TYPE_CHECKING:
 def main() -> NoReturn:
     """Run the command in `sys.argv` and end the process.
 
-    The exit code is 0 for success, 2 for bad input and 1 for any other failure. An interrupted process dies
-    of the signal.
+    The exit code is 0 for success, 2 for bad input and 1 for any other failure. After an interruption
+    (Ctrl-C), the signal SIGINT terminates the process.
     """
-    # Nothing is imported before interruptions are handled, because Ctrl-C in an import leaves a traceback.
+    # Interruptions are handled before anything else is imported, because Ctrl-C in an import leaves a
+    # traceback.
     from jaxsmw.cli.interruption import end_when_interrupted
 
     end_when_interrupted()

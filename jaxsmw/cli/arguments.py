@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and the types of arguments."""
+"""Arguments that several commands share, and argument types for `argparse`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import get_args
 from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian
 from jaxsmw.errors import InputError
 
-# JAX counts with 32 bits.
+# The largest 32-bit integer: JAX uses 32-bit integers by default.
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
@@ -18,7 +18,10 @@ MAP_FORMS = "one target vertex per line, or a .npy file, or a .mat file counted 
 
 
 def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int]:
-    """Returns an argument type: the whole numbers between two limits."""
+    """Return an argument type that accepts whole numbers from `least` to `most`, both included.
+
+    The argument type raises `argparse.ArgumentTypeError` for any other text.
+    """
 
     def convert(text: str) -> int:
         try:
@@ -35,7 +38,10 @@ def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int
 
 
 def path(text: str) -> str:
-    """Argument type: the name of a file or directory, which need not exist."""
+    """Argument type for the name of a file or directory, which need not exist.
+
+    **Raises:** `argparse.ArgumentTypeError` if the name is empty, or no file can have this name.
+    """
     if not text:
         raise argparse.ArgumentTypeError("the name is empty: give the name of a file or directory")
     try:
@@ -51,7 +57,7 @@ def path(text: str) -> str:
 
 
 def _shortened(text: str) -> str:
-    """Returns the beginning of a long text, for a message."""
+    """Return the beginning of a long text, for a message."""
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
@@ -61,9 +67,12 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
 
 
 def add_source_and_target(parser: argparse.ArgumentParser) -> None:
-    """Add the source and the target mesh."""
+    """Add the arguments `SOURCE` and `TARGET`, both meshes."""
     parser.add_argument(
-        "source", type=path, metavar="SOURCE", help="source mesh: every vertex gets a match on the target"
+        "source",
+        type=path,
+        metavar="SOURCE",
+        help="source mesh; each of its vertices gets a match on the target",
     )
     parser.add_argument("target", type=path, metavar="TARGET", help="target mesh")
 
@@ -74,16 +83,18 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         "--laplacian",
         choices=get_args(Laplacian),
         default="auto",
-        help="robust accepts degenerate triangles and non-manifold edges; auto is robust where a mesh needs "
-        "it, otherwise cotangent (default: %(default)s)",
+        help="discretization of the Laplacian: robust accepts degenerate triangles and non-manifold edges; "
+        "auto chooses robust for meshes that need it and cotangent for all other meshes (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--eigensolver",
         choices=get_args(Eigensolver),
         default="auto",
-        help="approximate is fast on large meshes, and its eigenvalues are within a few per mille where "
-        "triangles are even; where it would be far off, exact takes over with a warning; auto is approximate "
-        f"from {APPROXIMATE_FROM} vertices on, otherwise exact (default: %(default)s)",
+        help="method that computes eigenvectors: approximate is fast on large meshes, and on even "
+        "triangles its eigenvalues are accurate to a few tenths of a per cent; if approximate would be "
+        "inaccurate, exact is used with a warning; auto chooses approximate for meshes with at least "
+        f"{APPROXIMATE_FROM} vertices and exact for smaller meshes (default: %(default)s)",
     )
 
 
@@ -98,8 +109,8 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
         "--index-base",
         type=int,
         choices=get_args(IndexBase),
-        help="number of the first vertex in map, landmark and ground-truth files (default: 0, and 1 in .mat, "
-        ".vts, .baryc_gt and two-column ground-truth files)",
+        help="number of the first vertex in map, landmark and ground-truth files (default: 1 in .mat, "
+        ".vts, .baryc_gt and two-column ground-truth files, and 0 in all other files)",
     )
 
 
@@ -108,7 +119,8 @@ def add_partial(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--partial",
         action="store_true",
-        help="one mesh is a partial shape and the other the full shape, in the same unit of length",
+        help="declare that one mesh is a partial shape and the other mesh is the full shape; both must "
+        "have the same unit of length",
     )
 
 
@@ -117,20 +129,22 @@ def add_up(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--up",
         choices=get_args(Axis),
-        help="axis that points up in pictures (default: guessed from the mesh); write --up=-z for -z",
+        help="axis of the mesh that points up in pictures (default: guessed from the mesh); to choose a "
+        "negative axis, write for example --up=-z",
     )
 
 
 def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *names: str) -> None:
-    """Refuse options that have no effect without another option.
+    """Check that no option is given that has no effect without another option.
 
     **Arguments:**
 
-    - `needed`: the other option, for the message.
+    - `options`: the parsed options.
+    - `needed`: the name of the other option in the message.
     - `is_given`: whether the other option is given.
-    - `names`: the options, as attributes of `options`.
+    - `names`: the options that need the other option, as attribute names of `options`.
 
-    **Raises:** `InputError` for the first option that has no effect.
+    **Raises:** `InputError` that names the first option without effect.
     """
     for name in names:
         value = getattr(options, name)

@@ -1,4 +1,4 @@
-"""The filter banks that have a name on the command line."""
+"""The filter banks of the command line, by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxsmw.errors import InputError
 if TYPE_CHECKING:
     from jaxsmw.core.banks import FilterBank
 
-# The class of each bank. The first bank is the paper's.
+# The class of each bank in `jaxsmw.core.banks`. The first bank is that of the MWP paper.
 BANKS = {
     "meyer": "Meyer",
     "simple-tight": "SimpleTight",
@@ -29,14 +29,14 @@ BANKS = {
     "identity": "Identity",
 }
 _PAPER_BANK = next(iter(BANKS))
-# Banks whose name begins so are warped by the distribution of the eigenvalues.
+# Banks whose names have this prefix are warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# Eigenbases have fewer eigenvalues, and a filter needs at least one.
+# Eigenbases have fewer eigenvalues than this number, and more filters than eigenvalues are useless.
 _MOST_FILTERS = 10_000
 
 
 def add_bank(parser: argparse._ActionsContainer) -> None:
-    """Add `--bank` and `--filters`; an option that is not given is None."""
+    """Add `--bank` and `--filters`. The value of an omitted option is None."""
     parser.add_argument(
         "--bank",
         choices=tuple(BANKS),
@@ -47,12 +47,17 @@ def add_bank(parser: argparse._ActionsContainer) -> None:
         "--filters",
         metavar="N",
         type=whole_number(2, _MOST_FILTERS),
-        help="number of filters, for banks whose number is not fixed (default: the bank's own)",
+        help="number of filters; some banks have a fixed number (default: depends on the bank)",
     )
 
 
 def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
-    """Returns the named bank, by default the paper's, with a number of filters, by default the bank's own.
+    """Return a filter bank.
+
+    **Arguments:**
+
+    - `name`: a key of `BANKS`; None for the bank of the MWP paper.
+    - `number_of_filters`: the number of filters; None for the default of the bank.
 
     **Raises:** `InputError` if the bank cannot have this number of filters.
     """
@@ -63,26 +68,28 @@ def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
     if number_of_filters is None:
         bank = kind()
     elif "filters" not in kind.__dataclass_fields__:
-        raise InputError(f"--filters: the number of filters of {name} is fixed; leave --filters out.")
+        raise InputError(f"--filters: the number of filters of {name} is fixed: leave --filters out.")
     else:
         try:
             bank = kind(number_of_filters)
         except ValueError as error:
-            raise InputError(f"--filters {number_of_filters}: {error}; give a larger number.") from error
+            raise InputError(f"--filters {number_of_filters}: {error}: give a larger number.") from error
     return banks.Warped(bank, banks.SpectralDistribution()) if name.startswith(_ADAPTED) else bank
 
 
 def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
-    """Returns the frame bounds of a bank, or None for a tight frame."""
+    """Return the lower and the upper frame bound of a bank, or None for a tight frame."""
     import equinox as eqx
     import jax.numpy as jnp
 
     from jaxsmw.core.banks import frame_bounds
 
-    # Eigenvalues of a surface are nearly evenly spaced. One compiled program replaces forty small ones.
+    # Evenly spaced numbers represent the eigenvalues of a surface, which are nearly evenly spaced. The
+    # function is compiled as a whole, which replaces forty small programs.
     lower, upper = map(float, eqx.filter_jit(frame_bounds)(bank, jnp.arange(101.0), over="interval"))
     return None if upper < _TIGHT * lower else (lower, upper)
 
 
-# The bounds of tight frames differ by rounding errors; those of the other banks differ by a third or more.
+# The bounds of tight frames differ only by rounding errors. The bounds of all other banks differ by a third
+# or more.
 _TIGHT = 1.01

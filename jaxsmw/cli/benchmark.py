@@ -13,7 +13,7 @@ from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.cli.outputs import check_outputs
 from jaxsmw.errors import InputError
 
-HELP = "match and measure many pairs of a data set; continues an interrupted run"
+HELP = "match many pairs of a data set and measure the errors; an interrupted run can be continued"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,23 +22,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "data",
         metavar="DATASET_DIRECTORY",
         type=path,
-        help="FAUST, SCAPE, TOSCA, a SHREC set or a remeshed set, in the published layout",
+        help="directory of a data set in its published layout: FAUST, SCAPE, TOSCA, a SHREC set or a "
+        "remeshed set",
     )
     parser.add_argument(
         "--methods",
         metavar="METHOD",
         type=path,
         nargs="+",
-        help=f"methods: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} where these "
-        "libraries are installed; or directories with maps X_Y.map made elsewhere (default: all methods that "
-        "suit the pairs; cpd takes half a minute per pair, bcicp a quarter of a minute; pfm is for partial "
-        "shapes only)",
+        help=f"methods to measure: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if "
+        "these libraries are installed; or directories with maps X_Y.map of other programs (default: all "
+        "methods that suit the pairs). cpd takes 30 seconds per pair, bcicp takes 15 seconds per pair. pfm "
+        "matches partial shapes only",
     )
     parser.add_argument(
         "--pairs",
         metavar="N|FILE",
         type=path,
-        help="N random pairs, or the pairs in a file (default: all pairs)",
+        help="number of random pairs, or a file that lists pairs (default: all pairs)",
     )
     parser.add_argument(
         "--init",
@@ -51,25 +52,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mirrored",
         action="store_true",
-        help="measure against the mirrored ground truth where a map is nearer to the mirrored one",
+        help="measure each map against the ground truth or the mirrored ground truth, whichever is closer",
     )
     parser.add_argument(
         "--evaluation-samples",
         metavar="N",
         type=whole_number(1),
-        help="measure the error at N random points (default: at all points)",
+        help="number of random points at which errors are measured (default: all points)",
     )
     parser.add_argument(
         "--seed",
         type=whole_number(0),
         default=0,
-        help="seed for the choice of pairs and points (default: %(default)s)",
+        help="seed for the random choice of pairs and points (default: %(default)s)",
     )
     parser.add_argument(
         "--output",
         metavar="DIR",
         type=path,
-        help="directory for tables and figures (default: jaxsmw-benchmark-NAME, after the data set)",
+        help="directory for results, tables and figures (default: jaxsmw-benchmark-NAME, where NAME is the "
+        "name of the data set)",
     )
     processes = parser.add_mutually_exclusive_group()
     processes.add_argument(
@@ -77,14 +79,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         type=whole_number(1),
         default=os.cpu_count() or 1,
-        help="number of processes with one core each; times are most exact with one process (default: "
-        "%(default)s, the number of cores)",
+        help="number of worker processes, each on one core; measured times are most accurate with one "
+        "process (default: %(default)s, the number of cores)",
     )
-    processes.add_argument("--scheduler", metavar="ADDRESS", help="use the workers of a Dask cluster")
+    processes.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler; use the workers of its cluster"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match and measure the pairs that have no results yet, then write and print the tables of all pairs."""
+    """Match and measure all pairs without results, then write and print the tables of all pairs.
+
+    **Raises:** `InputError` if an option cannot be used, a needed package is not installed, or a pair cannot
+    be measured. All other results are written first.
+    """
     from jaxsmw.report.figures import check_drawable
 
     check_drawable()

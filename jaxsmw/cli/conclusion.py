@@ -1,4 +1,4 @@
-"""The end of a match: its errors, its report and its times."""
+"""Final steps after a match: measurement of errors, report, and printed times."""
 
 from __future__ import annotations
 
@@ -24,7 +24,19 @@ def measure_match(
     stopwatch: Stopwatch,
     others: Mapping[str, Any],
 ) -> dict[str, GeodesicError]:
-    """Returns the errors of the initial, the other and the refined maps, by name; none without a truth."""
+    """Measure the geodesic errors of the maps of a match.
+
+    **Arguments:**
+
+    - `correspondence`: the result of `match`.
+    - `truth`: the ground truth, or None.
+    - `settings`: the options of `jaxsmw.geodesic_error`; see `evaluation_settings`.
+    - `stopwatch`: the stopwatch of the command.
+    - `others`: further maps by name.
+
+    **Returns:** The errors by the names of the maps: `initial`, the names in `others`, and `refined`. The
+    result is empty if there is no ground truth.
+    """
     if truth is None:
         return {}
     maps = {
@@ -45,7 +57,17 @@ def write_match_report(
     *,
     up: Any,
 ) -> None:
-    """Write the report of a match; its summary lists the options as settings."""
+    """Write the report of a match. The summary of the report lists the options as settings.
+
+    **Arguments:**
+
+    - `directory`: the directory to write to.
+    - `correspondence`: the result of `match`.
+    - `errors`: the errors by the names of the maps; see `measure_match`.
+    - `options`: the parsed options of the command.
+    - `stopwatch`: the stopwatch of the command.
+    - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
+    """
     from jaxsmw.report.summary import write_report
 
     report_progress("report ...")
@@ -64,7 +86,7 @@ def write_match_report(
 
 
 def show_match(errors: Mapping[str, GeodesicError], stopwatch: Stopwatch) -> None:
-    """Print the errors and the times."""
+    """Print the errors of all maps and the times of all steps on standard output."""
     for name, error in errors.items():
         show(f"{name + ' map:':12} {error}")
     show(f"time:        {stopwatch.summary()} (compilation included)")

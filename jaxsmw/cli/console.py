@@ -1,4 +1,4 @@
-"""The output of commands: results go to standard output, all messages to standard error."""
+"""The output of commands: results on standard output, all messages on standard error."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ _logger = logging.getLogger("jaxsmw")
 def show(text: str) -> None:
     """Print a result on standard output.
 
-    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if nobody reads it.
+    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if its reader has closed
+    the pipe.
     """
     with _writing_output():
         print(text, flush=True)
 
 
 def flush_output() -> None:
-    """Write the buffer of standard output.
+    """Flush the buffer of standard output.
 
-    **Raises:** As `show`.
+    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if its reader has closed
+    the pipe.
     """
     with _writing_output():
         if sys.stdout is not None:
@@ -38,29 +40,31 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python writes the buffer once more at its end, and would report the same error.
+        # Python flushes the buffer again at exit. Without this redirection, the same error would be reported
+        # again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise
         raise InputError(
-            f"standard output: cannot be written ({error.strerror}): redirect it to a place with free space."
+            f"standard output: cannot be written ({error.strerror}): redirect standard output to a disk with "
+            "free space."
         ) from error
 
 
 def say(message: str) -> None:
     """Print a message on standard error."""
     if sys.stderr is not None:
-        with suppress(OSError):  # a lost message is no reason to stop the work
+        with suppress(OSError):  # the command continues even if a message cannot be printed
             print(message, file=sys.stderr, flush=True)
 
 
 def report_progress(message: str) -> None:
-    """Print a message on standard error, except with `--quiet`."""
+    """Print a progress message on standard error. The option `--quiet` suppresses these messages."""
     _logger.info("%s", message)
 
 
 def log_to_console(*, quiet: bool) -> None:
-    """Let the library's log messages appear on standard error; with `quiet`, warnings and errors only."""
+    """Print the library's log messages on standard error; with `quiet`, only warnings and errors."""
     _logger.handlers, _logger.propagate = [_Handler()], False
     _logger.setLevel(logging.WARNING if quiet else logging.INFO)
 
@@ -79,23 +83,23 @@ class Stopwatch:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Measure a block as a step. The times of steps with the same name are added."""
+        """Return a context manager that measures its block as a step. Times under the same name are added."""
         began = time.perf_counter()
         yield
         self.add({name: time.perf_counter() - began})
 
     def add(self, seconds: dict[str, float]) -> None:
-        """Add steps that were measured elsewhere: seconds by the name of the step."""
+        """Add the times of steps that were measured elsewhere, in seconds, by the names of the steps."""
         for name, more in seconds.items():
             self._seconds[name] = self._seconds.get(name, 0.0) + more
 
     def steps(self) -> dict[str, float]:
-        """Returns the seconds of each step so far; `other` is the time outside of all steps."""
+        """Return the seconds of each step so far. The entry `other` is the time outside of all steps."""
         total = time.perf_counter() - self._began
         return {**self._seconds, "other": total - sum(self._seconds.values())}
 
     def summary(self) -> str:
-        """Returns the total time and the time of each step."""
+        """Return the total time and the time of each step, in seconds, as text."""
         steps = self.steps()
         listed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in steps.items())
         return f"{sum(steps.values()):.2f} s: {listed}"

@@ -1,4 +1,4 @@
-"""`jaxsmw demo`: match two poses of a built-in creature."""
+"""`jaxsmw demo`: match two poses of a procedural creature."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from jaxsmw.cli.inputs import initial_map_file
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 
-HELP = "match two poses of a built-in creature and show the result"
+HELP = "generate a creature in two poses, match the poses and write a report"
 
 _FILES = ("source.off", "target.off", "truth.baryc_gt", "map.txt")
-# A creature with a tenth of these vertices takes 0.6 GiB.
+# A creature with a tenth of this number of vertices takes 0.6 GiB of memory.
 _MOST_VERTICES = 1_000_000
 
 
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=path,
         default="jaxsmw-demo",
-        help="directory for meshes, map and report (default: %(default)s)",
+        help="directory for the meshes, the map and the report (default: %(default)s)",
     )
     parser.add_argument("--kind", default="quadruped", help="kind of creature (default: %(default)s)")
     parser.add_argument(
@@ -39,13 +39,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=whole_number(0),
         default=0,
-        help="seed of the creature; each seed gives another individual (default: %(default)s)",
+        help="seed of the creature; different seeds give different individuals (default: %(default)s)",
     )
     add_method(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Make a creature in two poses, match the poses, and write meshes, map and report."""
+    """Generate a creature in two poses, match the poses, and write the meshes, the map and the report.
+
+    **Raises:** `InputError` if an option cannot be used or an output cannot be written. `ArithmeticError` if
+    a computation fails.
+    """
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         check_preset(options)
@@ -55,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.io.map_files import write_pointwise_map
         from jaxsmw.io.mesh_files import write_mesh
         from jaxsmw.runtime.files import make_directory
-    report_progress("making the creature ...")
+    report_progress("generating the creature ...")
     with stopwatch.step("creature"):
         pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)
     truth = GroundTruth.of_all_vertices(pair.truth)
@@ -71,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
     errors = measure_match(correspondence, truth, {}, stopwatch, {})
     write_match_report(options.output, correspondence, errors, options, stopwatch, up="y")
     show_match(errors, stopwatch)
-    show(f"Look at {directory / 'report.html'} and {directory / 'correspondence.png'}.")
+    show(f"Open {directory / 'report.html'} or {directory / 'correspondence.png'} to see the result.")
 
 
 def _check_output(options: argparse.Namespace) -> None:

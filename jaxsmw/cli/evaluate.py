@@ -1,4 +1,4 @@
-"""`jaxsmw evaluate`: measure maps against the ground truth."""
+"""`jaxsmw evaluate`: measure the geodesic errors of maps against the ground truth."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ from jaxsmw.cli.measurement import (
 )
 from jaxsmw.cli.outputs import check_outputs, report_written, write_comparison_page
 
-HELP = "measure maps against the ground truth"
+HELP = "measure the geodesic errors of maps against the ground truth"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_source_and_target(parser)
-    parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps: {MAP_FORMS}")
+    parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps to measure: {MAP_FORMS}")
     add_ground_truth(parser, required=True, purpose="true map")
     parser.add_argument(
-        "--output", metavar="FILE", type=path, help="write the errors here as JSON, with their curves"
+        "--output", metavar="FILE", type=path, help="write the errors and their quality curves here, as JSON"
     )
     parser.add_argument(
-        "--figure", metavar="FILE", type=path, help="draw the correspondence quality curves here"
+        "--figure",
+        metavar="FILE",
+        type=path,
+        help="draw the correspondence quality curves here (.png, .pdf or .svg)",
     )
     parser.add_argument(
         "--page",
         metavar="FILE.html",
         type=path,
-        help="write an interactive page here that shows one map at a time, with its errors",
+        help="write an interactive page here, which shows one map at a time with its errors",
     )
     add_partial(parser)
     add_up(parser)
@@ -54,7 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the errors of all maps, and write the requested files."""
+    """Print the errors of all maps, and write the requested files.
+
+    **Raises:** `InputError` if an option or a file cannot be used.
+    """
     check_evaluation(options)
     refuse_without(options, "--page", bool(options.page), "partial", "up")
     check_outputs(

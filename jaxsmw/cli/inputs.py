@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
-    """Read a mesh; describe the mesh on standard error, except with `--quiet`."""
+    """Read a mesh, and print its description on standard error unless `--quiet` is given.
+
+    **Raises:** `InputError` if `jaxsmw.read_mesh` refuses the file.
+    """
     from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(file, weld=weld)
@@ -29,7 +32,7 @@ def read_mesh_file(file: str, *, weld: bool) -> Mesh:
 
 
 def describe_mesh(mesh: Mesh) -> list[str]:
-    """Returns sentences about a mesh: notes from reading the file, size, and what is unusual."""
+    """Return sentences that describe a mesh: the notes of its reader, its size, and its defects."""
     from jaxsmw.geometry.mesh import diagnose
 
     return [*mesh.notes, *diagnose(mesh).sentences()]
@@ -38,7 +41,10 @@ def describe_mesh(mesh: Mesh) -> list[str]:
 def read_truth(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> GroundTruth:
-    """Read the ground truth of a pair; see `jaxsmw.read_ground_truth`."""
+    """Read the ground truth of a pair; see `jaxsmw.read_ground_truth`.
+
+    **Raises:** `InputError` if the files cannot be read or do not fit the meshes.
+    """
     from jaxsmw.evaluation.ground_truth import read_ground_truth
 
     for file in files:
@@ -49,7 +55,12 @@ def read_truth(
 def read_maps(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Read pointwise maps X -> Y; returns each by the name of its file. See `jaxsmw.read_pointwise_map`."""
+    """Read pointwise maps X -> Y; see `jaxsmw.read_pointwise_map`.
+
+    **Returns:** The maps (m,), 0-based, by the names of their files.
+
+    **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
+    """
     from jaxsmw.io.map_files import read_pointwise_map
 
     maps = {}
@@ -60,7 +71,10 @@ def read_maps(
 
 
 def initial_map(text: str) -> str:
-    """Argument type: the name of an initial map, or `landmarks:FILE` or `map:FILE`."""
+    """Argument type for an initial map: a name, `landmarks:FILE` or `map:FILE`.
+
+    **Raises:** `argparse.ArgumentTypeError` for any other text.
+    """
     kind, _, file = text.partition(":")
     if file and kind in _INITIAL_MAP_FILES:
         path(file)
@@ -74,12 +88,17 @@ _INITIAL_MAP_FILES = ("landmarks", "map")
 
 
 def initial_map_file(init: str) -> str | None:
-    """Returns the file that `--init` names, or None."""
+    """Return the file that the value of `--init` names, or None if it names no file."""
     return init.partition(":")[2] or None
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
-    """Returns the initial map for `jaxsmw.match`: a name, or the contents of the file that `--init` names."""
+    """Return the argument `init` of `jaxsmw.match` for a value of `--init`.
+
+    **Returns:** The name of an initial map, landmarks (l, 2), or a pointwise map (m,), both 0-based.
+
+    **Raises:** `InputError` if the file cannot be read or does not fit the meshes.
+    """
     from jaxsmw.io.map_files import read_landmarks, read_pointwise_map
 
     kind, _, file = init.partition(":")
@@ -91,11 +110,11 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
-    """Say that indices in a MATLAB file begin at 1, unless `--index-base` is given."""
+    """Print a note that the indices of a `.mat` file are read as 1-based, unless `--index-base` is given."""
     from jaxsmw.io.mat_files import is_mat_file
 
     if index_base is None and is_mat_file(file):
         say(
-            f"note: {file} is read with indices from 1, as usual in MATLAB; if its indices begin at 0, add "
+            f"note: {file} is read with indices from 1, as usual in MATLAB; if its indices start from 0, add "
             "--index-base 0."
         )

@@ -1,9 +1,9 @@
-"""The end of the process on Ctrl-C: at once, with one line, without unfinished files.
+"""Termination on Ctrl-C: the process ends at once, prints one line and leaves no unfinished files.
 
-Python would raise `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the code
-returns to Python. Functions that run at a garbage collection swallow the exception, and imports of extension
-modules turn it into other errors. Here nothing is raised. A signal handler in the main thread ends the
-process; while the main thread runs compiled code, a second thread does.
+By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
+code returns to Python. Functions that run during garbage collection suppress the exception, and imports of
+extension modules turn it into other errors. Therefore this module raises no exception. A signal handler in
+the main thread ends the process. If the main thread is in compiled code, a second thread ends the process.
 """
 
 from __future__ import annotations
@@ -15,21 +15,25 @@ import time
 from _thread import allocate_lock
 from contextlib import contextmanager, suppress
 
-# Few and fast imports: Ctrl-C leaves a traceback until the signal is handled.
+# The imports are few and fast, because Ctrl-C causes a traceback until the signal handler is installed.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# The main thread ends the process as soon as it runs Python code. The second thread acts after these seconds.
+# The main thread ends the process as soon as it runs Python code. If it does not do so within this number of
+# seconds, the second thread ends the process.
 _PATIENCE = 0.2
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
-# The first interruption locks this for good.
+# The first interruption acquires this lock and never releases it, so the process ends only once.
 _ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
-    """End this process on SIGINT from now on, unless its parent process ignores the signal for it."""
+    """Install a handler that ends this process on SIGINT, unless the process was started with SIGINT ignored.
+
+    The function must be called in the main thread.
+    """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         return
     signal.signal(signal.SIGINT, _end)
@@ -42,18 +46,25 @@ def end_when_interrupted() -> None:
 
 
 def announce_consequence(consequence: str) -> None:
-    """Set the line of a command with a progress bar: what an interruption means for the results."""
+    """Set the message that an interruption prints, for a command with a progress bar.
+
+    **Arguments:**
+
+    - `consequence`: the consequence of an interruption for the results, as a clause without a period.
+    """
     global _message
-    # The cursor stands behind the progress bar.
+    # The message begins with a newline because the cursor is at the end of the progress bar.
     _message = f"\njaxsmw: interrupted; {consequence}.\n"
 
 
 @contextmanager
 def quiet_children() -> Iterator[None]:
-    """Keep the processes that this thread starts in the block from printing at an interruption.
+    """Return a context manager that prevents child processes from printing messages on interruption.
 
-    A terminal sends SIGINT to these processes as well, so they inherit a blocked SIGINT. Another thread of
-    this process receives the signal. The process that removes leaked semaphores does not warn of them.
+    The context manager applies to processes that this thread starts in the block. A terminal also sends
+    SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the processes inherit this
+    setting. Another thread of this process receives the signal. Python's resource tracker, which removes
+    leaked semaphores, prints no warning.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
@@ -69,7 +80,7 @@ def _wait_for_signal(reading: int) -> None:
         pass  # another signal
     time.sleep(_PATIENCE)
     _end()
-    # The main thread was first but is stuck, for example because nobody reads its message.
+    # The main thread has begun to end the process but is stuck, for example because its message is not read.
     time.sleep(1)
     _die()
 
@@ -80,15 +91,15 @@ def _end(*_: object) -> None:
     console = -1
     with suppress(OSError):  # standard error may be closed
         console = os.dup(2)
-        # Other threads still run for a moment; their messages would surround the line.
+        # Other threads still run for a moment, and their output would be mixed with the message.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
     _remove_unfinished_files()
-    with suppress(OSError):  # nobody may read standard error
-        # A terminal has just printed "^C".
+    with suppress(OSError):  # standard error may be a closed pipe
+        # A terminal has just printed "^C", so the message starts on a new line.
         line = f"\n{_message.lstrip()}" if os.isatty(console) else _message
-        # `print` would fail if it were interrupted by itself.
+        # `print` would fail if the signal had interrupted another call of `print`.
         os.write(console, line.encode(errors="surrogateescape"))
     _die()
 
@@ -100,7 +111,7 @@ def _remove_unfinished_files() -> None:
 
 
 def _die() -> None:
-    """Die of SIGINT: a shell ends its loop only if the interrupted command dies of the signal."""
+    """End the process by SIGINT, because a shell ends a loop only if the signal terminated the command."""
     with suppress(Exception):
         try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -26,7 +26,7 @@ from jaxsmw.errors import InputError
 if TYPE_CHECKING:
     from jaxsmw.matching import Correspondence
 
-HELP = "match two meshes"
+HELP = "match two meshes and write the map"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,41 +38,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         required=True,
         help="write the map here: the target vertex of each source vertex, one per line, counted from 0; "
-        "with the suffix .npy an array for numpy.load; with .mat the column T12 for MATLAB, counted from 1",
+        "with the suffix .npy as an array for numpy.load, counted from 0; with the suffix .mat as the "
+        "column T12 for MATLAB, counted from 1",
     )
     parser.add_argument(
         "--surface-points",
         metavar="FILE.baryc_gt",
         type=path,
-        help="write a point between target vertices for each source vertex: a face, counted from 1, and "
+        help="write a point on the target surface for each source vertex: a face, counted from 1, and the "
         "barycentric weights of its corners",
     )
     parser.add_argument(
         "--expected-error",
         metavar="FILE",
         type=path,
-        help="write the expected error of each match, estimated without ground truth, as a fraction of the "
-        "square root of the target's area",
+        help="write the expected error of each match, one per line: an estimate of the geodesic error "
+        "without ground truth, divided by the square root of the target's area",
     )
     parser.add_argument(
         "--one-to-one",
         metavar="FILE",
         type=path,
-        help="write a map that uses no target vertex twice, in the forms of --output; for meshes with the "
-        "same triangulation, because for others this map is much less accurate",
+        help="write a map in which no two source vertices share a target vertex, in the formats of "
+        "--output; use this map for meshes with the same triangulation, because it is much less accurate "
+        "for other meshes",
     )
     parser.add_argument(
         "--texture",
         metavar="DIR",
         type=path,
-        help="write both meshes here as OBJ files with one picture, projected onto the target and "
-        "transferred to the source",
+        help="write both meshes here as OBJ files with a common texture, which is projected onto the "
+        "target and transferred to the source by the map",
     )
     parser.add_argument(
-        "--report", metavar="DIR", type=path, help="write pictures, a 3D page and a summary here"
+        "--report", metavar="DIR", type=path, help="write pictures, an interactive 3D page and a summary here"
     )
     add_up(parser)
-    add_ground_truth(parser, required=False, purpose="true map, for the errors before and after refinement")
+    add_ground_truth(parser, required=False, purpose="true map; measure errors before and after refinement")
     add_partial(parser)
     add_method(parser)
     add_weld(parser)
@@ -81,7 +83,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes, write the requested files, and print errors and times."""
+    """Match two meshes, write the requested files, and print errors and times.
+
+    **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
+    """
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
@@ -107,7 +112,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse options and outputs that would fail after minutes of work, and load the libraries."""
+    """Check options and outputs before the long computation, and import the libraries."""
     init_file = initial_map_file(options.init)
     check_preset(options)
     check_evaluation(options)
@@ -121,7 +126,7 @@ def _check(options: argparse.Namespace) -> None:
         )
     if expected and Path(expected).suffix in (".npy", ".mat"):
         raise InputError(
-            f"{expected}: expected errors are written as text: choose another name, such as one in .txt."
+            f"{expected}: expected errors are written as text: choose another suffix, such as .txt."
         )
     from jaxsmw.io.map_files import check_map_name
 
@@ -132,11 +137,11 @@ def _check(options: argparse.Namespace) -> None:
         files=[options.output, points, options.one_to_one, expected],
         directories=_directories(options),
     )
-    import jaxsmw.matching  # noqa: F401 (imported here for the stopwatch)
+    import jaxsmw.matching  # noqa: F401 (imported here so that the stopwatch counts it as loading)
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Returns the requested directories with the names of their files."""
+    """Return the requested directories, each with the names of the files in it."""
     directories: list[tuple[str, tuple[str, ...]]] = []
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
@@ -156,7 +161,7 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Any]:
-    """Write all files but the report; returns the maps besides the refined one, by name."""
+    """Write all files except the report, and return all maps except the refined map, by name."""
     from jaxsmw.io.map_files import write_pointwise_map
 
     others: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The errors of maps against the ground truth."""
+"""The measurement of the geodesic errors of maps against the ground truth, and its options."""
 
 from __future__ import annotations
 
@@ -17,42 +17,50 @@ if TYPE_CHECKING:
 
 
 def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose: str) -> None:
-    """Add `--ground-truth`; the help begins with the purpose and lists the forms of files."""
+    """Add `--ground-truth`.
+
+    **Arguments:**
+
+    - `parser`: the parser.
+    - `required`: whether the command requires the option.
+    - `purpose`: the beginning of the help text. A list of the accepted files follows.
+    """
     parser.add_argument(
         "--ground-truth",
         metavar="FILE",
         type=path,
         nargs="+",
         required=required,
-        help=f"{purpose}: target vertices, one per line; or two .vts files, of the source and of the target; "
-        "or a .baryc_gt file; or a file with two columns, a source and a target vertex",
+        help=f"{purpose}; accepted files: target vertices, one per line; or two .vts files, for the source "
+        "and for the target; or a .baryc_gt file; or a file with a source and a target vertex per line",
     )
 
 
 def add_evaluation(parser: argparse.ArgumentParser) -> None:
-    """Add the options of geodesic errors; an option that is not given is None."""
+    """Add `--evaluation-samples`, `--seed` and `--geodesics`. The value of an omitted option is None."""
     parser.add_argument(
         "--evaluation-samples",
         metavar="N",
         type=whole_number(1),
-        help="measure the error at N random vertices (default: at all vertices with a known truth)",
+        help="number of random vertices at which errors are measured (default: all vertices with ground "
+        "truth)",
     )
     parser.add_argument(
-        "--seed", type=whole_number(0), help="seed for the choice of --evaluation-samples (default: 0)"
+        "--seed", type=whole_number(0), help="seed for the random choice of --evaluation-samples (default: 0)"
     )
     default, *_ = get_args(GeodesicMethod)
     parser.add_argument(
         "--geodesics",
         choices=get_args(GeodesicMethod),
-        help="geodesic distances: strips is nearly always within 0.5 %% of exact, and much faster (default: "
-        f"{default})",
+        help="method for geodesic distances: strips is much faster than exact, and nearly always within "
+        f"0.5 %% of it (default: {default})",
     )
 
 
 def check_evaluation(options: argparse.Namespace) -> None:
-    """Refuse options of `add_evaluation` that have no effect.
+    """Check that no option of `add_evaluation` is given that has no effect.
 
-    **Raises:** `InputError` that names the option.
+    **Raises:** `InputError` that names the first option without effect.
     """
     measured = bool(options.ground_truth)
     refuse_without(options, "--ground-truth", measured, "evaluation_samples", "geodesics")
@@ -60,7 +68,7 @@ def check_evaluation(options: argparse.Namespace) -> None:
 
 
 def evaluation_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Returns the given options of `add_evaluation` as arguments of `jaxsmw.geodesic_error`."""
+    """Return the given options of `add_evaluation` as keyword arguments of `jaxsmw.geodesic_error`."""
     settings = {
         "method": options.geodesics,
         "number_of_samples": options.evaluation_samples,
@@ -72,7 +80,17 @@ def evaluation_settings(options: argparse.Namespace) -> dict[str, Any]:
 def measure_errors(
     mesh_y: Mesh, maps: Mapping[str, Any], truth: GroundTruth, settings: Mapping[str, Any]
 ) -> dict[str, GeodesicError]:
-    """Returns the geodesic error of each map, by name; `settings` are those of `evaluation_settings`."""
+    """Measure the geodesic error of each map.
+
+    **Arguments:**
+
+    - `mesh_y`: the target Y.
+    - `maps`: maps X -> Y by name, each as vertices of Y (m,) or m `SurfacePoints` on Y.
+    - `truth`: the ground truth.
+    - `settings`: the result of `evaluation_settings`.
+
+    **Returns:** The errors by the names of the maps.
+    """
     from jaxsmw.evaluation.metrics import geodesic_error
 
     report_progress("geodesic errors ...")

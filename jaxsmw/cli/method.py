@@ -1,4 +1,4 @@
-"""The options that choose how two meshes are matched, and the match itself."""
+"""The options of the matching method, and the call of `jaxsmw.match` with these options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jaxsmw.matching import Correspondence
     from jaxsmw.stage import Stage
 
-# The class and the arguments of each solution. The first solution is the paper's.
+# The class and the arguments of each solution. The first solution is that of the MWP paper.
 _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "filtering": ("Filtering", ()),
     "least-squares": ("LeastSquares", ()),
@@ -36,7 +36,7 @@ _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _PAPER_SOLUTION = next(iter(_SOLUTIONS))
 
-# The options that change the paper's method, as attributes of the options.
+# The options that change the method of the MWP paper, as attribute names of the parsed options.
 _CHANGES = (
     "eigenvectors",
     "bank",
@@ -47,12 +47,12 @@ _CHANGES = (
     "search",
     "stop_when_unchanged",
 )
-# The preset that these options need.
+# The preset that the options in `_CHANGES` modify.
 _PAPER: PresetName = "paper"
 
 
 def add_method(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the method."""
+    """Add the options that choose the initial map, the preset and the method."""
     group = parser.add_argument_group("method")
     group.add_argument(
         "--init",
@@ -60,16 +60,16 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         type=initial_map,
         default=DEFAULT_INITIAL_MAP,
         help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE or map:FILE (default: "
-        "%(default)s). shot, wks, hks and wavelet take nearest neighbours of that descriptor; functional "
-        "takes the functional map that preserves shot. A landmarks file has a source and a target vertex per "
-        "line. Only shot, functional and landmarks tell left from right",
+        "%(default)s). shot, wks, hks and wavelet match nearest neighbours in this descriptor. functional "
+        "computes a functional map that preserves shot. A landmarks file has a source and a target vertex "
+        "per line. Only shot, functional and landmarks distinguish left from right",
     )
     group.add_argument(
         "--preset",
         choices=get_args(PresetName),
-        help="method of refinement: paper is that of the MWP paper; fast is the same on samples; accurate "
-        f"refines three to four times as long as paper (default: {DEFAULT_PRESET}; {_PAPER} with any option "
-        "of the next group)",
+        help="method of refinement: paper is the method of the MWP paper; fast is the same method on "
+        "samples; accurate has more stages and repairs maps, and its refinement takes three to four times as "
+        f"long (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is given)",
     )
     group.add_argument(
         "--precision",
@@ -82,7 +82,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_changes(group: argparse._ActionsContainer) -> None:
-    """Add the options in `_CHANGES`; an option that is not given is None."""
+    """Add the options in `_CHANGES`. The value of an omitted option is None."""
     group.add_argument(
         "--eigenvectors",
         metavar="N",
@@ -93,9 +93,10 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--solution",
         choices=tuple(_SOLUTIONS),
-        help="computation of the functional map: filtering is for banks that are tight frames; least-squares "
-        "is exact for all banks, -frobenius with equal weight for every vertex; regularized adds "
-        f"commutativity with the Laplacian and orthogonality (default: {_PAPER_SOLUTION})",
+        help="computation of the functional map: filtering is meant for banks that are tight frames; "
+        "least-squares is exact for all banks; least-squares-frobenius is the same with equal weights of all "
+        "vertices; regularized adds commutativity with the Laplacian and orthogonality (default: "
+        f"{_PAPER_SOLUTION})",
     )
     group.add_argument(
         "--iterations",
@@ -107,28 +108,28 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--samples",
         metavar="N",
         type=whole_number(1),
-        help="iterate on N samples per shape, and search all vertices in the last step (default: iterate on "
-        "all vertices)",
+        help="number of samples per shape on which to iterate; the last step searches all vertices "
+        "(default: iterate on all vertices)",
     )
     default_search, *_ = get_args(Search)
     group.add_argument(
         "--search",
         choices=get_args(Search),
-        help="search for nearest neighbours: exhaustive and patches find the same ones, patches faster on "
-        f"large meshes; auto takes the faster of the two (default: {default_search})",
+        help="search for nearest neighbours: exhaustive and patches give the same result, and patches is "
+        f"faster on large meshes; auto chooses the faster search (default: {default_search})",
     )
     group.add_argument(
         "--stop-when-unchanged",
         action="store_true",
         default=None,
-        help="stop as soon as an iteration changes no match",
+        help="stop refinement when an iteration changes no match",
     )
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Refuse options that change the paper's method together with another preset.
+    """Check that options that change the paper's method are not combined with another preset.
 
-    **Raises:** `InputError` that names the option.
+    **Raises:** `InputError` that names the first such option.
     """
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
@@ -138,12 +139,15 @@ def check_preset(options: argparse.Namespace) -> None:
 
 
 def preset_name(options: argparse.Namespace) -> PresetName:
-    """Returns the name of the given preset, of the paper's if an option changes it, or of the default."""
+    """Return the name of the preset to use.
+
+    This is the given preset, `paper` if an option changes the paper's method, or else the default preset.
+    """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
-    """Returns the given options that change the paper's method."""
+    """Return the names of the given options that change the paper's method, such as `--bank`."""
     return [f"--{name.replace('_', '-')}" for name in _CHANGES if getattr(options, name) is not None]
 
 
@@ -160,9 +164,13 @@ def match_meshes(
 
     **Arguments:**
 
-    - `index_base`: the number of the first vertex in a file of `--init`.
+    - `options`: the parsed options.
+    - `mesh_x`, `mesh_y`: the source X and the target Y.
+    - `stopwatch`: the stopwatch of the command, to which the times of the match are added.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
+    - `index_base`: the index of the first vertex in a file of `--init`; None for the default of the file.
 
-    **Raises:** `InputError` if an option does not fit the meshes.
+    **Raises:** `InputError` if an option does not fit the meshes. `ArithmeticError` if a computation fails.
     """
     import jax
 
@@ -189,7 +197,7 @@ def match_meshes(
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
-    """Returns the paper's method with the given changes."""
+    """Return a stage with the paper's method and the given changes."""
     from jaxsmw.stage import Stage
 
     settings: dict[str, Any] = {
@@ -221,11 +229,11 @@ def _note_loose_frame(name: str, bounds: tuple[float, float] | None) -> None:
     if bounds:
         lower, upper = bounds
         say(
-            f"note: {name} is not a tight frame (bounds {lower:.2g} and {upper:.2g}), but filtering is meant "
-            "for tight frames; --solution least-squares is exact for every bank."
+            f"note: {name} is not a tight frame (frame bounds {lower:.2g} and {upper:.2g}), but filtering is "
+            "meant for tight frames; --solution least-squares is exact for every bank."
         )
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings that are not None; the library has defaults for the others."""
+    """Return the settings that are not None. The library has defaults for the omitted settings."""
     return {name: value for name, value in settings.items() if value is not None}

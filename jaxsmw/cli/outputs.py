@@ -1,4 +1,4 @@
-"""The files that commands write: their check before the work, and messages about them after it."""
+"""The files that commands write: checks before the computation, and messages after a file is written."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ def check_outputs(
     pages: Iterable[str | None] = (),
     directories: Sequence[tuple[str, Sequence[str]]] = (),
 ) -> None:
-    """Check before the work that every output can be written, and replaces no input and no other output.
+    """Check before a long computation that all outputs can be written.
 
-    Paths are compared after symbolic links are resolved. Entries that are None are skipped.
+    An output must not replace an input or another output. Paths are compared after symbolic links are
+    resolved. Entries that are None are skipped.
 
     **Arguments:**
 
     - `inputs`: the files that the command reads.
-    - `files`: the files that the command writes, other than figures and pages.
-    - `figures`: pictures (PNG, PDF or SVG).
-    - `pages`: interactive HTML pages.
-    - `directories`: the directories that the command makes, each with the names of its files. A directory may
-      occur several times.
+    - `files`: the files that the command writes, except figures and pages.
+    - `figures`: the pictures that the command writes (PNG, PDF or SVG).
+    - `pages`: the interactive HTML pages that the command writes.
+    - `directories`: the directories that the command creates, each with the names of the files in it. A
+      directory may occur several times.
 
-    **Raises:** `InputError` that names the path.
+    **Raises:** `InputError` that names the first path that cannot be written.
     """
     files, figures, pages = ([path for path in paths if path] for paths in (files, figures, pages))
     written = [*files, *figures, *pages]
@@ -67,8 +68,8 @@ def _refuse_clashes(inputs: Iterable[str], files: Iterable[str], directories: It
         _refuse_place(path, read, taken)
         if parents := taken.intersection(map(str, Path(os.path.realpath(path)).parents)):
             raise InputError(
-                f"{path}: lies in {parents.pop()}, which is an output file: choose another place for one of "
-                "them."
+                f"{path}: is a path in {parents.pop()}, which is an output file: choose another path for one "
+                "of the two outputs."
             )
 
 
@@ -77,11 +78,11 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
     if place in read:
         raise InputError(f"{path}: is an input and would be overwritten: choose another name.")
     if place in taken:
-        raise InputError(f"{path}: two outputs have this name: choose another name for one of them.")
+        raise InputError(f"{path}: two outputs have this name: choose another name for one of the outputs.")
 
 
 def is_page(path: str) -> bool:
-    """Returns whether the name is that of an HTML page."""
+    """Return whether a file name has the suffix of an HTML page, `.html` or `.htm`."""
     return Path(path).suffix.lower() in (".html", ".htm")
 
 
@@ -101,7 +102,7 @@ def _check_writable(path: str) -> None:
 
 
 def report_written(*paths: str | os.PathLike[str]) -> None:
-    """Name written files on standard error, except with `--quiet`."""
+    """Print the names of written files on standard error. The option `--quiet` suppresses these messages."""
     for path in paths:
         report_progress(f"wrote {path}")
 
@@ -116,11 +117,19 @@ def write_comparison_page(
     partial: bool,
     up: Axis | None,
 ) -> None:
-    """Write a page that compares maps. The page calls each map by as much of its path as is unique.
+    """Write an interactive page that compares maps; see `jaxsmw.report.summary.write_comparison`.
+
+    The page labels each map with its file name without suffix, its file name, or its full path: the shortest
+    of these for which the labels are unique.
 
     **Arguments:**
 
-    - `maps`, `errors`: by the paths of the maps; see `jaxsmw.report.summary.write_comparison`.
+    - `path`: the page to write.
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
+    - `maps`: maps X -> Y (m,), by the paths of their files.
+    - `errors`: the geodesic errors of the maps, by the same paths; may be empty.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
+    - `up`: the axis of the meshes that points up; None to guess the axis.
     """
     from jaxsmw.report.summary import write_comparison
 

@@ -1,4 +1,4 @@
-"""The parser of the command line."""
+"""The argument parser of the command line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum
 from jaxsmw.cli.arguments import add_quiet
 from jaxsmw.cli.console import say, show
 
-# The help lists them in this order.
+# The commands in the order in which the help lists them.
 _COMMANDS = {
     "demo": demo,
     "match": match,
@@ -23,24 +23,28 @@ _COMMANDS = {
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that refuses bad arguments with one sentence and exit code 2."""
+    """A parser that prints one sentence for bad arguments and exits with code 2."""
 
     def __init__(self, **settings: Any) -> None:
-        # An abbreviation would change its meaning with every new option that begins alike.
+        # Abbreviations are not allowed, because a new option with the same beginning would make them
+        # ambiguous.
         super().__init__(allow_abbrev=False, **settings)
 
     def print_help(self, file: Any = None) -> None:
-        """Print the help on standard output; argparse would ignore errors."""
+        """Print the help on standard output.
+
+        Unlike in argparse, an error of standard output is raised. The argument `file` is ignored.
+        """
         show(self.format_help().rstrip())
 
     def error(self, message: str) -> NoReturn:
-        """Print the message on standard error and exit with code 2."""
+        """Print a message on standard error, and exit with code 2."""
         say(f"{self.prog}: {message} (see {self.prog} --help)")
         sys.exit(2)
 
 
 def make_parser() -> Parser:
-    """Returns the parser of all commands. Parsed options have the function of the command in `run`."""
+    """Return the parser of all commands. The attribute `run` of parsed options is the command's function."""
     parser = Parser(
         prog="jaxsmw",
         description="Match two triangle meshes (OFF, OBJ, PLY, STL or MATLAB's MAT) of the same kind of body "
@@ -57,7 +61,7 @@ def make_parser() -> Parser:
 
 
 class _Version(argparse.Action):
-    """Print the version. The look-up is slow, so it waits until someone asks for the version."""
+    """An action that prints the version. The look-up of the version is slow, so it runs only on demand."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(

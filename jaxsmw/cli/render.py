@@ -17,22 +17,26 @@ from jaxsmw.cli.inputs import read_maps, read_mesh_file
 from jaxsmw.cli.outputs import check_outputs, is_page, report_written, write_comparison_page
 from jaxsmw.errors import InputError
 
-HELP = "draw a mesh, or a correspondence by its colours"
+HELP = "draw a mesh, or show a correspondence by colours"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("source", type=path, metavar="SOURCE", help="mesh to draw, or the source mesh")
-    parser.add_argument("target", type=path, metavar="TARGET", nargs="?", help="target mesh")
+    parser.add_argument("source", type=path, metavar="SOURCE", help="mesh to draw, or source mesh of a map")
+    parser.add_argument("target", type=path, metavar="TARGET", nargs="?", help="target mesh of a map")
     parser.add_argument(
-        "map", type=path, metavar="MAP", nargs="*", help=f"map: {MAP_FORMS}; a page may show several maps"
+        "map",
+        type=path,
+        metavar="MAP",
+        nargs="*",
+        help=f"map to show: {MAP_FORMS}; a page may show several maps",
     )
     parser.add_argument(
         "--output",
         metavar="FILE",
         type=path,
         required=True,
-        help="write a picture here (.png, .pdf, .svg), or for a correspondence an interactive page (.html)",
+        help="write a picture here (.png, .pdf or .svg), or an interactive page (.html) of a correspondence",
     )
     add_partial(parser)
     add_up(parser)
@@ -41,7 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Draw a mesh, a correspondence, or a page with one or several correspondences."""
+    """Draw a mesh or a correspondence, or write a page with one or several correspondences.
+
+    **Raises:** `InputError` if an option or a file cannot be used.
+    """
     page = is_page(options.output)
     _check(options, page)
     mesh_x = read_mesh_file(options.source, weld=options.weld)
@@ -66,18 +73,20 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace, page: bool) -> None:
-    """Refuse arguments that contradict each other, and outputs that cannot be written."""
+    """Check that the arguments do not contradict each other, and that the outputs can be written."""
     output = options.output
     if options.target and not options.map:
-        raise InputError(f"{options.target}: a second mesh needs a map; give the map as the third file.")
+        raise InputError(f"{options.target}: a second mesh needs a map: give the map as the third file.")
     if page and not options.map:
-        raise InputError(f"{output}: a page shows a correspondence; give a target mesh and a map as well.")
+        raise InputError(f"{output}: a page shows a correspondence: give a target mesh and a map as well.")
     if not page and len(options.map) > 1:
         raise InputError(
-            f"{output}: a picture shows one map; leave {options.map[1]} out, or name a page (.html)."
+            f"{output}: a picture shows only one map: leave {options.map[1]} out, or write a page (.html)."
         )
     if not page and options.partial:
-        raise InputError(f"--partial: is for pages; leave --partial out, or write {output} as .html.")
+        raise InputError(
+            f"--partial: has an effect only on pages: leave --partial out, or write {output} as .html."
+        )
     refuse_without(options, "a map", bool(options.map), "index_base")
     check_outputs(
         [options.source, options.target, *options.map],

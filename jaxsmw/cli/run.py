@@ -1,4 +1,4 @@
-"""One command, from its arguments to its exit code."""
+"""The execution of one command, from its arguments to its exit code."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ from jaxsmw.errors import InputError
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run a command and return its exit code: 0 for success, 2 for bad input, 1 for any other failure.
+    """Run a command, and print one sentence on standard error if it fails.
 
-    A failure is explained by one sentence on standard error.
+    **Arguments:**
+
+    - `arguments`: the words of the command line after `jaxsmw`.
+
+    **Returns:** The exit code: 0 for success, 2 for bad input, 1 for any other failure.
     """
     try:
         try:
@@ -32,7 +36,7 @@ def run_command(arguments: Sequence[str]) -> int:
         detail = f" ({error})" if str(error) else ""
         say(f"jaxsmw: this machine has too little memory{detail}: give smaller meshes or smaller numbers.")
         return 1
-    except BrokenPipeError:  # nobody reads standard output any more, for example after `head`
+    except BrokenPipeError:  # the reader of standard output, for example `head`, has closed the pipe
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""`jaxsmw spectrum`: inspect a mesh and its eigenbasis."""
+"""`jaxsmw spectrum`: describe a mesh and compute its eigenbasis."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jaxsmw.cli.outputs import check_outputs, report_written
 if TYPE_CHECKING:
     import numpy as np
 
-HELP = "inspect a mesh and its eigenbasis"
+HELP = "describe a mesh and compute its eigenbasis"
 
 _EIGENVALUES_PER_LINE = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("mesh", type=path, metavar="MESH", help="mesh to inspect")
+    parser.add_argument("mesh", type=path, metavar="MESH", help="mesh to describe")
     parser.add_argument(
         "--eigenvectors",
         metavar="N",
@@ -34,8 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="FILE",
         type=path,
-        help="write eigenvalues, eigenvectors and vertex_areas here, for area 1, as .npz; or as .mat a "
-        "struct S with evals, evecs, A and surface",
+        help="write the eigenbasis of the surface scaled to area 1 here: as .npz with eigenvalues, "
+        "eigenvectors and vertex_areas; or as .mat with a struct S with evals, evecs, A and surface",
     )
     parser.add_argument(
         "--figure", metavar="FILE", type=path, help="draw the filter bank over the eigenvalues here"
@@ -46,7 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Describe the mesh, print its eigenvalues, and write the requested files."""
+    """Describe the mesh, print its eigenvalues, and write the requested files.
+
+    **Raises:** `InputError` if an option or a file cannot be used.
+    """
     refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
@@ -82,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _lines(eigenvalues: np.ndarray) -> list[str]:
-    """Returns lines of eigenvalues; each line begins with the number of its first eigenvalue."""
+    """Return lines of eigenvalues. Each line begins with the index (0-based) of its first eigenvalue."""
     lines = []
     for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[first : first + _EIGENVALUES_PER_LINE])

@@ -25,7 +25,10 @@ def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:
-    """Returns whether all numbers in the floating-point arrays of a pytree are finite."""
+    """Returns whether all numbers in the floating-point arrays of a pytree are finite.
+
+    The pytree must contain at least one floating-point array.
+    """
     inexact = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
 
@@ -36,13 +39,14 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     **Raises:** `ValueError` if the value is not one of the choices.
     """
     if value not in choices:
-        raise ValueError(f"{name}={value!r} is none of {', '.join(choices)}")
+        raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
     """Checks the type of an argument.
 
-    **Raises:** `TypeError` if the value is not an instance of one of the kinds. The message names the first.
+    **Raises:** `TypeError` if the value is not an instance of one of the kinds. The message names
+    the first kind.
     """
     if isinstance(value, kinds):
         return
@@ -55,7 +59,9 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Checks a numerical parameter of a module. Only the shape of a traced parameter is checked.
+    """Checks a numerical parameter of a module.
+
+    If the parameter is traced, only its number of dimensions is checked.
 
     **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if a number in the parameter
     is not finite or not strictly between the limits.
@@ -73,12 +79,12 @@ def check_between(
 
 
 def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
-    """Decorates a compiled function so that `iterations` may be an integer of any type, but nothing else.
+    """Decorates a compiled function so that its argument `iterations` may be an integer of any type.
 
-    The decorator belongs outside of `equinox.filter_jit`, which would trace a NumPy integer.
+    Apply this decorator outside `equinox.filter_jit`, which would otherwise trace a NumPy integer.
 
     **Raises:** The decorated function raises `TypeError` if `iterations` is not an integer or is traced, and
-    `ValueError` if it is below 1.
+    `ValueError` if `iterations` is below 1.
     """
 
     @functools.wraps(function, updated=())

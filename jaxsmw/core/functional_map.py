@@ -1,4 +1,4 @@
-r"""Functional maps: how a pointwise map is written as a matrix, and the energy that preserves wavelets.
+r"""Functional maps: the matrix form of a pointwise map, and the energy of wavelet preservation.
 
 The functional map C comes in two conventions, named after the direction of C:
 
@@ -9,8 +9,8 @@ The functional map C comes in two conventions, named after the direction of C:
 
 This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions
 every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x, and C should map a_x to
-b_x. In the area norm, vertices count by their area. In the Frobenius norm, in which the paper prints eq. (5),
-all vertices count the same:
+b_x. In the area norm, each vertex has its area as its weight. In the Frobenius norm, which the paper uses in
+eq. (5), all vertices have the same weight:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -25,16 +25,16 @@ energy of eq. (5) is
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
 The sum over scales is an elementwise product, `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`.
-So the energy depends on two moments only. It needs no loop over scales, and no array of size m x n:
+So the energy depends on two moments only. They require no loop over scales and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
 The minimiser solves the (k_in, k_in) system `C gram = cross`. If the inputs are orthonormal, the gram matrix
-is diagonal and holds the frame function, so that the minimiser is `cross` with its columns divided by the
-frame function. For a Parseval frame that is filtering alone, eq. (8). The inputs are always orthonormal in
-the pushforward convention with the area norm, and in the pullback convention if T preserves area.
-`docs/frames.md` derives all of this.
+is diagonal and holds the frame function. The minimiser is then `cross` with its columns divided by the frame
+function. For a Parseval frame this minimiser is the filtered map of eq. (8). The inputs are always
+orthonormal in the pushforward convention with the area norm, and in the pullback convention if T preserves
+area. `docs/frames.md` derives all of this.
 """
 
 from __future__ import annotations
@@ -68,15 +68,15 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
 
 
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
-    """Returns the transpose of the pseudo-inverse `Phi^+` (k, n) of the eigenvectors.
+    """Returns the transpose (n, k) of the pseudo-inverse `Phi^+` (k, n) of the eigenvectors.
 
     **Arguments:**
 
     - `spectrum`: the shape.
     - `pseudo_inverse`: `"area"` for `Phi^T A`, the projection in the inner product of the surface (the
-      paper); `"least_squares"` for `(Phi^T Phi)^-1 Phi^T`, in which all vertices count the same (the authors'
-      program). The more evenly the vertices are spread, the smaller the difference. On samples only the
-      second is an inverse.
+      paper); `"least_squares"` for `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight (the
+      authors' program). The difference is small if the vertices are spread evenly. On samples, only
+      `"least_squares"` is a pseudo-inverse.
     """
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
@@ -96,10 +96,11 @@ def encode(
 
     **Arguments:**
 
-    - `pointwise_map`: T, one vertex of Y per vertex of X, or a soft map from X to Y.
+    - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
     - `convention`: `"pullback"` gives `Phi_X^+ P Phi_Y` (k_X, k_Y). `"pushforward"` gives `Phi_Y^+ P^T Phi_X`
       (k_Y, k_X).
-    - `pseudo_inverse`: see `dual_eigenvectors`.
+    - `pseudo_inverse`: `"area"` or `"least_squares"`; see `dual_eigenvectors`.
     """
     spectrum_out, spectrum_in = out_and_in(convention, spectrum_x, spectrum_y)
     dual_out = dual_eigenvectors(spectrum_out, pseudo_inverse)
@@ -114,7 +115,7 @@ def _encode(
 ) -> Float[Array, "k_out k_in"]:
     """Returns `encode` for given dual eigenvectors: a sum over the vertices of X in both conventions.
 
-    Padded vertices of X contribute nothing because their rows on the side of X are zero.
+    Padded vertices of X contribute nothing, because their rows in the array of X are zero.
     """
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
@@ -124,7 +125,11 @@ def _encode(
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the kernel K for which `sum_l g_l(Lambda_out) C g_l(Lambda_in)` is `C * K`, elementwise."""
+    """Returns the kernel K (k_out, k_in) of a bank, for which filtering is an elementwise product.
+
+    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals `C * K` for every C (k_out, k_in). The arguments are the
+    responses (filters, k) of the bank at the eigenvalues of the shapes that C maps to and maps from.
+    """
     return product(responses_out.T, responses_in)
 
 
@@ -136,8 +141,8 @@ class QuadraticEnergy(eqx.Module):
 
     **Attributes:**
 
-    - `gram`: `sum a a^T`, positive semi-definite.
-    - `cross`: `sum b a^T`.
+    - `gram`: `sum a a^T` (k_in, k_in), positive semi-definite.
+    - `cross`: `sum b a^T` (k_out, k_in).
     - `constant`: `sum ||b||²`, the energy of C = 0.
     """
 
@@ -153,7 +158,7 @@ class QuadraticEnergy(eqx.Module):
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
         """Returns the energy of a functional map.
 
-        The energy is a difference of large sums, so that rounding can make it slightly negative.
+        The energy is a difference of large sums, so rounding can make the result slightly negative.
         """
         return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
 
@@ -166,14 +171,14 @@ class QuadraticEnergy(eqx.Module):
         return QuadraticEnergy(weight * self.gram, weight * self.cross, weight * self.constant)
 
     def minimizer(self) -> Float[Array, "k_out k_in"]:
-        """Returns the functional map of least energy, by one Cholesky factorisation of the gram matrix.
+        """Returns the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
         The result is NaN or meaningless if the gram matrix is singular; see `is_regular`.
         """
         return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
 
     def cholesky(self) -> Float[Array, "k_in k_in"]:
-        """Returns the lower Cholesky factor of the gram matrix."""
+        """Returns the lower Cholesky factor of the gram matrix, (k_in, k_in)."""
         return jnp.linalg.cholesky(self.gram, symmetrize_input=False)
 
     def is_regular(self) -> Bool[Array, ""]:
@@ -183,12 +188,18 @@ class QuadraticEnergy(eqx.Module):
         return jnp.min(pivots) > self.rounding()
 
     def rounding(self) -> Float[Array, ""]:
-        """Returns the rounding error of the gram matrix: its largest entry times k times the precision."""
+        """Returns the rounding error of the gram matrix.
+
+        The error is the largest diagonal entry times k_in times the precision of the float type.
+        """
         relative = self.gram.shape[0] * jnp.finfo(self.gram.dtype).eps
         return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
 
     def condition_number(self) -> Float[Array, ""]:
-        """Returns the largest over the smallest eigenvalue of the gram matrix, infinite if it is singular."""
+        """Returns the ratio of the largest to the smallest eigenvalue of the gram matrix.
+
+        The ratio is infinite if the matrix is singular.
+        """
         eigenvalues = jnp.linalg.eigvalsh(self.gram)
         return eigenvalues[-1] / jnp.maximum(eigenvalues[0], 0)
 
@@ -196,15 +207,16 @@ class QuadraticEnergy(eqx.Module):
 class WaveletProblem(eqx.Module):
     """Two shapes, the responses of a filter bank on both, and the convention of C.
 
-    Solutions need not know the convention. They use the methods of this class, which return quantities of the
-    shapes in the order of C: the shape that C maps to ("out"), then the shape that C maps from ("in").
+    Solutions do not depend on the convention. They use the methods of this class, which return quantities of
+    the shapes in the order of C: the shape that C maps to ("out"), then the shape that C maps from ("in").
 
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: source X and target Y.
-    - `responses_x`, `responses_y`: the responses at their eigenvalues, (filters, k_x) and (filters, k_y).
+    - `responses_x`, `responses_y`: the responses of the bank at the eigenvalues of X (filters, k_x) and of Y
+      (filters, k_y).
     - `convention`: `"pullback"` or `"pushforward"`.
-    - `sampled`: whether the spectra hold samples only, at which eigenvectors are not orthonormal.
+    - `sampled`: whether the spectra contain samples only, on which eigenvectors are not orthonormal.
     """
 
     spectrum_x: Spectrum
@@ -231,12 +243,12 @@ class WaveletProblem(eqx.Module):
     def encode(
         self, pointwise_map: PointwiseMap, dual_out: Float[Array, "n_out k_out"]
     ) -> Float[Array, "k_out k_in"]:
-        """Returns the unfiltered functional map C_0 of a pointwise map; see `encode`.
+        """Returns the unfiltered functional map C_0 (k_out, k_in) of a pointwise map; see `encode`.
 
         **Arguments:**
 
-        - `pointwise_map`: T, one vertex of Y per vertex of X, or a soft map from X to Y.
-        - `dual_out`: the `dual_eigenvectors` of the shape that C maps to.
+        - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
         """
         _, spectrum_in = self.spectra
         return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
@@ -244,15 +256,17 @@ class WaveletProblem(eqx.Module):
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
         """Returns the energy of eq. (5): how badly functional maps preserve wavelets at all scales under T.
 
-        The top of this module states the formula, which holds for every filter bank. Call the result with a
-        functional map to get the energy of the map. `minimizer()` is the exact solution for frames that are
-        not tight. The map C = 0 preserves nothing and has the energy `constant`. In the pullback convention
-        with the area norm, that is `sum_i G_X(lambda_i)`, which is k_X for a Parseval frame.
+        The docstring of the module `jaxsmw.core.functional_map` states the formula, which holds for every
+        filter bank. Call the result with a functional map to get the energy of this map. `minimizer()` of the
+        result is the exact solution, also for frames that are not tight. The map C = 0 preserves nothing and
+        has the energy `constant`. In the pullback convention with the area norm, this constant is `sum_i
+        G_X(lambda_i)`, which is k_X for a Parseval frame.
 
         **Arguments:**
 
-        - `pointwise_map`: T, one vertex of Y per vertex of X, or a soft map from X to Y.
-        - `norm`: `"area"` for the norm of the surface, `"frobenius"` for eq. (5) as printed.
+        - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `norm`: `"area"` to weight vertices by area, `"frobenius"` for equal weights, as in eq. (5) of the
+          paper.
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses
@@ -265,7 +279,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns w_x, a_x and b_x of the vertices of X: one line of the table at the top of this module."""
+        """Returns w_x, a_x and b_x of the vertices of X: one row of the table at the top of this module."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

@@ -1,4 +1,4 @@
-"""The loop between functional and pointwise maps, into which every refiner plugs its half-steps."""
+"""The refinement loop, which alternates between functional maps and pointwise maps for any refiner."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class History(eqx.Module):
-    """A record of each iteration; NaN for iterations that an early stop skipped.
+    """A record of each iteration. Numbers are NaN for iterations that an early stop skipped.
 
     **Attributes:**
 
-    - `changed`: (iterations,), the share of source vertices whose match changed. With samples it is the
-      share of samples, and NaN in the first and last iteration, which have no earlier map to compare with.
+    - `changed`: (iterations,), the share of source vertices whose match changed. With samples, `changed` is
+      the share of samples. It is then NaN in the first and last iteration, which have no earlier map to
+      compare with.
     - `energy`: (iterations,), `Refiner.energy` of the state and the pointwise map from which the state
       follows; for `WaveletPreservation` the energy of eq. (5).
     - `objective`: (iterations,), `Refiner.objective` of the state and the map recovered from the state.
     - `pointwise_maps`: (iterations, m), the map recovered in each iteration. Skipped iterations repeat the
-      last map; a failure fills all entries with -1. None with samples, where iterations do not map the other
-      vertices.
+      last map; a failure fills all entries with -1. None with samples, because the iterations then map only
+      the samples.
     """
 
     changed: Float[Array, " iterations"]
@@ -48,9 +49,9 @@ class Refinement(eqx.Module):
     **Attributes:**
 
     - `pointwise_map`: T: X -> Y (m,), one vertex of Y per vertex of X; all -1 after a failure.
-    - `functional_map`: the C from which the pointwise map was recovered.
+    - `functional_map`: the C (k_out, k_in) from which the pointwise map was recovered.
     - `state`: the refiner's last state.
-    - `result`: a member of `RESULTS`; compare with `RESULTS.successful`.
+    - `result`: a member of `RESULTS`; compare it with `RESULTS.successful`.
     - `iterations`: the number of iterations done, fewer than requested after an early stop.
     - `history`: a `History` if requested, else None.
     """
@@ -67,7 +68,12 @@ class Refinement(eqx.Module):
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
-        """The same outcome without the vertices that `Spectrum.pad` added to X."""
+        """Returns the same outcome without the vertices that `Spectrum.pad` added to X.
+
+        **Arguments:**
+
+        - `number_of_vertices`: the number of vertices of X before padding.
+        """
         history = self.history
         if history is not None and history.pointwise_maps is not None:
             maps = history.pointwise_maps[:, :number_of_vertices]
@@ -92,30 +98,31 @@ def refine(
 ) -> Refinement:
     """Refine a pointwise map T: X -> Y by alternating functional and pointwise maps (Algorithm 1).
 
-    The function is pure and jit-compiled, and compiles again only when sizes or static settings change. For
-    many pairs of equal size use `jax.vmap`, or `jax.lax.map` if memory is short.
+    The function is pure and jit-compiled. It is compiled again only when sizes or static settings change. For
+    many pairs of equal size use `jax.vmap`, or `jax.lax.map` if memory is scarce.
 
-    With samples, the first functional map comes from all vertices, iterations run on the samples, and the
-    last search is over all vertices. With `WaveletPreservation` this is the MWP authors' fast variant.
+    With samples, the first functional map is computed from all vertices, the iterations run on the samples,
+    and the last search is over all vertices. With `WaveletPreservation`, this is the MWP authors' fast
+    variant.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_map`: the initial T, one vertex of Y per vertex of X.
+    - `pointwise_map`: the initial map T (m,), one vertex of Y per vertex of X.
     - `refiner`: the method.
     - `iterations`: the number of functional maps, each followed by its pointwise map; an integer, at least 1.
-    - `samples`: vertices of X (s_x,) and of Y (s_y,) on which to iterate: evenly spread, and more of them
-      than eigenvectors.
-    - `partial`: one shape is a partial view of the other, in the same unit of length.
-    - `stop_when_unchanged`: skip the remaining iterations once no match changes. (Under `vmap` all pairs cost
-      as much as the slowest pair, but each pair still stops where it would stop alone.)
-    - `history`: record a `History`, which takes about a tenth more time.
+    - `samples`: vertices of X (s_x,) and of Y (s_y,) on which to iterate. They should be evenly spread and
+      outnumber the eigenvectors.
+    - `partial`: whether one shape is a part of the other. Both shapes must then have the same unit of length.
+    - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. (Under `vmap`
+      every pair takes as long as the slowest pair, but has the same result as alone.)
+    - `history`: whether to record a `History`, which takes about a tenth more time.
 
-    **Returns:** A `Refinement`. Numerical failures raise nothing: check its `result`.
+    **Returns:** A `Refinement`. Numerical failures raise no error: check the attribute `result`.
 
     **Raises:** `ValueError` for fewer than one iteration, an initial map that is not one vertex per vertex of
-    X, or spectra of two float types; `TypeError` if `iterations` or the entries of the initial map are not
-    integers, or another argument has the wrong type.
+    X, samples that are not a pair, or spectra of two float types; `TypeError` if `iterations` or the entries
+    of the initial map are not integers, or another argument has the wrong type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     pointwise_map = pointwise_map.astype(jnp.int32)
@@ -128,7 +135,8 @@ def refine(
     loop = _Loop(refiner, prepared, stop_when_unchanged, history, keeps_maps=history and samples is None)
     progress = loop.init(in_full, pointwise_map, first_map)
     if samples is None:
-        # The last search is an iteration like the others, because searches take longest to compile.
+        # The last search is an iteration of the same loop, because a search takes longer to compile than
+        # anything else.
         is_last = jnp.arange(iterations) == iterations - 1
         progress, records = lax.scan(loop.step, progress, is_last)
         refined = progress.pointwise_map
@@ -160,7 +168,7 @@ class _Progress(NamedTuple):
 
 
 class _Record(NamedTuple):
-    """The entries of one iteration in the `History`; stacked, those of all iterations."""
+    """The entries of the `History` for one iteration or, stacked, for all iterations."""
 
     changed: Float[Array, "*iterations"]
     energy: Float[Array, "*iterations"]
@@ -168,7 +176,7 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """The record with the last iteration of a loop on samples, which searches all vertices.
+        """Returns the record of a loop on samples, extended by the last iteration, a search of all vertices.
 
         The first map of the samples and the last map of all vertices have no earlier map to compare with.
         """
@@ -181,7 +189,7 @@ class _Record(NamedTuple):
         )
 
     def history(self, successful: Bool[Array, ""]) -> History:
-        """The `History`, with maps only if the refinement was successful."""
+        """Returns the `History`. All entries of its maps are -1 if the refinement was not successful."""
         maps = self.pointwise_map
         if maps is not None:
             maps = jnp.where(successful, maps, -1)
@@ -205,7 +213,11 @@ class _Loop:
     def init(
         self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """The first update, by the initial map of all vertices. `first_map` is its part on the samples."""
+        """Computes the first state, from the initial map of all vertices.
+
+        `first_map` is compared with the map of the first iteration. It is the initial map or, with samples,
+        an array of -1.
+        """
         state, result = self.refiner.update(in_full, pointwise_map, None)
         return _Progress(
             first_map,
@@ -218,7 +230,7 @@ class _Loop:
         )
 
     def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        """One iteration; nothing at all once the loop has terminated."""
+        """Runs one iteration, or nothing if the loop has terminated."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
         return lax.cond(
@@ -226,13 +238,13 @@ class _Loop:
         )
 
     def terminate(self, progress: _Progress) -> Bool[Array, ""]:
-        """Whether the last iteration is done."""
+        """Returns whether the last iteration is done."""
         return progress.finished
 
     def search(
         self, prepared: Prepared, state: State, before: Int32[Array, " s"]
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """The pointwise map of a state, the share of matches that changed, and the objective."""
+        """Returns the pointwise map of a state, the share of matches that changed, and the objective."""
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
         changed = jnp.sum((after != before) & mask) / jnp.sum(mask)
@@ -280,19 +292,23 @@ def _check_arguments(
     check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
-            raise ValueError("samples are a pair: the sampled vertices of X and those of Y")
+            raise ValueError("samples must be a pair: the sampled vertices of X and those of Y")
         check_kind("samples of X", samples[0], np.ndarray, jax.Array)
         check_kind("samples of Y", samples[1], np.ndarray, jax.Array)
     if pointwise_map.shape != spectrum_x.mask.shape:
         raise ValueError(
-            f"the initial map has shape {pointwise_map.shape}, but X has {spectrum_x.mask.shape[0]} vertices"
+            f"the initial map has shape {pointwise_map.shape}, but X has {len(spectrum_x.mask)} vertices: "
+            "give one vertex of Y for each vertex of X"
         )
     if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
         raise TypeError(f"the initial map has type {pointwise_map.dtype}; it must be integer vertex indices")
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """**Raises:** `TypeError` if an argument is not a `Spectrum`, `ValueError` if the float types differ."""
+    """Checks that two spectra can be refined together.
+
+    **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the float types differ.
+    """
     check_kind("spectrum of X", spectrum_x, Spectrum)
     check_kind("spectrum of Y", spectrum_y, Spectrum)
     dtype_x, dtype_y = spectrum_x.eigenvectors.dtype, spectrum_y.eigenvectors.dtype
@@ -304,7 +320,10 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """How an update ended: a failure that the update reports takes precedence over NaN and zero maps."""
+    """Returns how an update ended: a failure that the update reports, or else a fault of its state.
+
+    The faults of a state are NaN, infinity, and a functional map of zeros.
+    """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
     result = where(went_well & zero, RESULTS.undetermined_functional_map, result)
@@ -314,10 +333,10 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """How a refinement ended: a fault of the spectra or of the initial map, or else `result`.
+    """Returns how a refinement ended: a fault of the spectra or of the initial map, or else `result`.
 
-    `matches` are the vertices of Y in the initial map, one or several per vertex of X; None if the initial
-    map names no vertices.
+    `matches` are the vertices of Y in the initial map, one or several per vertex of X (m, ...). They are None
+    if the initial map contains no vertex indices.
     """
     if matches is not None:
         vertices_y = spectrum_y.mask.shape[0]

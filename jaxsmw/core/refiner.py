@@ -1,4 +1,4 @@
-"""What a method of refinement is: the interface between `jaxsmw.refine` and the methods that plug into it."""
+"""The interface of refiners, through which `jaxsmw.refine` runs any method of refinement."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 
 Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
-"""Vertices of X and of Y on which a refiner iterates instead of all vertices."""
+"""Vertices of X (s_x,) and of Y (s_y,) on which a refiner iterates instead of all vertices."""
 
 
 class Problem(eqx.Module):
@@ -25,7 +25,7 @@ class Problem(eqx.Module):
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
     - `samples`: the vertices on which the refiner iterates; None for all vertices.
-    - `partial`: whether one shape is a partial view of the other, in the same unit of length.
+    - `partial`: whether one shape is a part of the other. Both shapes must then have the same unit of length.
     """
 
     spectrum_x: Spectrum
@@ -34,19 +34,24 @@ class Problem(eqx.Module):
     partial: bool = eqx.field(static=True, default=False)
 
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
-        """The spectra of the vertices on which the refiner iterates: the samples, or all vertices."""
+        """Returns the spectra of X and of Y at the vertices on which the refiner iterates.
+
+        These vertices are the samples, or all vertices if there are no samples.
+        """
         if self.samples is None:
             return self.spectrum_x, self.spectrum_y
         return self.spectrum_x.sample(self.samples[0]), self.spectrum_y.sample(self.samples[1])
 
 
 class Prepared(eqx.Module):
-    """Everything that a refiner computes once per problem. Each refiner extends this class by its own fields.
+    """The values that a refiner computes once per problem.
+
+    Refiners extend this class with their own fields.
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: `Problem.query_spectra`. The pointwise map has one entry per vertex of
-      `spectrum_x`.
+    - `spectrum_x`, `spectrum_y`: the result of `Problem.query_spectra`. The pointwise map has one entry per
+      vertex of `spectrum_x`.
     """
 
     spectrum_x: Spectrum
@@ -54,18 +59,20 @@ class Prepared(eqx.Module):
 
 
 class State(eqx.Module):
-    """What a refiner passes from one iteration to the next. Refiners extend this class by their own fields.
+    """The values that a refiner passes from one iteration to the next.
+
+    Refiners extend this class with their own fields.
 
     **Attributes:**
 
-    - `functional_map`: C, in the refiner's convention.
+    - `functional_map`: C (k_out, k_in), in the refiner's convention.
     """
 
     functional_map: Float[Array, "k_out k_in"]
 
     @property
     def uncertainty(self) -> Float[Array, ""] | None:
-        """How uncertain the refiner is of its matches, lower is better; None if the refiner does not say."""
+        """The uncertainty of the matches, a number; lower is better. None if the refiner has no estimate."""
         return None
 
 
@@ -74,9 +81,10 @@ StateT = TypeVar("StateT", bound=State)
 
 
 class Refiner(eqx.Module, Generic[PreparedT, StateT]):
-    """A method of refinement: its two half-steps between pointwise map and state.
+    """A method of refinement: the two half-steps between pointwise map and state.
 
-    `jaxsmw.refine` calls `prepare` once, then `update` and `recover` in each iteration.
+    `jaxsmw.refine` calls `prepare` once (with samples, a second time for the samples). Then it calls `update`
+    and `recover` in each iteration.
     """
 
     @abc.abstractmethod
@@ -87,46 +95,74 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def update(
         self, prepared: PreparedT, pointwise_map: Int[Array, " m"], previous: StateT | None
     ) -> tuple[StateT, RESULTS]:
-        """The state that follows from a pointwise map, and how its computation ended.
+        """Returns the state that follows from a pointwise map, and a member of `RESULTS`.
 
-        `previous` is the state from which the pointwise map was recovered; None in the first iteration.
+        **Arguments:**
+
+        - `prepared`: the result of `prepare`.
+        - `pointwise_map`: T: X -> Y, one entry per vertex of `prepared.spectrum_x`.
+        - `previous`: the state from which the pointwise map was recovered; None in the first iteration.
         """
 
     @abc.abstractmethod
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
-        """The pointwise map X -> Y that follows from a state."""
+        """Returns the pointwise map X -> Y that follows from a state.
+
+        The map has one entry per vertex of `prepared.spectrum_x`. `update` must accept this map with the same
+        `prepared`.
+        """
 
     @abc.abstractmethod
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
-        """The reverse map Y -> X that follows from a state: the vertex of X nearest to each vertex of Y.
+        """Returns the reverse map Y -> X that follows from a state, (n,).
 
-        Both are compared in `embeddings`. `prepared` must be of a problem without samples.
+        The map assigns to each vertex of Y the nearest vertex of X. The search compares the `embeddings` of X
+        and Y. `prepared` must belong to a problem without samples.
         """
 
     @abc.abstractmethod
     def energy(self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """The quantity that the method minimises, for the history."""
+        """Returns the quantity that the method minimises, a number for `History.energy`.
+
+        **Arguments:**
+
+        - `prepared`: the result of `prepare`.
+        - `state`: the state that follows from the pointwise map.
+        - `pointwise_map`: T: X -> Y, one entry per vertex of `prepared.spectrum_x`.
+        """
 
     def embeddings(
         self, prepared: PreparedT, state: StateT
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Two point sets in which a vertex of X lies close to its match on Y.
+        """Returns two point sets in which each vertex of X is close to its match on Y.
 
-        One row per vertex of X to be matched, and one row per vertex of Y, in the units of the method.
         `jaxsmw.Correspondence.surface_points` finds points between the vertices of Y in this space.
+
+        **Returns:** One row per vertex of X to be matched (m, d), and one row per vertex of Y (n, d), in the
+        units of the method.
         """
         return spectral_embeddings(state.functional_map, prepared.spectrum_x, prepared.spectrum_y)
 
     def objective(
         self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """The area-weighted mean squared distance between matched embeddings, for the history."""
+        """Returns the area-weighted mean squared distance between matched embeddings, for the history.
+
+        **Arguments:**
+
+        - `prepared`: the result of `prepare`.
+        - `state`: the state that defines the `embeddings`.
+        - `pointwise_map`: T: X -> Y, the map that `recover` returns for this state.
+        """
         queries, database = self.embeddings(prepared, state)
         areas = prepared.spectrum_x.vertex_areas
         return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Whether an unchanged pointwise map stays unchanged: False while the refiner's settings vary."""
+        """Returns whether a map that one iteration leaves unchanged also stays unchanged in later iterations.
+
+        The result is False while the refiner changes its settings between iterations.
+        """
         return jnp.asarray(True)
 
     @property
@@ -136,5 +172,5 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @property
     def convention(self) -> Convention:
-        """The direction of the functional map."""
+        """The direction of the functional map: `"pullback"` or `"pushforward"`."""
         return "pullback"

@@ -1,4 +1,4 @@
-"""The outcome of a computation: a value for jit and vmap, with a sentence for each failure."""
+"""The outcomes of computations, as values that work under jit and vmap, with a sentence for each outcome."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class RESULTS(eqx.Enumeration):
 def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
     """Returns one of two results, depending on a condition.
 
-    `str` is in the types because type checkers take the members of an Enumeration for strings.
+    The annotations include `str` because type checkers treat the members of an Enumeration as strings.
     """
     return RESULTS.where(condition, if_true, if_false)  # type: ignore[arg-type]
 

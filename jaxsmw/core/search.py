@@ -1,4 +1,4 @@
-"""Exact nearest neighbours: by comparison with all points, or by patches, most of which can be skipped."""
+"""Exact nearest-neighbour search, exhaustive or by patches. Most patches can be skipped."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 from jaxsmw.core.products import product
 
 # The number of queries per block, and the number of database rows per chunk, measured on two CPU cores with
-# scripts/benchmark_speed.py. The scores of a block have to fit into the cache. A maximum over a chunk is
-# vectorised, an argmax is not.
+# scripts/benchmark_speed.py. The scores of a block must fit into the cache. A maximum over a chunk is
+# vectorised, but an argmax is not.
 BLOCK = 128
 _CHUNK = 64
-# Maxima over chunks are computed in runs of this length, maxima over boxes in this number of parts.
+# Maxima over chunks are computed in runs of the first length, and maxima over boxes in the second number of
+# parts.
 _RUN, _PARTS = 8, 16
-# Patches are compact in this number of coordinates, and their directions settle in this number of iterations.
+# The number of coordinates in which patches are compact, and the number of power iterations after which the
+# `variations` of patches have nearly converged.
 _COORDINATES, _POWER_ITERATIONS = 6, 4
-# The number of patches per step of the search. One matrix product compares a block with this many patches.
+# The number of patches that one step of the search compares with a block, by one matrix product.
 _GROUP = 4
 
 
@@ -37,16 +39,20 @@ def nearest_neighbor(
 ) -> Int32[Array, " m"]:
     """Returns the index of the database row that is nearest to each query, exactly, in Euclidean distance.
 
-    Ties go to the lowest index. The queries are searched in blocks, so that no array of size m x n is stored.
-    Within a block, two levels keep the work close to that of the matrix product alone: the best score of
-    every chunk of database rows, then the best rows of the two best chunks. The true distances decide between
-    these two rows. (The scores `q·b - |b|²/2` lose digits if `|b|` is large compared to the distance. In
-    float32 the second candidate makes the result agree with an exact search.)
+    Ties go to the lowest index. The queries are processed in blocks, so no array of size m x n is stored.
+    Within a block, the search first finds the best score in every chunk of database rows. Then it finds the
+    best row in each of the two best chunks. The true distances decide between these two rows. The search
+    takes little longer than the matrix product that computes the scores. (The scores `q·b - |b|²/2` lose
+    digits if `|b|` is large compared to the distance. In float32 the second candidate makes the result agree
+    with an exact search.)
 
     **Arguments:**
 
-    - `queries`, `database`: points in d dimensions.
-    - `database_mask`: False for rows that are never chosen. If all are False, the result is meaningless.
+    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
+    - `database_mask`: False for rows that are never chosen (n,). If all entries are False, the result is
+      meaningless.
+
+    **Returns:** One index from 0 to n - 1 per query, (m,).
     """
     n = database.shape[0]
     chunks = -(-n // _CHUNK)
@@ -58,7 +64,7 @@ def nearest_neighbor(
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         products = product(rows, block.T)
-        # With the queries last, a maximum over chunks is computed for neighbouring queries at once.
+        # With the queries last, maxima over chunks are computed for several neighbouring queries at once.
         scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, BLOCK)
         chunk_scores = _maximum(scores, 1, _CHUNK // _RUN)
         best_chunks = _two_best(chunk_scores)
@@ -75,9 +81,10 @@ def in_blocks(
     queries: Float[Array, "m d"],
     size: int,
 ) -> Shaped[Array, "m ..."]:
-    """Returns the results of a search for all queries. The search gets blocks of `size` queries.
+    """Returns the results of `search` for all queries, one row per query (m, ...).
 
-    The last block is padded with zeros.
+    The function `search` gets blocks (size, d) of queries, one after another. The last block is padded with
+    zeros.
     """
     m, d = queries.shape
     blocks = -(-m // size)
@@ -87,9 +94,9 @@ def in_blocks(
 
 
 def _maximum(values: Array, axis: int, parts: int) -> Array:
-    """Returns the maximum along an axis. The axis is first folded into parts, which saves a tenth on CPUs.
+    """Returns the maximum along an axis.
 
-    The parts may overlap.
+    The axis is first folded into parts, which may overlap. Folding saves a tenth of the time on CPUs.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -112,7 +119,7 @@ def _nearest(
     masked: Bool[Array, "c block"],
     n: int,
 ) -> Int[Array, " block"]:
-    """Returns the row of the candidate nearest to each query, the lowest row of equals, n if all are NaN."""
+    """Returns the row of the candidate nearest to each query: the lowest row in a tie, n if all are NaN."""
     distances = jnp.sum((queries[None, :, :] - candidates) ** 2, axis=2)
     distances = jnp.where(masked, jnp.inf, distances)
     nearest = jnp.min(distances, axis=0, keepdims=True)
@@ -120,14 +127,14 @@ def _nearest(
 
 
 class Patches(eqx.Module):
-    """Groups of equal size of points that lie close together.
+    """Groups of nearby points. All groups have the same size.
 
-    On a surface, a patch of neighbouring vertices varies along few directions in its spectral embedding,
-    because the eigenfunctions are smooth and the patch is small compared to their wavelengths.
+    In the spectral embedding of a surface, a patch of neighbouring vertices varies along few directions. The
+    reason is that eigenfunctions are smooth, and that the patch is small compared to their wavelengths.
 
     **Attributes:**
 
-    - `rows`: (p, s), the indices of the points of each patch, ascending; padding where masked.
+    - `rows`: (p, s), the indices of the points of each patch, ascending, with padding at the end.
     - `mask`: (p, s), False for padding and for masked points.
     - `variations`: (p, r, s), linear combinations of the points of a patch. They give the r directions in
       which the patch varies most.
@@ -139,17 +146,19 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Divides points into patches: halves all groups repeatedly, along the coordinate of largest variance.
+    """Divides points into patches by repeatedly halving all groups along the coordinate of largest variance.
 
-    Only the first coordinates of the points are considered.
+    Only the first 6 coordinates of the points are used.
 
     **Arguments:**
 
-    - `points`: the points. For surfaces these are the eigenvectors, whose first columns are coordinates along
-      the body.
-    - `mask`: False for points to be ignored.
-    - `size`: the wanted number of points per patch. Patches have 0.7 to 1.4 times as many.
-    - `rank`: the number r of `variations`. Patches of queries need none.
+    - `points`: the points (n, d). For surfaces these are the eigenvectors, whose first columns are
+      coordinates along the body.
+    - `mask`: False for points to be ignored (n,).
+    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times this number.
+    - `rank`: the number r of `variations`. Patches of queries need no variations, so their rank is 0.
+
+    **Returns:** The `Patches`, as many as a power of two.
     """
     n = points.shape[0]
     levels = max(0, round(math.log2(n / size)))
@@ -159,7 +168,7 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
         jnp.pad(points[:, :_COORDINATES], ((0, total - n), (0, 0))), jnp.pad(mask, (0, total - n)), levels
     )
     valid = jnp.pad(mask, (0, total - n))[rows]
-    # Ascending rows let the first of several equals be the lowest. Padding comes last.
+    # With ascending rows, the first of several equal candidates has the lowest index. Padding comes last.
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     if rank == 0:
@@ -170,7 +179,7 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
 def _halved(
     coordinates: Float[Array, "total c"], mask: Bool[Array, " total"], levels: int
 ) -> Int32[Array, " total"]:
-    """Returns the order of points in which each of 2^levels equal parts of the order is a patch."""
+    """Returns an order of the points. Each of its 2^levels equal parts is a patch."""
     total, dtype = coordinates.shape[0], coordinates.dtype
 
     def halve(level: Int[Array, ""], rows: Int32[Array, " total"]) -> Int32[Array, " total"]:
@@ -187,7 +196,7 @@ def _halved(
         _, _, ordered = lax.sort([group, jnp.where(valid, along, jnp.inf), rows], num_keys=2)
         return ordered
 
-    # The loop compiles one sort, whatever the number of levels.
+    # The loop compiles one sort for any number of levels.
     return lax.fori_loop(0, levels, halve, jnp.arange(total, dtype=jnp.int32))
 
 
@@ -199,7 +208,7 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
     def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The first coordinate of a surface is constant and does not distinguish points, so it comes last.
+    # The first eigenvector of a surface is constant and does not distinguish points, so it comes last.
     _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
     return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)
@@ -225,21 +234,23 @@ def nearest_neighbor_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> Int32[Array, " m"]:
-    """Returns the same rows as `nearest_neighbor`, faster if patches describe the points well.
+    """Returns the same rows as `nearest_neighbor`, in less time if patches describe the points well.
 
-    A patch of the database lies in a box: r axes through the centre of the patch, and the largest distance of
-    its points from the space that the axes span. The box gives a lower bound on the distance from a query to
-    all points of the patch, for the price of r + 1 products. The patch with the smallest bound gives a first
-    candidate. Then the search skips all patches that cannot hold a nearer point for any query of a patch of
-    queries. The bounds allow for rounding, so that the result is exact. If the points are spread evenly in
-    all dimensions, no patch is skipped, and `nearest_neighbor` is faster.
+    Each patch of the database has a bounding box: r axes through the centre of the patch, and the largest
+    distance of its points from the space that the axes span. The box gives a lower bound on the distance from
+    a query to all points of the patch, at the cost of r + 1 products. The patch with the smallest bound gives
+    a first candidate. Then the search skips all patches that cannot contain a nearer point for any query of a
+    patch of queries. The bounds allow for rounding, so the result is exact. If the points are spread evenly
+    in all dimensions, no patch is skipped, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
-    - `queries`, `database`: points in d dimensions.
-    - `query_patches`, `database_patches`: the `make_patches` of these points, or of points from which these
-      points follow by a linear map. Masked points of the database are never chosen. The results for masked
-      queries are meaningless.
+    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
+    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points from
+      which these points follow by a linear map. Masked points of the database are never chosen. The results
+      for masked queries are meaningless.
+
+    **Returns:** One index from 0 to n - 1 per query, (m,).
     """
     found, _ = search_in_patches(queries, database, query_patches, database_patches)
     return found
@@ -251,7 +262,10 @@ def search_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> tuple[Int32[Array, " m"], Int32[Array, " p"]]:
-    """Returns `nearest_neighbor_in_patches`, and the number of searched patches for each patch of queries."""
+    """Returns the result of `nearest_neighbor_in_patches` (m,), and the numbers of searched patches (p,).
+
+    There is one number of searched patches of the database for each patch of queries.
+    """
     queries, database = lax.stop_gradient((queries, database))  # indices have no derivatives
     boxes = _boxes(database, database_patches)
     tables = _bound_tables(boxes)
@@ -268,7 +282,7 @@ def search_in_patches(
         return _nearest(block, points, vertices[rows], masked, database.shape[0]), number
 
     found, numbers = lax.map(search, (query_patches.rows, query_patches.mask))
-    # Rows of padding and masked queries are out of range, so that the scatter drops them.
+    # Rows of padding and masked queries are set out of range, so the scatter drops them.
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
     kept = jnp.where(query_patches.mask, query_patches.rows, queries.shape[0])
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
@@ -280,7 +294,11 @@ def nearest_vertices(
     database_mask: Bool[Array, " n"],
     patches: tuple[Patches, Patches] | None,
 ) -> Int32[Array, " m"]:
-    """Returns the database row nearest to each query, by patches of both point sets if there are any."""
+    """Returns the database row nearest to each query, (m,).
+
+    The search uses `patches`, the `make_patches` of the queries and of the database. If they are None, the
+    search is exhaustive. `database_mask` (n,) is False for rows that an exhaustive search never chooses.
+    """
     if patches is None:
         return nearest_neighbor(queries, database, database_mask=database_mask)
     return nearest_neighbor_in_patches(queries, database, *patches)
@@ -289,8 +307,8 @@ def nearest_vertices(
 class _Boxes(NamedTuple):
     """The location of each patch: within `radius` of a box along orthonormal `axes` through its `center`.
 
-    `local` holds the coordinates of the points along the axes, `low` and `high` their range. `counts` is
-    False for patches without points.
+    `local` holds the coordinates of the points along the axes; `low` and `high` are the ranges of these
+    coordinates. `counts` is False for patches without points.
     """
 
     points: Float[Array, "p s d"]
@@ -339,7 +357,7 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
     center_norms = jnp.sum(boxes.center**2, axis=1)
     low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # A bound is made of sums of d products and about a dozen operations. Each of them rounds.
+    # A bound consists of sums of d products and about a dozen further operations. Each operation rounds.
     precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
     return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
 
@@ -347,7 +365,7 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
 def _bounds(
     tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Returns how far each query of a block is from each patch.
+    """Returns the distances from each query of a block to each patch.
 
     **Returns:** The squared distances to the boxes without their radius, lower bounds on the distances to the
     points, and the coordinates of the queries along each axis.
@@ -377,7 +395,7 @@ def _distance_to_promising_patch(
     The point is nearest in the coordinates along the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
-    # The smallest value and then its position take a third of the time of argmin.
+    # Finding the smallest value and then its position takes a third of the time of argmin.
     smallest = -_maximum(-squared, 0, _PARTS)
     is_smallest = squared == smallest[None, :]
     promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)

@@ -1,7 +1,8 @@
-"""Soft maps: a point corresponds to several points with shares of its area, which can be differentiated.
+"""Soft maps: each point corresponds to several points, with differentiable shares of its area.
 
-A `Recovery` makes a soft map from two point sets. `Softmax` uses the distances alone, `NearestFew` only the
-nearest points, and `Sinkhorn` makes every point give and receive its share.
+A `Recovery` computes a soft map from two point sets. `Softmax` uses the distances alone. `NearestFew` uses
+the distances to the nearest points only. With `Sinkhorn`, every point also receives the share that its area
+implies.
 """
 
 from __future__ import annotations
@@ -25,24 +26,24 @@ _BLOCK = 128
 
 
 class SoftMap(eqx.Module):
-    """A transport plan between two point sets: how much of each query's area goes to each database row.
+    """A transport plan between two point sets: the part of each query's area that goes to each database row.
 
-    The plan is `P_ij = a_i w_ij / sum_j w_ij` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. It is
-    never stored as a whole. Its rows sum to the areas of the queries exactly. Its columns sum to the areas of
-    the database rows up to the `residual`.
+    The plan is `P_ij = a_i w_ij / sum_j w_ij` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. The
+    matrix P is never stored as a whole. Its rows sum to the areas of the queries exactly. Its columns sum to
+    the areas of the database rows up to the `residual`.
 
     **Attributes:**
 
     - `queries`, `database`: the points q (m, d) and y (n, d), up to a common shift.
-    - `query_areas`, `database_areas`: a (m,) and b (n,), each of sum 1, zero for points that do not count. A
-      query of zero area still gets the shares that its position implies.
+    - `query_areas`, `database_areas`: a (m,) and b (n,), each with sum 1, zero for ignored points. A query of
+      zero area still gets the shares that its position implies.
     - `potentials`: g (n,), without unit. A high potential raises the share of a row. Zero for rows of zero
       area.
     - `temperature`: the temperature, in squared units of the points.
-    - `residual`: the share of the total area, from 0 to 1, that arrives at rows with too much area already.
-      NaN if the residual was not computed (`Softmax`).
-    - `converged`: whether the residual is at most the tolerance. False if it is NaN.
-    - `iterations`: the number of iterations.
+    - `residual`: the share of the total area, from 0 to 1, that rows receive in excess of their own area. NaN
+      if the residual was not computed (`Softmax`).
+    - `converged`: whether the residual is at most the tolerance. False if the residual is NaN.
+    - `iterations`: the number of iterations of `sinkhorn` that were done.
     """
 
     queries: Float[Array, "m d"]
@@ -57,7 +58,16 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y over each query's shares, for example of colours."""
+        """Returns the mean of functions on Y, such as colours, over the shares of each query.
+
+        **Arguments:**
+
+        - `functions_on_y`: the values of p functions at the database rows (n, p), in any unit.
+
+        **Returns:** The values of the p functions at the queries (m, p), in the same unit.
+
+        **Raises:** `ValueError` if the values are not of shape (n, p).
+        """
         functions = jnp.asarray(functions_on_y, self.database.dtype)
         if functions.ndim != 2 or functions.shape[0] != self.database.shape[0]:
             raise ValueError(
@@ -73,7 +83,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the most probable database row of each query: the row with the largest share per area.
+        """Returns the most probable database row of each query (m,): the row with the largest share per area.
 
         (The largest share itself would favour the larger of two neighbouring vertices.)
         """
@@ -91,24 +101,33 @@ class SparseSoftMap(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (m, t), the database rows of each query, nearest first.
-    - `shares`: (m, t), the shares of these rows; each line sums to 1.
+    - `rows`: (m, t), the t database rows of each query, nearest first.
+    - `shares`: (m, t), the shares of these database rows. The shares of each query sum to 1.
     """
 
     rows: Int32[Array, "m t"]
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y over each query's shares."""
+        """Returns the mean of functions on Y, such as colours, over the shares of each query.
+
+        **Arguments:**
+
+        - `functions_on_y`: the values of p functions at the database rows (n, p), in any unit.
+
+        **Returns:** The values of the p functions at the queries (m, p), in the same unit.
+
+        **Raises:** `ValueError` if the values do not have two dimensions.
+        """
         functions = jnp.asarray(functions_on_y, self.shares.dtype)
         if functions.ndim != 2:
             raise ValueError(f"functions on Y have shape {functions.shape}, where (n, p) is needed")
-        # The rows are processed one after another: all at once would need t times the memory.
+        # The rows are processed one by one, because all rows at once would need t times the memory.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the nearest database row of each query."""
+        """Returns the nearest database row of each query, (m,)."""
         return self.rows[:, 0]
 
 
@@ -117,7 +136,7 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Returns functions on Y as functions on X, `P f`, without storing P (m x n)."""
+    """Returns functions on Y (n, p) as functions on X (m, p), `P f`, without storing the matrix P (m, n)."""
     if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):
         return pointwise_map.pull_back(functions_on_y)
     return functions_on_y[pointwise_map]
@@ -134,7 +153,13 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """Returns the soft map from the queries to the database. Rows of zero area get no share."""
+        """Returns the soft map from the queries to the database. Rows of zero area get no share.
+
+        **Arguments:**
+
+        - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
+        - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit.
+        """
 
 
 class Softmax(Recovery):
@@ -142,7 +167,9 @@ class Softmax(Recovery):
 
     **Arguments:**
 
-    - `temperature`: a positive number, in the units of `sinkhorn`.
+    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
+
+    **Raises:** `ValueError` if the temperature is not one positive, finite number.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -165,14 +192,17 @@ class Softmax(Recovery):
 
 
 class NearestFew(Recovery):
-    """`Softmax` among the nearest rows of each query only. The choice of these rows is not differentiated.
+    """`Softmax` restricted to the nearest rows of each query. The choice of these rows is not differentiated.
 
-    `NearestFew` is fast in float32. In float64 sorting takes most of the time on CPUs.
+    `NearestFew` is fast in float32. In float64, sorting takes most of the time on CPUs.
 
     **Arguments:**
 
-    - `number`: the number of rows per query. If fewer rows have positive area, the other shares are zero.
-    - `temperature`: a positive number, in the units of `sinkhorn`.
+    - `number`: the number of rows per query, at least 1. If fewer rows have positive area, the other shares
+      are zero.
+    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
+
+    **Raises:** `ValueError` if the number is below 1, or the temperature is not one positive, finite number.
     """
 
     number: int = eqx.field(static=True, default=10)
@@ -201,7 +231,7 @@ class NearestFew(Recovery):
             return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
 
         rows = in_blocks(nearest, settled_queries, _BLOCK)
-        # The rows are processed one after another: all differences at once would need t times the memory.
+        # The rows are processed one by one, because all differences at once would need t times the memory.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
         exponents = -jnp.stack(squares, axis=1) / temperature
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
@@ -212,8 +242,10 @@ class Sinkhorn(Recovery):
 
     **Arguments:**
 
-    - `temperature`: a positive number, in the units of `sinkhorn`.
+    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
     - `iterations`, `tolerance`: see `sinkhorn`.
+
+    **Raises:** `ValueError` for fewer than 1 iteration, or a temperature or tolerance that is not positive.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -259,30 +291,31 @@ def sinkhorn(
 ) -> SoftMap:
     """Returns the entropy-regularised optimal transport between two point sets, by Sinkhorn's iterations.
 
-    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. Among all plans
-    that spread the areas of the queries over the areas of the database, this plan minimises the mean squared
-    distance minus `temperature` times the entropy. Nearest neighbours crowd on some rows and leave out
-    others; here every row gets its share.
+    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. A plan spreads
+    the areas of the queries over the areas of the database. The returned plan minimises the mean squared
+    distance minus `temperature` times the entropy. Nearest-neighbour maps crowd onto some rows and leave out
+    other rows, but this plan gives every row its share.
 
-    The iterations update the logarithms of Sinkhorn's factors. Each iteration computes the distances again,
-    in blocks of queries, so that no array of size m x n is stored. This also holds for derivatives, which go
-    through all iterations.
+    The iterations update the logarithms of Sinkhorn's factors. Each iteration recomputes the distances in
+    blocks of queries, so no array of size m x n is stored. Derivatives go through all iterations and need no
+    such array either.
 
     **Arguments:**
 
-    - `queries`, `database`: points in d dimensions.
-    - `query_areas`, `database_areas`: areas in any unit. Both sides are scaled to sum 1. Points of zero area
-      neither give nor receive, and do not affect other points.
+    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
+    - `query_areas`, `database_areas`: areas (m,) and (n,), in any unit. Both sides are scaled to sum 1.
+      Points of zero area neither give nor receive area, and do not affect other points.
     - `temperature`: a positive number. Its unit is the area-weighted mean squared distance from queries to
-      their nearest database rows, but at least `sqrt(eps)` times the area-weighted variance of the queries,
-      where eps is the precision of the float type. Lower temperatures give sharper maps and need more
-      iterations. Temperatures below the rounding errors of squared distances, eps times the variance, act
-      like that value and have derivative zero.
+      their nearest database rows. The unit is at least `sqrt(eps)` times the area-weighted variance of the
+      queries, where eps is the precision of the float type. Lower temperatures give sharper maps and need
+      more iterations. Temperatures below the rounding error of squared distances, eps times the variance, are
+      raised to this value and have derivative zero.
     - `iterations`: the largest number of iterations. Iterations after convergence are skipped; under `vmap`
       they run but change nothing.
-    - `tolerance`: the tolerance of `SoftMap.residual`.
+    - `tolerance`: the tolerance of `SoftMap.residual`, a share of the total area.
 
-    **Returns:** A `SoftMap`. Bad numbers and missing convergence raise no error: check `converged`.
+    **Returns:** A `SoftMap`. Numbers that are not finite and missing convergence raise no error: check its
+    attribute `converged`.
 
     **Raises:** `ValueError` for fewer than one iteration.
     """
@@ -295,7 +328,7 @@ def sinkhorn(
 
 
 class _SinkhornState(NamedTuple):
-    """Potentials, the next potentials, the residual of the former, and the number of iterations."""
+    """Potentials, their residual, the potentials of the next iteration, and the number of iterations."""
 
     potentials: Float[Array, " n"]
     following: Float[Array, " n"]
@@ -325,15 +358,15 @@ def _sinkhorn_potentials(
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
         # The arriving area can underflow to zero. Then the potential rises over several iterations.
         least = jnp.finfo(dtype).tiny
-        wanting = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
-        return potentials + wanting, jnp.sum(jnp.abs(arrived - b)) / 2
+        correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
+        return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2
 
     def step(state: _SinkhornState, _: None) -> tuple[_SinkhornState, None]:
-        def go_on() -> _SinkhornState:
+        def iterate() -> _SinkhornState:
             following, residual = jax.checkpoint(update)(state.following)
             return _SinkhornState(state.following, following, residual, state.iterations + 1)
 
-        return lax.cond(state.residual <= tolerance, lambda: state, go_on), None
+        return lax.cond(state.residual <= tolerance, lambda: state, iterate), None
 
     zeros = jnp.zeros_like(b)
     initial = _SinkhornState(zeros, zeros, jnp.asarray(jnp.inf, dtype), jnp.asarray(0, jnp.int32))
@@ -342,7 +375,7 @@ def _sinkhorn_potentials(
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns logarithms: -inf for zero, with derivative zero instead of infinity."""
+    """Returns the logarithms of areas: -inf for a zero area, with derivative zero instead of infinity."""
     return jnp.where(areas > 0, jnp.log(jnp.where(areas > 0, areas, 1)), -jnp.inf)
 
 
@@ -351,8 +384,8 @@ def _log_kernel(
 ) -> Float[Array, "n block"]:
     """Returns `-distance² / temperature` up to a constant per query.
 
-    The queries come last. Then sums over the database are computed for neighbouring queries at once, which
-    halves the time.
+    The queries are on the last axis. So sums over the database are computed for several neighbouring queries
+    at once, which halves the time.
     """
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
@@ -391,10 +424,10 @@ def _normalized(
 ) -> _Transport:
     """Returns the `_Transport` between two point sets, from a temperature in the units of `sinkhorn`.
 
-    Points far from the origin would lose distances to rounding; hence the shift to the centre. A temperature
-    that is not positive, as a training step can produce, becomes NaN, and so does the result. A temperature
-    below the rounding errors of squared distances is raised: exponents would consist of rounding errors, and
-    derivatives would overflow.
+    The points are shifted to their centre, because rounding would falsify distances between points far from
+    the origin. A temperature that is not positive, which a training step can produce, becomes NaN and makes
+    the result NaN. A temperature below the rounding error of squared distances is raised to this error.
+    Otherwise exponents would consist of rounding errors, and derivatives would overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
@@ -404,7 +437,7 @@ def _normalized(
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     eps = jnp.finfo(queries.dtype).eps
     unit = jnp.maximum(unit, eps**0.5 * spread)
-    unit = jnp.where(unit > 0, unit, 1)  # any unit will do if all points coincide
+    unit = jnp.where(unit > 0, unit, 1)  # any unit suffices if all points coincide
     relative = temperature.astype(queries.dtype)
     absolute = jnp.maximum(relative * unit, eps * spread)
     return _Transport(queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan))

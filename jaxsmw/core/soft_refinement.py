@@ -1,4 +1,4 @@
-"""Differentiable refinement, with soft maps between the updates of the functional map."""
+"""Differentiable refinement, with soft maps instead of pointwise maps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""One iteration: the functional map that follows from a functional map, and how its computation ended."""
+"""One iteration: from a functional map to the next functional map and a member of `RESULTS`."""
 
 
 class SoftRefinement(eqx.Module):
@@ -30,12 +30,12 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: C.
+    - `functional_map`: C, in the convention of the refiner (k_out, k_in).
     - `soft_map`: the soft map X -> Y that is recovered from C.
     - `result`: a member of `RESULTS`; compare it with `RESULTS.successful`.
     - `iterations`: the number of functional maps after the first.
-    - `change`: the change of C in the last iteration relative to its Frobenius norm. It is 0 at a fixed
-      point.
+    - `change`: the Frobenius norm of the change of C in the last iteration, relative to the Frobenius norm of
+      C. It is 0 at a fixed point.
     """
 
     functional_map: Float[Array, "k_out k_in"]
@@ -67,30 +67,30 @@ def refine_softly(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_map`: the initial map, a pointwise map or a soft map from X to Y.
-    - `refiner`: how functional maps follow from soft maps. Its `search` is not used.
-    - `recovery`: how soft maps follow from functional maps. Lower temperatures are closer to `jaxsmw.refine`,
-      but their derivatives are larger and less informative.
+    - `pointwise_map`: the initial map: a pointwise map (m,), or a soft map from X to Y.
+    - `refiner`: the computation of functional maps from soft maps. The `search` of the refiner is not used.
+    - `recovery`: the computation of soft maps from functional maps. Lower temperatures give results closer to
+      those of `jaxsmw.refine`, but larger and less informative derivatives.
     - `iterations`: the number of functional maps after the first, at least 1. With `"implicit"` this is the
-      largest number.
+      largest number of such maps.
     - `differentiation`: how derivatives are computed.
         - `"unrolled"`: automatic differentiation through all iterations.
-        - `"checkpointed"`: the same derivatives, with less memory: intermediate values within an iteration
-          are computed again.
+        - `"checkpointed"`: the same derivatives with less memory. Intermediate values within an iteration are
+          computed again.
         - `"implicit"`: iterations up to a fixed point C = F(C, θ), where `dC = (I - dF/dC)^-1 dF/dθ dθ` by
           the implicit function theorem. `optimistix.fixed_point` iterates, and GMRES solves the linear system
-          with derivatives of one iteration. The memory does not grow with the iterations. The initial map has
-          no derivative.
+          with derivatives of one iteration. The memory does not grow with the number of iterations. The
+          outcome has no derivative with respect to the initial map.
     - `tolerance`: with `"implicit"`, the tolerance of the fixed point, relative to the largest entry of C,
-      and of the linear solver.
+      and of the linear solver; positive.
 
-    **Returns:** A `SoftRefinement`. Bad numbers raise no error: check `result`. With `"implicit"` and too few
-    `iterations` it is `RESULTS.fixed_point_not_reached`.
+    **Returns:** A `SoftRefinement`. Numerical failures raise no error: check the attribute `result`. With
+    `"implicit"` and too few `iterations`, the result is `RESULTS.fixed_point_not_reached`.
 
     **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, an unknown
     `differentiation`, an initial map of the wrong size, or spectra of different float types; `TypeError` for
     an argument of the wrong type. With `"implicit"`, reverse-mode derivatives raise equinox's runtime error
-    after too few iterations, or if GMRES does not reach its tolerance. Forward-mode derivatives are NaN then.
+    after too few iterations, or if GMRES does not reach its tolerance. Forward-mode derivatives are then NaN.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
@@ -142,7 +142,9 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
     matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
     check_kind("initial map", matches, np.ndarray, jax.Array)
     if matches.shape[0] != m or matches.ndim != 1 + sparse:
-        raise ValueError(f"the initial map has shape {matches.shape}, but X has {m} vertices")
+        raise ValueError(
+            f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each vertex"
+        )
     return matches
 
 
@@ -150,14 +152,13 @@ class WaveletPreservationLayer(eqx.Module):
     """A layer for neural networks: from features of both shapes to a functional map and a soft map.
 
     The layer computes a soft map between the features and refines this map by `refine_softly`. Its parameters
-    are the leaves of its modules, as in any equinox module. Train all of them, or freeze some with
-    `equinox.partition`. The layer is a pure function of arrays, so that flax and haiku models can use it,
-    too.
+    are the leaves of its modules, as in any equinox module. Train all parameters, or freeze some of them with
+    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can use it as well.
 
     **Arguments:**
 
-    - `refiner`: how functional maps follow from soft maps.
-    - `recovery_of_features`: how the initial soft map follows from the features.
+    - `refiner`: the computation of functional maps from soft maps.
+    - `recovery_of_features`: the computation of the initial soft map from the features.
     - `recovery`, `iterations`, `differentiation`, `tolerance`: see `refine_softly`.
     """
 
@@ -179,8 +180,11 @@ class WaveletPreservationLayer(eqx.Module):
 
         **Arguments:**
 
-        - `features_x`, `features_y`: features of the vertices of X and Y. Corresponding vertices should be
-          close to each other in feature space.
+        - `features_x`, `features_y`: d features of each vertex of X (m, d) and of Y (n, d), in the same unit.
+          Corresponding vertices should be close to each other in feature space.
+        - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+
+        **Returns:** The `SoftRefinement` of `refine_softly`.
 
         **Raises:** `ValueError` if the features do not have one row per vertex, or differ in width between
         the shapes; see also `refine_softly`.
@@ -208,7 +212,7 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
 
 
 class _Loop(NamedTuple):
-    """The outcome of the iterations: the last functional map, how it still changes, and how they went."""
+    """The last functional map, its change in the last iteration, the result, and the number of iterations."""
 
     functional_map: Float[Array, "k_out k_in"]
     last_change: Float[Array, "k_out k_in"]
@@ -244,7 +248,7 @@ def _to_the_fixed_point(
 ) -> _Loop:
     """Iterates up to the fixed point, at which derivatives are implicit."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # The solver reports neither the result of an update nor the last change, hence one more iteration.
+    # The solver reports neither the result of an update nor the last change. One more iteration gives both.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
@@ -256,8 +260,8 @@ def _fixed_point(
     iterations: int,
     tolerance: float,
 ) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
-    """Returns the fixed point of an iteration, the number of iterations, and whether they converged."""
-    import lineax as lx  # imported here because the import takes as long as an eigenbasis
+    """Returns the fixed point of a step, the number of iterations, and whether the iterations converged."""
+    import lineax as lx  # imported here because the import takes as long as computing an eigenbasis
     import optimistix as optx
 
     # The unit is the largest entry, because the tolerance is relative to C as a whole. The solver works in
@@ -284,9 +288,9 @@ def _fixed_point(
 def _differentiable_if(
     converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map. Its derivative is NaN without convergence.
+    """Returns the functional map. Its derivative is NaN if the iterations have not converged.
 
-    The formula for the implicit derivative holds at fixed points only.
+    The formula for implicit derivatives holds only at fixed points.
     """
     return functional_map
 

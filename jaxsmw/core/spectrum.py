@@ -1,4 +1,4 @@
-"""The spectrum of a shape, which is all that the traced core knows about the shape."""
+"""The spectrum of a shape, the only form in which the traced core receives the shape."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ class Spectrum(eqx.Module):
 
     A `Spectrum` describes one shape. For `jax.vmap`, shapes of equal size are stacked: every leaf gets a
     leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero eigenvectors.
-    Unreferenced vertices (no face references them) are masked, too.
+    Unreferenced vertices (vertices that no face references) are also masked.
 
     **Attributes:**
 
     - `eigenvalues`: (k,), ascending, in units of 1 / length².
-    - `eigenvectors`: (n, k).
+    - `eigenvectors`: (n, k), in units of 1 / length.
     - `vertex_areas`: (n,), in units of length², zero for masked vertices.
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
     - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
-      or None. Only some refiners use them; their documentation says so.
+      or None. The documentation of a refiner says whether it uses descriptors.
     - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Only some
-      refiners use them.
-    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Only some refiners use them.
+      refiners use positions.
+    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Only some refiners use
+      normals.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -43,7 +44,7 @@ class Spectrum(eqx.Module):
     normals: Float[Array, "n 3"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
-        """Returns the shape with its first eigenpairs only."""
+        """Returns the shape with only the first `number_of_eigenvectors` eigenpairs."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues[:number_of_eigenvectors],
@@ -51,7 +52,12 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Returns the shape with all areas multiplied by a factor, and all lengths by its square root."""
+        """Returns the shape with all areas multiplied by a factor, and all lengths by its square root.
+
+        **Arguments:**
+
+        - `factor`: a positive number.
+        """
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues / factor,
@@ -61,7 +67,7 @@ class Spectrum(eqx.Module):
         )
 
     def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """Returns the shape with the given descriptors, or with none.
+        """Returns the shape with the given descriptors (n, d), or without descriptors if they are None.
 
         **Raises:** `ValueError` if the descriptors do not have one row per vertex.
         """
@@ -69,7 +75,9 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, descriptors=descriptors)
 
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """Returns the shape with the given vertex positions, in its unit of length, and unit normals.
+        """Returns the shape with the given vertex positions (n, 3) and unit normals (n, 3).
+
+        Positions are in the unit of length of the spectrum, which is the square root of its unit of area.
 
         **Raises:** `ValueError` if the arrays do not have one row of 3 numbers per vertex.
         """
@@ -80,12 +88,13 @@ class Spectrum(eqx.Module):
     def pad(self, number_of_vertices: int) -> Spectrum:
         """Returns the shape with masked vertices appended, up to a given number of vertices.
 
-        **Raises:** `ValueError` if the shape has more vertices already.
+        **Raises:** `ValueError` if the shape already has more vertices.
         """
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
             raise ValueError(
-                f"a shape of {self.mask.shape[0]} vertices does not fit into {number_of_vertices}"
+                f"a shape of {self.mask.shape[0]} vertices does not fit into {number_of_vertices} vertices: "
+                f"pad it to {self.mask.shape[0]} vertices or more"
             )
         if rows == 0:
             return self
@@ -94,10 +103,13 @@ class Spectrum(eqx.Module):
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """Returns the shape at some evenly spread vertices only. Each sample gets the same share of the area.
+        """Returns the shape with only some of its vertices, the samples. All samples get equal areas.
 
-        The eigenvectors of the samples are no longer orthonormal. Use the least-squares pseudo-inverse for
-        samples.
+        The eigenvectors are not orthonormal on samples. Use the least-squares pseudo-inverse for samples.
+
+        **Arguments:**
+
+        - `vertices`: the samples (s,), as indices of evenly spread vertices.
         """
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
         sampled = self._map_vertex_arrays(lambda field: field[vertices])

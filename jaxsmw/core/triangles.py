@@ -27,10 +27,10 @@ def nearest_point_on_triangles(
 
     **Arguments:**
 
-    - `queries`: points in d dimensions.
-    - `points`: the corners of the triangles.
-    - `faces`: three indices into `points` per triangle.
-    - `face_mask`: False for triangles to be ignored. If all are ignored, the result is meaningless.
+    - `queries`: points (m, d) in d dimensions, in any unit.
+    - `points`: the corners (n, d) of the triangles, in the same unit.
+    - `faces`: three indices into `points` per triangle (f, 3).
+    - `face_mask`: False for triangles to be ignored. If all triangles are ignored, the result is meaningless.
 
     **Returns:** The triangle of each nearest point (m,), and the barycentric weights (m, 3) of its corners.
     The weights are not negative and sum to 1.
@@ -40,7 +40,7 @@ def nearest_point_on_triangles(
     lengths = product(edges, jnp.swapaxes(edges, 1, 2))
     grams = (lengths[:, 0, 0], lengths[:, 0, 1], lengths[:, 1, 1])
     starts = jnp.einsum("fed,fd->ef", edges, corners[:, 0], precision="highest")
-    # |q - a|² = |q|² + |a|² - 2 q·a. The first term is the same for all triangles and left out.
+    # |q - a|² = |q|² + |a|² - 2 q·a. The first term is the same for all triangles and is left out.
     norms = jnp.sum(corners[:, 0] ** 2, axis=1)
     masked = jnp.zeros(len(faces), bool) if face_mask is None else ~face_mask
     columns = [value[:, None] for value in (*grams, *starts, norms)]
@@ -69,13 +69,15 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns the squared distances from points q to triangles, and s and t of the nearest `a + s u + t v`.
+    """Returns the squared distances from points q to triangles, and the nearest points as pairs of s and t.
+
+    The points of a triangle are `a + s u + t v`, with a corner a and the edges u and v from this corner.
 
     **Arguments:**
 
     - `squared`: `|q - a|²` up to an additive constant, which the returned distance keeps.
-    - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v` for the edges u and v from the corner a.
-    - `uu`, `uv`, `vv`: the products of these edges.
+    - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`.
+    - `uu`, `uv`, `vv`: the products `u·u`, `u·v` and `v·v`.
     """
 
     def at(s: Array, t: Array) -> Array:

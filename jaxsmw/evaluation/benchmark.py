@@ -1,6 +1,6 @@
-"""Measures several methods on the pairs of a data set, and keeps every result on the disk.
+"""Measures several methods on the pairs of a data set, and stores every result on disk.
 
-After an interruption the same call continues: finished shapes and pairs are not measured again.
+If a benchmark was interrupted, the same call continues it. Finished shapes and pairs are not measured again.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class Results(NamedTuple):
         raise InputError(
             "\n".join(
                 [
-                    "some shapes or pairs could not be measured; correct these faults and start again, all "
-                    "other results are kept:",
+                    "some shapes or pairs could not be measured; correct these faults and start again (all "
+                    "other results are kept):",
                     *lines,
                 ]
             )
@@ -69,12 +69,12 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Lists the first few names, and counts the others."""
+    """Returns the first few names, followed by the number of remaining names."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
 
-# The number of names in a message; the others have the same fault.
+# The largest number of names in a message. All listed shapes or pairs have the same fault.
 _NAMED_FAILURES = 3
 
 
@@ -86,21 +86,24 @@ def run_benchmark(
     settings: Settings,
     executor: Executor,
 ) -> Results:
-    """Measures every missing pair and method, stores each result as soon as it is known, and skips failures.
+    """Measures every method on every pair, except for results that `output` already contains.
+
+    Each result is stored as soon as it is available. A shape or pair that cannot be measured is skipped.
 
     **Arguments:**
 
     - `data_set`: the data set.
     - `pairs`: pairs of the data set.
-    - `output`: an existing directory; gets `results.csv`, `shapes.csv` and `provenance.json`.
+    - `output`: an existing directory, to which `results.csv`, `shapes.csv` and `provenance.json` are written.
     - `methods`: the methods by their names in tables, for example `METHODS`.
-    - `settings`: the settings, which must be those of any results in `output`.
+    - `settings`: the settings. They must equal the settings of any results that `output` already contains.
     - `executor`: runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
 
-    **Returns:** The results of these pairs and methods. Call `check` on them to learn about failures.
+    **Returns:** The results of these pairs and methods. Their method `check` raises an error if there were
+    failures.
 
-    **Raises:** `InputError` if `output` holds damaged results or results of another origin, if another
-    process is adding results, if a method is undefined on a pair, or if a file with a published map is
+    **Raises:** `InputError` if `output` contains damaged results or results of another origin, if another
+    process is adding results to it, if a method is undefined on a pair, or if a file with a published map is
     missing.
     """
     for method in methods.values():
@@ -119,15 +122,15 @@ def run_benchmark(
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
-    The times of precomputation depend on this number, so it is the same for most choices of methods. Methods
-    can then be added to existing results.
+    The number is the same for most choices of methods. The time of the precomputation depends on it, so
+    equal numbers let later runs add methods to existing results.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
     """Returns the contents of `provenance.json`."""
-    # Only the name of the directory with initial maps, because a moved copy has the same maps.
+    # Only the name of the directory with initial maps counts, because a moved copy contains the same maps.
     chosen = asdict(settings) | {"init": Path(settings.init).name}
     return {
         "settings": chosen | {"number_of_eigenvectors": number_of_eigenvectors},
@@ -138,8 +141,8 @@ def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[s
 class _Store:
     """The result files of some pairs of a data set.
 
-    **Raises:** `InputError` if the files are damaged, belong to another data set, or a shape has changed
-    since.
+    **Raises:** `InputError` if the files are damaged or belong to another data set, or if a mesh file has
+    changed since it was measured.
     """
 
     def __init__(self, output: Path, data_set: DataSet, pairs: Sequence[DataPair]):
@@ -152,7 +155,7 @@ class _Store:
         own = data_set.shapes
         if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:
             raise InputError(
-                f"{output}: holds results of another data set, with a shape {strangers[0]} that is not in "
+                f"{output}: contains results of another data set, with a shape {strangers[0]} that is not in "
                 f"{data_set.directory}: give another --output."
             )
         for name, file in self.files.items():
@@ -162,11 +165,11 @@ class _Store:
                 )
 
     def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Returns the shapes that are not measured yet, by name."""
+        """Returns the name and the mesh file of each shape that is not measured yet, by name."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns the pairs that some methods are not measured on yet, by name."""
+        """Returns a task for each pair on which a method is not measured yet, by name of the pair."""
         tasks = {}
         for pair in self.pairs:
             missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
@@ -176,7 +179,7 @@ class _Store:
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
         """Returns the results of all pairs on which all methods are measured."""
-        # Leaving out the other pairs compares all methods on the same pairs.
+        # The other pairs are left out, so that all methods are compared on the same pairs.
         known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
         by_pair = [[(*pair.names, name) for name in methods] for pair in known]
         finished = [keys for keys in by_pair if all(key in self.results for key in keys)]

@@ -1,7 +1,7 @@
 """Data sets in their published layouts: shapes, pairs and ground truth.
 
-No data set comes with this library, because the licences do not allow copies. `docs/datasets.md` says where
-to obtain each data set.
+This library contains no data set, because the licences do not allow copies. `docs/datasets.md` says where to
+obtain each data set.
 """
 
 from __future__ import annotations
@@ -63,12 +63,19 @@ class DataPair:
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
         """Returns the ground truth of the pair, or the mirrored ground truth.
 
-        **Raises:** `InputError` if a file is wrong, if there is no mirrored ground truth, or if the meshes
-        should have the same vertices but differ in their number.
+        **Arguments:**
+
+        - `mesh_x`, `mesh_y`: X and Y, as read from `source_file` and `target_file`.
+        - `mirrored`: whether to return the mirrored ground truth.
+
+        **Raises:** `InputError` if a file cannot be used, if there is no mirrored ground truth, or if vertex
+        i of X should correspond to vertex i of Y, but the numbers of vertices differ.
         """
         files = self.mirrored_truth if mirrored else self.truth
         if files is None:
-            raise InputError(f"{self.name}: its data set has no mirrored ground truth.")
+            raise InputError(
+                f"{self.name}: its data set has no mirrored ground truth: use the direct ground truth."
+            )
         if files:
             return read_ground_truth(files, mesh_x, mesh_y, index_base=self.index_base)
         m, n = len(mesh_x.vertices), len(mesh_y.vertices)
@@ -86,7 +93,7 @@ class DataSet:
 
     **Attributes:**
 
-    - `directory`: the directory.
+    - `directory`: the directory that contains the files.
     - `layout`: the name of the recognised layout.
     - `pairs`: the pairs to match, in the order of the data set's own list if there is one.
     - `others`: further pairs with ground truth.
@@ -112,24 +119,32 @@ class DataSet:
 
 
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
-    """Recognises a data set by its files.
+    """Opens a data set, and recognises its layout from its files.
 
     - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): the meshes in one folder (`off/`,
       `shapes/`, …), and for each mesh a `corres/NAME.vts` and optionally a `corres/NAME.sym.vts`.
-    - **SHREC'19 humans** (Melzi et al. 2019): meshes `1.obj`, … and for each pair `I_J.txt` in a folder
-      `FARMgt_txt`; in the remeshed version `I_J.map` in `corres/`.
-    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` and `cuts/` or `holes/`; the pairs are partial shape
-      to full shape.
-    - **SHREC'16 topology** (Lähner et al. 2016): `kid00`, and `kidNN` with `kidNN_ref.txt`; the pairs are
-      `kidNN` to `kid00`.
+    - **SHREC'19 humans** (Melzi et al. 2019): meshes `1.obj`, …, and for each pair a file `I_J.txt` in a
+      folder `FARMgt_txt`. The remeshed version has a file `I_J.map` in `corres/` instead.
+    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` with the full shapes, and `cuts/` or `holes/` with the
+      partial shapes. Each pair has a partial shape as source and its full shape as target.
+    - **SHREC'16 topology** (Lähner et al. 2016): `kid00`, and `kidNN` with `kidNN_ref.txt`. Each pair has
+      `kidNN` as source and `kid00` as target.
     - **FAUST registrations** `tr_reg_NNN`, **SCAPE** `meshNNN`, **TOSCA** (`cat0`, …): meshes only, in the
-      directory or in one folder. Vertex i corresponds to vertex i, in TOSCA within a class.
+      directory or in one folder. Vertex i of one shape corresponds to vertex i of the other; in TOSCA, within
+      a class only.
 
-    The pairs are those of the list that comes with a data set (`test_pairs.txt`, `PAIRS_list_….txt`: two
-    names per line). Without a list, the pairs are all ordered pairs of different shapes, within a class if
-    names have one (`cat0`, `cat1`). A directory that holds several data sets is not a data set.
+    If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line),
+    `pairs` is this list. Otherwise the pairs are all ordered pairs of different shapes with ground truth,
+    within a class if the names have one (`cat0`, `cat1`).
 
-    **Raises:** `InputError` with the expected layouts, or with the missing file.
+    **Arguments:**
+
+    - `directory`: the directory of one unpacked data set.
+
+    **Returns:** A `DataSet`.
+
+    **Raises:** `InputError` if the directory has no known layout, lacks a file, cannot be read, or contains
+    several data sets.
     """
     # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
     if not os.path.isdir(directory):
@@ -144,8 +159,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
         ) from error
     if len(inner) > 1:
         raise InputError(
-            f"{directory}: holds several data sets ({', '.join(folder.name for folder in inner)}): give the "
-            "directory of one data set."
+            f"{directory}: contains several data sets ({', '.join(folder.name for folder in inner)}): give "
+            "the directory of one data set."
         )
     if found is None:
         raise InputError(
@@ -199,7 +214,8 @@ def _meshes(directory: Path) -> dict[str, Path]:
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
     found: dict[str, Path] = {}
     for file in sorted(files, key=lambda file: MESH_SUFFIXES.index(file.suffix.lower())):
-        found.setdefault(file.stem, file)  # two formats of one shape: the first in the list counts
+        # If a shape has files in two formats, the first suffix in MESH_SUFFIXES counts.
+        found.setdefault(file.stem, file)
     return {name: found[name] for name in sorted(found, key=_natural)}
 
 
@@ -208,7 +224,10 @@ _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Returns the meshes with such names in a directory, or in its first folder with any such mesh."""
+    """Returns the meshes whose names match a pattern, by name.
+
+    The meshes are those in the directory itself, or else those in its first folder that contains any.
+    """
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
         found = {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}
@@ -226,12 +245,20 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 
 
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
-    """Reads a list of pairs: the names of source and target on each line, with spaces or a comma between.
+    """Reads a list of pairs of shapes.
 
-    The rest of a line after `#` is a comment.
+    Each line has the names of source and target, separated by spaces, a comma or a semicolon. The rest of a
+    line after `#` is a comment.
 
-    **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if
-    there is no pair.
+    **Arguments:**
+
+    - `path`: the text file.
+    - `shapes`: the names of all shapes of the data set.
+
+    **Returns:** The names of source and target of each pair, in the order of the file.
+
+    **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if the
+    file names no pair.
     """
     path, known, pairs = Path(path), set(shapes), []
     try:
@@ -257,9 +284,10 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
     **Arguments:**
 
-    - `wanted`: a number of pairs, drawn without replacement (all pairs if there are fewer); or the path of a
-      list of pairs with ground truth (see `read_pairs`), where repeated pairs count once; or None for all
-      pairs of the data set.
+    - `data_set`: the data set.
+    - `wanted`: one of three choices. A number, as text, draws this many pairs without replacement, or all
+      pairs if there are fewer. A path names a list of pairs with ground truth (see `read_pairs`); repeated
+      pairs count once. None chooses all pairs of the data set.
     - `seed`: the seed of the draw.
 
     **Returns:** The pairs, in the order of the data set or of the list.
@@ -273,7 +301,7 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     if re.fullmatch(r"[+-]?\d+", wanted):
         count = int(wanted)
         if count < 1:
-            raise InputError(f"{count} pairs cannot be measured: ask for at least 1.")
+            raise InputError(f"{count} pairs cannot be measured: give at least 1.")
         rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
         return [pairs[row] for row in np.sort(rows)]
     known = {pair.names: pair for pair in (*pairs, *data_set.others)}
@@ -287,7 +315,7 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
 
 def class_of(name: str) -> str:
-    """Returns the class of a shape: its name without the number at the end."""
+    """Returns the class of a shape, given its name: the name without the number at its end."""
     return re.sub(r"[_-]?\d+$", "", name)
 
 
@@ -300,7 +328,10 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Returns the listed pairs, or all pairs if there is no list, and the other pairs with ground truth."""
+    """Returns the pairs of a list and all other pairs with ground truth.
+
+    Without a list, the first are all pairs with ground truth, and there are no others.
+    """
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)
     return [pair(*names) for names in wanted], [pair(*names) for names in others]
@@ -317,7 +348,7 @@ def _remeshed(directory: Path) -> _Pairs | None:
     if not shapes:
         raise InputError(
             f"{directory}: has {len(plain)} .vts files in corres/, but no folder with their meshes: put the "
-            "meshes into off/ beside corres/."
+            "meshes into off/ next to corres/."
         )
     if missing := [name for name in shapes if name not in plain]:
         raise InputError(
@@ -391,7 +422,7 @@ def _topology(directory: Path) -> _Pairs | None:
     if not shapes:
         return None
     if "kid00" not in shapes:
-        raise InputError(f"{directory}: has no kid00, the target of all other kids: complete the copy.")
+        raise InputError(f"{directory}: has no kid00, the target of all pairs: complete the copy.")
     full = shapes.pop("kid00")
     pairs = []
     for name, file in shapes.items():
@@ -403,7 +434,7 @@ def _topology(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Returns the layout of meshes with such names, in which vertex i corresponds to vertex i."""
+    """Returns the layout of meshes whose names match a pattern, where vertex i corresponds to vertex i."""
     pattern = re.compile(names)
 
     def open_layout(directory: Path) -> _Pairs | None:

@@ -1,6 +1,6 @@
-"""Ground truth in every form in which it circulates.
+"""Ground truth, and its readers for all common file formats.
 
-Files are read as `jaxsmw.io.map_files` reads them. Each form has the index base with which it circulates.
+The files are parsed by `jaxsmw.io.map_files`. Each format has its usual index base.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
-# How far weights in a file, printed with few digits, may lie below 0 and their sum from 1.
+# The amount by which weights in a file may be below 0, and their sum may differ from 1. Files print weights
+# with few digits.
 _WEIGHT_TOLERANCE = 1e-4
 
 
@@ -34,6 +35,8 @@ class GroundTruth:
 
     - `source_vertices`: 0-based vertices of X (p,); a vertex may occur several times, or never.
     - `targets`: the true point of each source vertex (p,), as 0-based vertices of Y or as `SurfacePoints`.
+
+    **Raises:** `InputError` if the numbers of source vertices and targets differ.
     """
 
     source_vertices: Int64[np.ndarray, " p"]
@@ -48,11 +51,17 @@ class GroundTruth:
 
     @classmethod
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
-        """Returns the ground truth in which vertices 0, 1, … of X have these targets, in this order."""
+        """Returns the ground truth of all vertices of X. Entry i of `targets` (m,) belongs to vertex i.
+
+        The targets are 0-based vertices of Y or `SurfacePoints` on Y.
+        """
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
         """Returns a map X -> Y (m,): each vertex takes the target of the nearest vertex with ground truth.
+
+        The nearest vertex is the nearest in Euclidean distance on `mesh_x`. The map contains 0-based vertices
+        of Y.
 
         **Raises:** `InputError` if the targets are not vertices.
         """
@@ -73,25 +82,28 @@ def read_ground_truth(
 
     The suffix and the number of columns determine the format:
 
-    - two `.vts` files, first the file of the source: one vertex per line; line i of both files is the same
-      point; 1-based. Two files with other suffixes have the same format, but are 0-based.
-    - `.baryc_gt` or `.baryc_gt_sym`: for each source vertex a face of the target and three barycentric
-      weights; 1-based.
-    - two columns: a source vertex and its target vertex; 1-based.
-    - one column: for each source vertex its target vertex; 0-based, and 1-based in `.mat` files, as written
-      by `write_pointwise_map`.
+    - Two `.vts` files, the file of the source first: each has one vertex per line, and line i of both files
+      is the same point. Vertices are 1-based. Two files with other suffixes have the same format, but are
+      0-based.
+    - `.baryc_gt` or `.baryc_gt_sym`: line i has a face of the target and three barycentric weights for source
+      vertex i. Faces are 1-based.
+    - Two columns: a source vertex and its target vertex, 1-based.
+    - One column: line i has the target vertex of source vertex i. Vertices are 0-based, or 1-based in `.mat`
+      files, as `write_pointwise_map` writes them.
 
-    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) are read like all others.
+    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) are read in the same way.
 
     **Arguments:**
 
     - `paths`: one file, or the two files of a pair.
     - `mesh_x`, `mesh_y`: source X and target Y.
-    - `index_base`: the number of the first vertex and face in the files; by default that of the format.
+    - `index_base`: the number of the first vertex and face in the files; by default the base of the format.
 
-    **Returns:** A `GroundTruth` without unreferenced vertices of X; a warning gives their number.
+    **Returns:** A `GroundTruth` without unreferenced vertices of X. If vertices are left out, a warning gives
+    their number.
 
-    **Raises:** `InputError` that names the file, the line and the fault.
+    **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
+    message names the file, the line and the fault.
     """
     files = [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(path) for path in paths]
     truth = _read_all(files, mesh_x, mesh_y, index_base)
@@ -150,20 +162,23 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
     """Writes the true points of all vertices of X as a `.baryc_gt` file (see `read_ground_truth`).
 
+    If the targets are vertices, use `jaxsmw.write_pointwise_map` instead.
+
     **Arguments:**
 
     - `path`: the file to create or to replace; `read_ground_truth` needs the suffix `.baryc_gt`.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-      (`write_pointwise_map` writes targets that are vertices.)
     - `mesh_y`: the target Y. Faces are numbered as in its file, including faces that were dropped on reading.
 
-    **Raises:** `InputError` if the ground truth is of another kind, or if the file cannot be written.
+    **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
+    this order, or if the file cannot be written.
     """
     points = ground_truth.targets
     in_order = np.array_equal(ground_truth.source_vertices, np.arange(len(points)))
     if not isinstance(points, SurfacePoints) or not in_order:
         raise InputError(
-            f"{path}: a .baryc_gt file needs a point on a face for each source vertex, in order."
+            f"{path}: a .baryc_gt file needs a point on a face for each source vertex, in order: give the "
+            "ground truth of all source vertices as SurfacePoints."
         )
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii") as file:
         for face, weights in zip(
@@ -173,7 +188,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-    """A column as 0-based faces of a mesh. The file also counts the faces that cleaning dropped."""
+    """Returns a column as 0-based faces of a mesh. The numbers in the file also count dropped faces."""
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)
     faces = np.searchsorted(mesh.face_numbers, given)
@@ -181,14 +196,14 @@ def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.n
     if dropped.any():
         row = int(dropped.argmax())
         raise InputError(
-            f"{table.place(row)}: face {table.word(row, column)} was dropped from {mesh.name}, for it "
+            f"{table.place(row)}: face {table.word(row, column)} was dropped from {mesh.name} because it "
             "repeats a vertex or another face: name a face that was kept."
         )
     return faces
 
 
 def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
-    """Three columns as barycentric weights."""
+    """Returns three columns as barycentric weights: not negative, with sum 1."""
     weights = table.values[:, column : column + 3]
     good = (weights >= -_WEIGHT_TOLERANCE).all(axis=1)
     good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE
@@ -196,7 +211,7 @@ def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
         row = int(good.argmin())
         written = " ".join(table.word(row, at) for at in range(column, table.columns))
         raise InputError(
-            f"{table.place(row)}: {written[:80]} are no barycentric weights, "
+            f"{table.place(row)}: {written[:80]} are not barycentric weights, "
             "which are at least 0 and sum to 1: correct the line."
         )
     weights = np.maximum(weights, 0)

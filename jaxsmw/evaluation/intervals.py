@@ -13,14 +13,17 @@ RESAMPLES = 9999
 
 
 class Interval(NamedTuple):
-    """A mean with the ends of its bootstrap confidence interval."""
+    """A mean with the lower and upper end of its bootstrap confidence interval, in the unit of the sample.
+
+    The ends are NaN if there is no interval.
+    """
 
     mean: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """The mean and the interval with signs; a dash if the mean is NaN."""
+        """The mean and the ends of the interval, with signs and one decimal; a dash if the mean is NaN."""
         if np.isnan(self.mean):
             return "—"
         if np.isnan(self.low):
@@ -36,15 +39,15 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
     - `values`: the sample (p,).
     - `seed`: the seed of the resampling.
 
-    **Returns:** The mean and its interval of confidence `CONFIDENCE`. For fewer than three values the
-    interval is NaN; for no values the mean is NaN, too.
+    **Returns:** The mean and its interval with confidence level `CONFIDENCE`, from `RESAMPLES` resamples. The
+    ends of the interval are NaN for fewer than three values. The mean is also NaN for an empty sample.
     """
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
     if len(values) < 3:  # too few for a bootstrap
         return Interval(mean, np.nan, np.nan)
-    if np.ptp(values) == 0:  # for which the BCa interval is undefined
+    if np.ptp(values) == 0:  # the BCa interval of equal values is undefined
         return Interval(mean, mean, mean)
     found = bootstrap(
         (values,),

@@ -1,4 +1,4 @@
-"""Result files that survive an interruption at any moment, and never mix results of different origin."""
+"""Result files that survive interruptions at any time, and never mix results of different origin."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
-"""One row of a journal: text by the name of its column."""
+"""One row of a journal: values by the names of their columns. A row that was read contains text only."""
 
 Columns = Mapping[str, Callable[[str], Any]]
-"""The columns of a journal in order, each with the function that reads its text or raises a `ValueError`."""
+"""The columns of a journal in order. Each has a function that parses its text or raises a `ValueError`."""
 
 
 class Journal:
-    """A CSV file that grows by whole rows; appended rows stay.
+    """A CSV file to which whole rows are appended.
 
-    If a process was killed while it wrote a line, the unfinished line is cut off when the file is opened
-    again.
+    `key in journal` checks whether there is a row with a key, and `journal[key]` returns the row. The values
+    of a key are compared as text. If a process was killed while it wrote a line, the unfinished line is
+    removed when the file is opened again.
 
     **Arguments:**
 
     - `path`: the file, which need not exist yet.
     - `key`: the columns that identify a row. If two rows have the same key, the first row counts.
-    - `columns`: the columns that the file must have, each with the function that checks its values; by
-      default any columns that include the key.
+    - `columns`: the columns that the file must have, each with the function that checks its values. By
+      default the file may have any columns that include the key.
 
-    **Raises:** `InputError` if the file is not such a table. The file is then left as it is.
+    **Raises:** `InputError` if the file cannot be read or is not such a table. The file is then not changed.
     """
 
     def __init__(self, path: Path, key: Sequence[str], columns: Columns | None = None):
@@ -71,9 +72,13 @@ class Journal:
         return self._rows[tuple(map(str, key))]
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Adds rows with the columns of the file, and returns when the rows are on the disk.
+        """Appends rows to the file, and returns when the rows are on disk.
 
-        **Raises:** `InputError` if the file has other columns, or if it cannot be written.
+        **Arguments:**
+
+        - `rows`: rows with the columns of the file. If the file has no columns yet, the first row sets them.
+
+        **Raises:** `InputError` if a row has other columns than the file, or if the file cannot be written.
         """
         if not rows:
             return
@@ -102,7 +107,12 @@ class Journal:
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrites the file with its rows in the order of `keys`; workers finish in an arbitrary order."""
+        """Rewrites the file with the rows of `keys`, in this order, and drops all other rows.
+
+        Workers finish in an arbitrary order, so rows are appended in an arbitrary order.
+
+        **Raises:** `KeyError` if no row has one of the keys; `InputError` if the file cannot be written.
+        """
         self._rows = {tuple(map(str, key)): self._rows[tuple(map(str, key))] for key in keys}
         with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._fields, lineterminator="\n")
@@ -110,7 +120,10 @@ class Journal:
             writer.writerows(self.rows)
 
     def _read(self, contents: bytes, columns: Columns) -> None:
-        """Reads whole lines, and remembers their rows."""
+        """Parses whole lines, checks their values, and keeps their rows.
+
+        **Raises:** `InputError` if the contents are not a table with these columns.
+        """
         try:
             reader = csv.reader(io.StringIO(contents.decode(), newline=""), strict=True)
             lines = [(reader.line_num, fields) for fields in reader]
@@ -156,26 +169,27 @@ def claimed_directory(
     provenance: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[None]:
-    """Keeps other processes out of a directory while results are added.
+    """Locks a directory against other processes while results are added.
 
-    The first call writes the origin of the results to `provenance.json`; later calls compare with that file.
+    The function is a context manager; the lock ends with the `with` block. The first call writes the origin
+    of the results to `provenance.json`. Later calls check that their origin is the same.
 
     **Arguments:**
 
     - `directory`: an existing directory.
     - `provenance`: groups of settings that all results in the directory must share.
-    - `noted`: facts about the first call that may differ later.
+    - `noted`: facts that the first call also writes, and that may differ in later calls.
 
-    **Raises:** `InputError` if the directory holds results of another origin, if `provenance.json` is
+    **Raises:** `InputError` if the directory contains results of another origin, if `provenance.json` is
     damaged, or if another process is adding results.
     """
-    # The operating system releases the lock however the process ends.
+    # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)
     try:
         lock.acquire()
     except Timeout:
         raise InputError(
-            f"{directory}: another run is adding results: wait for its end, or give another --output."
+            f"{directory}: another run is adding results: wait until it ends, or give another --output."
         ) from None
     except OSError as error:
         raise InputError(
@@ -202,11 +216,12 @@ def _check_origin(
             for name in {**before, **now}:
                 if before.get(name) != now.get(name):
                     raise InputError(
-                        f"{directory}: holds results for which the {name} in {group} was "
-                        f"{before.get(name)} and not {now.get(name)}: give another --output, or remove it."
+                        f"{directory}: contains results for which the {name} in {group} was "
+                        f"{before.get(name)} and not {now.get(name)}: give another --output, or remove the "
+                        "directory."
                     )
     elif any(directory.glob("*.csv")):
-        raise InputError(f"{directory}: holds results of unknown origin: give another --output.")
+        raise InputError(f"{directory}: contains results of unknown origin: give another --output.")
     else:
         contents = {**wanted, "noted": dict(noted)} if noted else wanted
         with atomic_write(path) as temporary:

@@ -1,4 +1,4 @@
-"""The tasks of a benchmark: precompute one shape, or match and evaluate one pair."""
+"""The two kinds of tasks of a benchmark: precompute one shape, and match and evaluate one pair."""
 
 from __future__ import annotations
 
@@ -43,17 +43,23 @@ FIGURES = (
     "unreachable",
     "coverage",
 )
-"""The figures of each map besides its curve; lengths in square roots of the target's area."""
+"""The figures of each map in addition to its curve. Lengths are in square roots of the target's area."""
 
 
 def read_curve(text: str) -> list[float]:
-    """Reads a stored curve: the share of points with an error of at most each threshold of `CURVE`.
+    """Parses a stored curve: the share of points with an error of at most each threshold of `CURVE`.
 
-    **Raises:** `ValueError` if the text is not a curve.
+    **Arguments:**
+
+    - `text`: the shares, separated by spaces.
+
+    **Returns:** The shares, one per threshold.
+
+    **Raises:** `ValueError` if the text does not contain one number per threshold.
     """
     shares = [float(share) for share in text.split()]
     if len(shares) != len(CURVE):
-        raise ValueError(f"{len(shares)} shares instead of {len(CURVE)}")
+        raise ValueError(f"the curve has {len(shares)} shares instead of {len(CURVE)}")
     return shares
 
 
@@ -68,10 +74,10 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(FIGURES, float),
     "curve": read_curve,
 }
-"""The columns of `results.csv`, one row per pair and method, each with the function that reads its text.
+"""The columns of `results.csv`, each with the function that parses its text.
 
-`seconds` is the time from the initial map to the result, without compilation, and `truth` the ground truth
-that was used, `direct` or `mirrored`.
+The file has one row per pair and method. `seconds` is the time from the initial map to the result, without
+compilation. `truth` is the ground truth that was used, `direct` or `mirrored`.
 """
 
 SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
@@ -81,24 +87,27 @@ SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
     "seconds_spectrum": float,
     "seconds_descriptors": float,
 }
-"""The columns of `shapes.csv`, one row per shape; `digest` is a hash of the mesh file."""
+"""The columns of `shapes.csv`, each with the function that parses its text.
+
+The file has one row per shape. `digest` is a hash of the mesh file.
+"""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that results depend on, besides data and code.
+    """The settings of a benchmark. Results depend on these settings, the data and the code only.
 
     **Attributes:**
 
-    - `init`: the initial map of all methods: a descriptor (see `jaxsmw.match`), or a directory with maps
-      `X_Y.map`.
-    - `mirrored`: whether to use the mirrored ground truth where a map is closer to the mirrored ground truth;
-      for methods and initial maps that cannot distinguish left from right.
+    - `init`: the initial map of all methods: the name of an initial map (see `jaxsmw.match`), or a directory
+      with maps `X_Y.map`.
+    - `mirrored`: whether to use the mirrored ground truth for a map that is closer to it than to the direct
+      ground truth. This setting is for methods and initial maps that cannot tell left from right.
     - `evaluated_points`: the number of evaluated rows of each ground truth, the same rows for all methods;
       all rows if None.
-    - `seed`: the seed of the draw of these rows.
+    - `seed`: the seed with which these rows are drawn.
 
-    **Raises:** `InputError` if `init` is neither a descriptor nor a directory.
+    **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
     """
 
     init: str = "shot"
@@ -130,7 +139,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Task:
-    """A pair, and the methods that still have to be measured on that pair, by name."""
+    """A pair, and the methods to measure on that pair, by name."""
 
     pair: DataPair
     methods: dict[str, Method]
@@ -150,9 +159,16 @@ def file_digest(file: Path) -> str:
 
 
 def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Precomputes and caches the spectrum and the descriptors of a shape, and measures the time.
+    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures the wall times.
 
-    **Returns:** One row with `SHAPE_COLUMNS`.
+    **Arguments:**
+
+    - `shape`: the name of the shape and its mesh file.
+    - `number_of_eigenvectors`: k of the spectrum.
+
+    **Returns:** One row with `SHAPE_COLUMNS`; times are in seconds.
+
+    **Raises:** `InputError` if the file cannot be read, or if its spectrum or descriptors cannot be computed.
     """
     name, file = shape
     with recomputing():
@@ -170,7 +186,16 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
     """Matches a pair with every method, and evaluates the maps.
 
-    **Returns:** One row with `RESULT_COLUMNS` for each method.
+    **Arguments:**
+
+    - `task`: the pair and the methods.
+    - `settings`: the initial map and the evaluation.
+    - `number_of_eigenvectors`: k of the spectra, at least the number that any method uses.
+
+    **Returns:** One row with `RESULT_COLUMNS` for each method. All figures of a failed map are NaN.
+
+    **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
+    the computation of an initial map fails numerically.
     """
     data = task.pair
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
@@ -198,7 +223,10 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
 
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
-    """Runs a method; returns map, result and seconds without compilation (NaN for published maps)."""
+    """Runs a method, and returns its map, its result and its time.
+
+    The time is in seconds and leaves out compilation. The time of published maps is NaN.
+    """
     for _ in range(2):
         with _CompilationClock() as compilation, one_blas_thread():
             began = time.perf_counter()
@@ -206,13 +234,14 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
             seconds = time.perf_counter() - began - compilation.seconds
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
-        # A first run also imports modules, for example. That is negligible in a long run.
+        # A first run takes longer than later runs, for example because of imports. In a long run the
+        # difference is negligible.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
 
 
-# A run of more than so many seconds is not repeated.
+# A run that takes longer than this number of seconds is not repeated.
 _LONG = 60
 # The names of the methods that have run in this process.
 _warm: set[str] = set()
@@ -240,7 +269,10 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Returns the figures of a map by the ground truth closest to the map; all NaN if the map failed."""
+    """Returns the figures of a map, measured with the ground truth that is closest to the map.
+
+    If the method failed, all figures are NaN.
+    """
     if (pointwise_map < 0).any():
         return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
     errors = {

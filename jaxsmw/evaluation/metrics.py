@@ -20,7 +20,7 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# In square roots of the target's area: the thresholds of reported shares, and the end of reported curves.
+# The thresholds of reported shares and the end of reported curves, in square roots of the target's area.
 THRESHOLDS = (0.02, 0.05, 0.1)
 LARGEST_THRESHOLD = 0.25
 
@@ -31,10 +31,10 @@ class GeodesicError:
 
     **Attributes:**
 
-    - `errors`: the error of each evaluated row of the ground truth (p,); inf where the image and the true
-      point lie on different connected components of the target.
+    - `errors`: the error of each evaluated row of the ground truth (p,); inf where the match and the true
+      point are on different connected components of the target.
     - `source_vertices`: the vertex of X for each error (p,).
-    - `method`: the method that computed the distances.
+    - `method`: the method that computed the geodesic distances.
     """
 
     errors: Float64[np.ndarray, " p"]
@@ -43,23 +43,26 @@ class GeodesicError:
 
     @property
     def unreachable(self) -> float:
-        """The share of points whose image lies on another connected component than the true point."""
+        """The share of points whose match is on another connected component than the true point."""
         return float(np.isinf(self.errors).mean())
 
     @property
     def mean(self) -> float:
-        """The mean over the points that are not `unreachable`; inf if all points are. Report both numbers."""
+        """The mean error of all points but those that `unreachable` counts; inf if no point is left.
+
+        Report `unreachable` together with this mean.
+        """
         reachable = self.errors[np.isfinite(self.errors)]
         return float(reachable.mean()) if len(reachable) else np.inf
 
     @property
     def median(self) -> float:
-        """The median over all points, where unreachable points have an infinite error."""
+        """The median over all points. Unreachable points count with an infinite error."""
         return float(np.median(self.errors))
 
     @property
     def within(self) -> dict[float, float]:
-        """The share of points with an error of at most each of the usual `THRESHOLDS`."""
+        """The share of points with an error of at most 0.02, 0.05 and 0.1, by threshold."""
         shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
         return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
 
@@ -73,7 +76,10 @@ class GeodesicError:
         )
 
     def as_dictionary(self) -> dict[str, Any]:
-        """Returns the main figures and the curve for JSON; None where a figure is infinite."""
+        """Returns the main figures and the correspondence quality curve as a dictionary for JSON.
+
+        A mean or median that is infinite becomes None. The curve has 251 thresholds from 0 to 0.25.
+        """
         thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
             "mean": self.mean if np.isfinite(self.mean) else None,
@@ -90,7 +96,14 @@ class GeodesicError:
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
-        """Returns the share of points with an error of at most each threshold (Kim et al. 2011)."""
+        """Returns the share of points with an error of at most each threshold (Kim et al. 2011).
+
+        **Arguments:**
+
+        - `thresholds`: the thresholds (t,), in square roots of the target's area, in any order.
+
+        **Returns:** The shares (t,), in [0, 1].
+        """
         counts = np.searchsorted(np.sort(self.errors), np.asarray(thresholds), side="right")
         return counts / len(self.errors)
 
@@ -98,7 +111,11 @@ class GeodesicError:
         """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
 
         The curve has a step at each error e, so its mean height is exactly the mean of
-        `max(0, 1 - e/largest)`. A perfect map has 1.
+        `max(0, 1 - e/largest)`. The value is in [0, 1]; a perfect map has 1.
+
+        **Arguments:**
+
+        - `largest`: the largest threshold, in square roots of the target's area.
 
         **Raises:** `InputError` if the threshold is not positive.
         """
@@ -116,39 +133,40 @@ def geodesic_error(
     number_of_samples: int | None = None,
     seed: int = 0,
 ) -> GeodesicError:
-    """Computes the geodesic distances on the target between the images of points and their true points.
+    """Computes the geodesic error of each match: its geodesic distance on Y to the true point.
 
     Distances are divided by the square root of the target's area (Kim, Lipman and Funkhouser 2011), so errors
-    do not depend on the unit or the size of a shape.
+    do not depend on the unit of length or the size of a shape.
 
     **Arguments:**
 
     - `mesh_y`: the target Y.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y, or `SurfacePoints` on Y.
+    - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y or as `SurfacePoints` on Y.
     - `ground_truth`: the true points on Y of some vertices of X.
     - `method`: the method for distances; see `jaxsmw.geometry.geodesics.geodesic_distances`.
-    - `number_of_samples`: the number of evaluated rows of the ground truth, drawn without replacement; all
-      rows by default, or if there are fewer.
+    - `number_of_samples`: the number of rows of the ground truth to evaluate, drawn without replacement. By
+      default, and if there are fewer rows, all rows are evaluated.
     - `seed`: the seed of the draw.
 
     **Returns:** A `GeodesicError`.
 
-    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, if fewer than 1
-    sample is asked for, or if the method `"exact"` is not available.
+    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, if the ground
+    truth is empty, if `number_of_samples` is less than 1, or if the method `"exact"` is not available.
     """
     images = check_points(pointwise_map, mesh_y, "pointwise map")
     targets = check_points(ground_truth.targets, mesh_y, "ground truth")
     sources = ground_truth.source_vertices
     if len(sources) == 0:
-        raise InputError("ground truth: it has no rows, so there is nothing to evaluate.")
+        raise InputError("ground truth: it has no rows: give the true point of at least one source vertex.")
     if not 0 <= sources.min() <= sources.max() < len(images):
         raise InputError(
             f"ground truth: its source vertices are numbered {sources.min()} to {sources.max()}, but the "
-            f"pointwise map has {len(images)} entries: give the map and the truth of the same source mesh."
+            f"pointwise map has {len(images)} entries: give the map and the ground truth of the same source "
+            "mesh."
         )
     if number_of_samples is not None:
         if number_of_samples < 1:
-            raise InputError(f"{number_of_samples} samples cannot be evaluated: ask for at least 1.")
+            raise InputError(f"{number_of_samples} samples cannot be evaluated: give at least 1.")
         rows = np.random.default_rng(seed).permutation(len(sources))[:number_of_samples]
         sources, targets = sources[rows], targets[rows]
     distances = geodesic_distances_between(mesh_y, images[sources], targets, method=method)
@@ -156,9 +174,9 @@ def geodesic_error(
 
 
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
-    """Returns the share of the target's area that belongs to vertices in the image of a map.
+    """Returns the coverage of a map: the share of the target's area that belongs to matched vertices.
 
-    The coverage needs no ground truth.
+    The coverage is in [0, 1] and needs no ground truth.
 
     **Arguments:**
 

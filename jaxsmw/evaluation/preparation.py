@@ -1,4 +1,4 @@
-"""Prepares a pair for the compared methods, by the pipeline of `jaxsmw.match`."""
+"""Prepares a pair for the compared methods, with the preparation of `jaxsmw.match`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.initial_maps import INITIAL_MAPS, initial_map
 from jaxsmw.pair import Pair
-from jaxsmw.preparation import PreparedPair, fewest_vertices, prepare
+from jaxsmw.preparation import PreparedPair, prepare
 
 
 def prepare_pair(
@@ -31,23 +31,28 @@ def prepare_pair(
     number_of_descriptors: int = 0,
     both_directions: bool = False,
 ) -> MethodInput:
-    """Computes everything that the methods share.
+    """Computes the input that all methods share: spectra, descriptors, initial maps and samples.
 
     **Arguments:**
 
     - `data`: the names of the two shapes, and whether X is a partial shape.
-    - `mesh_x`, `mesh_y`: X and Y.
-    - `init`: a descriptor (see `jaxsmw.match`), or a directory with initial maps `X_Y.map`.
+    - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
+    - `init`: the name of an initial map (see `jaxsmw.match`), or a directory with initial maps `X_Y.map`.
     - `number_of_eigenvectors`: k of both spectra.
-    - `number_of_descriptors`: the number of principal components of SHOT; without descriptors if 0.
-    - `both_directions`: whether to compute the initial map Y -> X, too.
+    - `number_of_descriptors`: the number of principal components of SHOT; 0 for no descriptors.
+    - `both_directions`: whether to compute the initial map Y -> X as well.
+
+    **Returns:** A `MethodInput`, with arrays padded as `jaxsmw.match` pads them.
+
+    **Raises:** `InputError` if a spectrum or an initial map cannot be computed, or if the directory has no
+    usable initial map X -> Y; `ArithmeticError` if the computation of an initial map fails numerically.
     """
     pair = Pair(mesh_x, mesh_y, data.partial)
     prepared = prepare(
         pair,
         number_of_eigenvectors=number_of_eigenvectors,
         number_of_descriptors=number_of_descriptors,
-        number_of_samples=min(MOST_SAMPLES, fewest_vertices(pair)),
+        number_of_samples=min(MOST_SAMPLES, pair.fewest_vertices()),
         init=_init(init, data.names, pair),
     )
     reverse = _reverse_initial_map(data, prepared, init) if both_directions else None
@@ -55,14 +60,15 @@ def prepare_pair(
 
 
 def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:
-    """Returns the name of a descriptor as it is, and the map of a directory."""
+    """Returns the argument `init` of `prepare`: the name of an initial map, or the map from a directory."""
     return init if init in INITIAL_MAPS else read_published_map(Path(init), names, pair.meshes)
 
 
 def _reverse_initial_map(data: DataPair, prepared: PreparedPair, init: str) -> Int64[np.ndarray, " n"]:
-    """Returns the initial map Y -> X, of the same kind as the initial map X -> Y.
+    """Returns the initial map Y -> X, found in the same way as the initial map X -> Y.
 
-    If the directory has no map Y -> X, the functional map of the initial map X -> Y gives the map Y -> X.
+    If a directory with initial maps contains no map Y -> X, the map is computed from the functional map of
+    the initial map X -> Y.
     """
     names, reversed_ = (data.target, data.source), prepared.pair.reversed()
     if init in INITIAL_MAPS or published_file(Path(init), names).is_file():

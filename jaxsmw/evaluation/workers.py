@@ -1,7 +1,7 @@
 """Runs tasks in worker processes: on this machine, or on a Dask cluster.
 
-Everything that one core per worker needs is set in the workers. The calling process keeps its environment,
-its JAX caches and its other child processes.
+The settings that limit a process to one core apply to the workers only. The environment, the JAX caches and
+the other child processes of the calling process stay unchanged.
 """
 
 from __future__ import annotations
@@ -35,9 +35,13 @@ _ONE_THREAD_FLAG = "--xla_cpu_multi_thread_eigen=false"
 
 
 class Workers(ProcessPoolExecutor):
-    """Processes on this machine with one core each, which use JAX on the CPU whatever other devices exist.
+    """Worker processes on this machine with one core each. JAX runs on the CPU, even if there is a GPU.
 
-    The processes end immediately if the `with` block ends by an exception.
+    If an exception ends the `with` block, the processes are terminated at once.
+
+    **Arguments:**
+
+    - `count`: the number of processes.
     """
 
     def __init__(self, count: int):
@@ -56,11 +60,11 @@ class Workers(ProcessPoolExecutor):
 
 
 class _OneCoreProcess(SpawnProcess):
-    """A process that is started with one core.
+    """A process that is limited to one core.
 
-    The variables must be there when the process starts: a worker imports the main module of the calling
-    program before it runs any function of ours, and with that module perhaps NumPy and JAX, which read them
-    once.
+    The environment variables must be set before the process starts. NumPy and JAX read these variables only
+    once, on import. A worker imports the main module of the calling program, and perhaps NumPy and JAX with
+    it, before it runs any function of this library.
     """
 
     def start(self) -> None:
@@ -69,7 +73,7 @@ class _OneCoreProcess(SpawnProcess):
 
 
 class _OneCoreContext(SpawnContext):
-    """Starts processes with one core each, and remembers them."""
+    """Starts processes with one core each, and keeps a list of them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -88,7 +92,7 @@ def _one_thread_flags() -> str:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables while a process starts, which takes milliseconds, and restores them."""
+    """Sets environment variables for the milliseconds in which a process starts, then restores them."""
     with _starting:
         before = {name: os.environ.get(name) for name in variables}
         os.environ.update(variables)
@@ -102,12 +106,15 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
                     os.environ[name] = value
 
 
-# Two threads that start processes at once would restore each other's variables.
+# Without the lock, two threads that start processes at the same time would restore each other's variables.
 _starting = threading.Lock()
 
 
 def _start_worker() -> None:
-    """Makes a worker ignore Ctrl-C, which the calling process handles, and end with the calling process."""
+    """Makes a worker ignore Ctrl-C, and makes it exit when the calling process exits.
+
+    The calling process handles Ctrl-C.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -120,16 +127,16 @@ def _start_worker() -> None:
 
 
 def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Calls a function in a worker; before that, releases compiled programs if they take too much memory.
+    """Calls a function in a worker, after releasing compiled programs if they take too much memory.
 
-    A worker meets many pairs of different sizes, and compiles programs for each.
+    A worker processes many pairs of different sizes, and each size needs its own compiled programs.
     """
     release_programs()
     return function(*arguments, **options)
 
 
 class _DaskWorkers(Executor):
-    """The workers of a Dask cluster, which need the same care as local workers."""
+    """The workers of a Dask cluster. Like local workers, they release compiled programs between tasks."""
 
     def __init__(self, executor: Executor):
         self._executor = executor
@@ -143,12 +150,16 @@ class _DaskWorkers(Executor):
 def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Executor]:
     """Starts local worker processes, or connects to the workers of a Dask cluster.
 
+    The function is a context manager. The local processes or the connection end with the `with` block.
+
     **Arguments:**
 
     - `workers`: the number of local processes; ignored if `scheduler` is given.
-    - `scheduler`: the address of a Dask scheduler, for example `tcp://host:8786`.
+    - `scheduler`: the address of a Dask scheduler, for example `tcp://host:8786`; None for local processes.
 
-    **Raises:** `InputError` if Dask is not installed, or if no scheduler answers at the address.
+    **Yields:** An executor for `run_tasks`.
+
+    **Raises:** `InputError` if Dask is not installed, or if no scheduler responds at the address.
     """
     if scheduler is None:
         with Workers(workers) as executor:
@@ -158,16 +169,17 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
         from distributed import Client
     except ImportError:
         raise InputError(
-            "--scheduler needs Dask's distributed: install it with pip install 'jaxsmw[cluster]'."
+            "--scheduler needs Dask's package distributed: install it with pip install 'jaxsmw[cluster]'."
         ) from None
     try:
-        # Checked here because a client that fails for lack of a port leaves threads that log errors later.
+        # Checked first, because a client that fails for lack of a port leaves threads that log errors later.
         if urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}").port is None:
             raise ValueError("the address has no port")
         client = Client(scheduler, timeout=5, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"{scheduler}: no Dask scheduler answers there ({error}): start one, or give its address."
+            f"{scheduler}: no Dask scheduler answers at this address ({error}): start a scheduler, or give "
+            "its address."
         ) from error
     with client:
         yield _DaskWorkers(client.get_executor(pure=False, retries=2))
@@ -176,13 +188,20 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 def run_tasks(
     function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor
 ) -> Iterator[tuple[str, Result | BaseException]]:
-    """Submits every task to an executor, and yields the name and the result of each as soon as it is done.
+    """Submits every task to an executor, and yields the result of each task as soon as the task ends.
 
-    A task that raised an exception yields the exception instead of a result.
+    **Arguments:**
+
+    - `function`: called once with each task. The function and the tasks must be picklable.
+    - `tasks`: the tasks by name.
+    - `executor`: runs the calls; see `open_executor`.
+
+    **Yields:** The name of a task and its result, in the order in which the tasks end. If a task raised an
+    exception, the exception takes the place of the result.
     """
     futures = {executor.submit(function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
-        # Removed from the dictionary so that a result is freed once it was yielded.
+        # Removed from the dictionary, so that the memory of a result is freed after the result is yielded.
         name = futures.pop(future)
         error = future.exception()
         yield name, future.result() if error is None else error

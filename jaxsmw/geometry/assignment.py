@@ -25,25 +25,28 @@ def one_to_one_map(
     5000 vertices of real bodies take 15 seconds and 0.7 GiB. The time grows with the third power of the
     number of vertices.
 
-    One-to-one maps suit vertices that correspond one by one, as in shapes of the same triangulation. In
-    other shapes, areas per vertex differ, and a vertex whose match is taken gets one far away: on remeshed
-    FAUST pairs, the mean error rises from 22 to 62 thousandths of the square root of the area.
+    One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
+    triangulation. In other shapes, areas per vertex differ, and a vertex whose match is already taken gets a
+    distant match. On remeshed FAUST pairs, the mean error rises from 22 to 62 thousandths of the square root
+    of the area.
 
     **Arguments:**
 
-    - `embedding_x`, `embedding_y`: points in d dimensions, in which matches lie close together.
-    - `mask_x`, `mask_y`: False for vertices that are not matched. By default, all vertices are matched.
+    - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex, in the same
+      unit. Points of matching vertices should be close to each other.
+    - `mask_x`, `mask_y`: False for vertices that are not matched, (m,) and (n,). By default, all vertices are
+      matched.
 
     **Returns:** The vertex of Y for each vertex of X (m,); -1 for masked vertices.
 
-    **Raises:** `InputError` if Y has fewer vertices than X, both have too many, a point is not finite, or
-    array shapes do not fit.
+    **Raises:** `InputError` if Y has fewer unmasked vertices than X, the product of the numbers of vertices
+    is above 20 000², a point is not finite, or array shapes do not fit.
     """
     for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):
         if points.ndim != 2 or (mask is not None and mask.shape != points.shape[:1]):
             raise InputError(
                 f"embedding_{side} has shape {points.shape}, which does not fit mask_{side}: give one point "
-                "per row, and a mask of the same length."
+                "per row, and a mask with one entry per point."
             )
     if embedding_x.shape[1] != embedding_y.shape[1]:
         raise InputError(
@@ -70,9 +73,9 @@ def one_to_one_map(
 
 
 def check_one_to_one(vertices_x: int, vertices_y: int) -> None:
-    """Check before long work that `one_to_one_map` can match these numbers of vertices.
+    """Check, before a long computation, that `one_to_one_map` can match these numbers of vertices.
 
-    **Raises:** `InputError` if Y has fewer vertices than X, or both have too many.
+    **Raises:** `InputError` if Y has fewer vertices than X, or the product of the numbers is above 20 000².
     """
     if vertices_x > vertices_y:
         raise InputError(

@@ -1,4 +1,4 @@
-"""A smooth subspace with far fewer dimensions than the surface has vertices."""
+"""A smooth subspace of functions on a surface, with far fewer dimensions than the surface has vertices."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
 
 class Coarsening(NamedTuple):
-    """A generalized eigenproblem projected to a subspace.
+    """A generalized eigenproblem projected onto a subspace.
 
     **Attributes:**
 
     - `prolongation`: P (n, c), from coefficients to values at vertices. Its rows sum to one.
     - `stiffness`, `mass`: P^T W P and P^T A P, (c, c).
     - `smooth`: a low-pass filter for values (n, j). It keeps the frequencies that the cells can represent,
-      and slightly higher ones.
+      and slightly higher frequencies.
 
     Prolongation and smoothing are in single precision, whose errors are far below those of the subspace.
     """
@@ -36,12 +36,14 @@ class Coarsening(NamedTuple):
 
 
 def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> Coarsening:
-    """Smoothed aggregation: cells of vertices around evenly spread seeds, with smoothed indicator functions.
+    """Coarsen an eigenproblem by smoothed aggregation of vertices into cells.
 
+    The cells surround evenly spread seeds. The smoothed indicator functions of the cells span the subspace.
     Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-    problems", Computing 1996. Here a single step suffices for cells of any size, because the degree of the
-    smoothing Chebyshev polynomial is one and a half times the radius of the cells in edges. (The radius
-    itself as the degree costs a fifth less, but makes errors of eigenvalues ten times as large.)
+    problems", Computing 1996. Here a single step suffices for cells of any size. The reason is the degree of
+    the smoothing Chebyshev polynomial, which is one and a half times the radius of the cells in edges. (With
+    a degree equal to the radius, coarsening takes a fifth less time, but the errors of eigenvalues are ten
+    times as large.)
 
     **Arguments:**
 
@@ -52,7 +54,7 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     **Returns:** The projected eigenproblem.
 
     **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbors that
-    smoothed indicators would overlap everywhere, or if a large part of the area lies in large cells.
+    smoothed indicators would overlap everywhere, or if large cells cover more than a tenth of the area.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
@@ -86,7 +88,10 @@ _LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
-    """The indicator functions (n, c) of the cells. Each vertex joins the seed the fewest edges away."""
+    """Return the indicator functions (n, c) of the cells. Each cell has one seed.
+
+    Each vertex joins the cell whose seed is the smallest number of edges away.
+    """
     n = graph.shape[0]
     seeds = maximal_independent_set(graph, radius)
     _, _, nearest = dijkstra(graph, indices=seeds, unweighted=True, min_only=True, return_predecessors=True)
@@ -115,7 +120,7 @@ class _Smoother:
         self.operator = sp.diags(1 / diagonal) @ stiffness
 
     def single(self) -> _Smoother:
-        """This smoother in single precision."""
+        """Return this smoother in single precision."""
         other = copy(self)
         other.operator = self.operator.astype(np.float32)
         return other

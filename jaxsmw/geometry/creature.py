@@ -2,8 +2,9 @@
 
 A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. In the rest pose it is
 exactly mirror symmetric. Marching cubes, decimation and relaxation on the surface give well-shaped
-triangles. Joints deform the surface by smooth functions of the rest position alone. So two triangulations of
-one creature in two poses sample two smooth surfaces, and points with the same rest position correspond.
+triangles. Joints deform the surface by smooth functions that depend only on the rest position. So two
+triangulations of one creature in two poses sample two smooth surfaces. Points with the same rest position
+correspond.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from jaxsmw.geometry.mesh import Mesh
 _Vector = tuple[float, float, float]
 
 _MINIMUM_VERTICES = 500
-_REACH = 0.25  # the field is a distance up to this value; beyond, only the sign is meaningful
+_REACH = 0.25  # the field is a distance up to this value; above this value only its sign is meaningful
 _STIFFNESS = 4.0  # the sharpness of the division of the skin between bones
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
@@ -39,7 +40,7 @@ class CreaturePair:
 
     - `source`: the source mesh with m vertices.
     - `target`: the target mesh with n vertices.
-    - `truth`: the point on the target (m) that corresponds to each source vertex.
+    - `truth`: the point on the target that corresponds to each source vertex, m `SurfacePoints`.
     """
 
     source: Mesh
@@ -48,7 +49,7 @@ class CreaturePair:
 
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
-        """The ground truth as a pointwise map: the nearest corner of the triangle of each true point."""
+        """The ground truth as a pointwise map (m,): the nearest corner of the triangle of each true point."""
         return self.truth.nearest_corners(self.target)
 
 
@@ -67,7 +68,7 @@ class _Tube:
     thickness: float  # half the thickness of a plate
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """The signed distance (p,) to the nearest link of the chain."""
+        """Return the signed distance (p,) from points (p, 3) to the nearest link of the chain."""
         result = np.full(len(points), np.inf)
         for i, axis in enumerate(np.diff(self.centers, axis=0)):
             relative = planar = points - self.centers[i]
@@ -92,16 +93,17 @@ class _Tube:
 
 
 def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """The minimum, rounded by a parabola where the values differ by less than the width."""
+    """Return the minimum, rounded by a parabola where the values differ by less than the width."""
     overlap = np.maximum(1 - np.abs(a - b) / width, 0)
     return np.minimum(a, b) - overlap**2 * (width / 4)
 
 
 class _Body:
-    """One individual in the rest pose: an implicit surface around a skeleton. x is its left, y up, z forward.
+    """One individual in the rest pose: an implicit surface around a skeleton.
 
-    Parts away from the plane x = 0 are added on both sides, and their joints are called left_… and right_….
-    Random numbers warp all proportions smoothly, so that eyes stay in the head and toes on the feet.
+    The x axis points to its left, y up and z forward. Parts away from the plane x = 0 are added on both
+    sides, and their joints are called left_… and right_…. Random numbers warp all proportions smoothly, so
+    that eyes stay in the head and toes on the feet.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
@@ -116,7 +118,7 @@ class _Body:
         self._amplitudes = 0.03 * random.normal(size=(4, 4))
 
     def _individual(self, balls: str) -> np.ndarray:
-        """The balls "x y z radius, ..." as an array (p, 4), in the proportions of this individual."""
+        """Return the balls "x y z radius, ..." as an array (p, 4), in the proportions of this individual."""
         chain = np.array([ball.split() for ball in balls.split(",")], dtype=float)
         across, up, ahead = (
             chain[:, i, None] * self._frequencies[i] + (i > 0) * self._phases for i in range(3)
@@ -139,7 +141,7 @@ class _Body:
     ) -> None:
         """Add or carve a tube, or a plate, through the balls.
 
-        Tubes that project far from the body name the `joint` that moves them.
+        If the tube projects far from the body, `joint` is the name of the joint that moves the tube.
         """
         chain = self._individual(balls)
         if joint:
@@ -171,7 +173,7 @@ class _Body:
         return [("", chain)]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """The field (p,) whose zero set is the skin: negative inside, and a distance up to `_REACH`."""
+        """Return the field (p,), which is 0 on the skin, negative inside, and a distance up to `_REACH`."""
         folded = np.stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]])
         result = np.full(len(points), 2 * _REACH)
         for tube in self._tubes:
@@ -207,10 +209,10 @@ class _Body:
         return points - np.clip(value / length, -0.03, 0.03)[:, None] * normals, normals
 
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
-        """Rotation vectors (j, 3) of the joints in radians: a pose, with variations of this individual.
+        """Return the rotation vectors (j, 3) of the joints in radians, with variations of this individual.
 
-        `pose` lists joints with angles in degrees: nose down, nose to the left, left side up. A name without
-        a side stands for both sides, mirrored.
+        `pose` lists joints with three angles in degrees, which turn the nose down, turn the nose to the left,
+        and raise the left side. A joint name without a side applies to both sides, mirrored.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -222,10 +224,10 @@ class _Body:
         return np.radians(angles + 2 * random.normal(size=angles.shape))
 
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """The positions of points after the joints turn.
+        """Return the positions of points (p, 3) after the rotations of the joints.
 
-        Every point turns by its share of each joint's angle. Unlike averages of matrices, shares of an angle
-        neither shrink a bent joint nor collapse a twisted one.
+        Every point rotates by its share of each joint's angle. Unlike averages of matrices, shares of an
+        angle neither shrink a flexed joint nor collapse a twisted joint.
         """
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:
@@ -244,7 +246,7 @@ class _Body:
 
 
 def _hulls(chain: np.ndarray) -> np.ndarray:
-    """Consecutive pairs of balls (p - 1, 2, 4) of a chain."""
+    """Return the consecutive pairs of balls (p - 1, 2, 4) of a chain."""
     return np.stack([chain[:-1], chain[1:]], axis=1)
 
 
@@ -271,13 +273,16 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
     numbers, cubes = np.unique(numbers, return_inverse=True)
     nodes = np.stack(np.unravel_index(numbers, 3 * [2 * size]), axis=1) - size
     nodes = (nodes + shift) * spacing @ turn
-    # Since version 2.6.3, libigl returns a third value, too.
+    # Since version 2.6.3, libigl also returns a third value.
     vertices, faces = igl.marching_cubes(body.signed_distance(nodes), nodes, cubes.reshape(-1, 8))[:2]
     return vertices, faces
 
 
 def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Flip edges whose opposite angles sum to more than 180 degrees, in rounds without common faces."""
+    """Flip edges whose opposite angles sum to more than 180 degrees.
+
+    The edges that one round flips have no common faces.
+    """
     faces = faces.copy()
     for _ in range(20):
         edges, _, sides, corners = igl.edge_flaps(faces)
@@ -309,10 +314,11 @@ def _unit_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Well-shaped triangles, with `count` vertices, of the body in the rest pose."""
+    """Return well-shaped triangles, with `count` vertices, of the body in the rest pose."""
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per area of a grid square: the goal is four times the wanted number.
+    # Marching cubes give 1.5 vertices per grid square. The spacing gives four times the wanted number of
+    # vertices.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
@@ -322,8 +328,8 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
         spacing *= 0.8  # a grid can break or bridge parts thinner than its cells
     else:
         raise InputError("The creature of this seed has parts that touch each other: choose another seed.")
-    # Decimation collapses the shortest edges, measured in position and (a little) in normal: curved regions
-    # stay denser.
+    # Decimation collapses the shortest edges. Lengths are measured in positions and, with a small weight, in
+    # normals, so curved regions stay denser.
     features = np.hstack([vertices, 0.07 * body.project(vertices)[1]])
     features, faces, _, _ = igl.decimate(
         np.asfortranarray(features), np.asfortranarray(faces, dtype=np.int32), 2 * count - 4
@@ -371,7 +377,7 @@ def _quadruped(body: _Body) -> None:
     hindleg = ".11 .76 -.4 .15, .165 .5 -.26 .1, .15 .25 -.5 .045, .15 .07 -.45 .055"
     limb("hip knee hock", "hips", hindleg, blend=0.07)
     limb("foot", "hock", ".15 .055 -.45 .056, .15 .05 -.35 .055", blend=0.03)
-    add(".17 .5 .15 .05, .175 .37 .17 .04", blend=0.04)  # muscles lie outside: a left leg is no right leg
+    add(".17 .5 .15 .05, .175 .37 .17 .04", blend=0.04)  # muscles outside distinguish left from right
     add(".18 .46 -.28 .06, .18 .36 -.4 .045", blend=0.04)
     add(".12 .13 .23 .032, .1 .12 .27 .024", blend=0.015)  # dewclaw
     add(".165 .26 -.51 .034, .175 .28 -.55 .024", blend=0.015)  # heel
@@ -432,7 +438,7 @@ def _biped(body: _Body) -> None:
         add(finger, blend=0.01, joint="fingers")
     add(".62 .83 .04 .036, .635 .82 .11 .031, .655 .8 .165 .024", blend=0.02, joint="wrist")  # thumb
     limb("hip knee", "hips", ".105 .76 0 .12, .14 .44 .02 .075, .15 .09 -.03 .05", blend=0.06)
-    add(".165 .38 -.03 .06, .16 .26 -.05 .045", blend=0.04)  # calf, outside: a left leg is no right leg
+    add(".165 .38 -.03 .06, .16 .26 -.05 .045", blend=0.04)  # calf, outside: distinguishes left from right
     add(".13 .47 .07 .045, .13 .43 .075 .04", blend=0.03)  # kneecap
     add(".115 .13 -.03 .032, .11 .12 -.03 .03", blend=0.02)  # ankle
     limb("foot", "knee", ".15 .07 -.02 .055, .16 .055 .14 .055", blend=0.05)
@@ -563,16 +569,17 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
     The same kind, number of vertices and seed give the same triangles in every pose, so vertex i is always
     the same point of the body. In the rest pose the body is mirror symmetric in x, but its triangulation is
-    not.
+    not symmetric.
 
     **Arguments:**
 
     - `kind`, `pose`: one of `CREATURES` and one of its poses.
     - `vertices`: the number of vertices, at least 500.
-    - `seed`: the individual: its proportions, its variation of a pose, and its triangulation.
+    - `seed`: the number of the individual, at least 0. It determines the proportions, the variation of a
+      pose, and the triangulation.
 
-    **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. x is its left, y up, z
-    forward.
+    **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. The x axis points to the
+    creature's left, y up and z forward.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
     whose body intersects itself (rare: none of the first 250 seeds).
@@ -597,11 +604,12 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
 
     - `kind`: one of `CREATURES`.
     - `vertices`: the number of source vertices, at least 500.
-    - `seed`: determines the individual, the poses and the triangulations.
+    - `seed`: a number, at least 0, that determines the individual, the poses and the triangulations.
 
-    **Returns:** The `CreaturePair`.
+    **Returns:** The `CreaturePair`. Both meshes have the unit and the axes of `creature`.
 
-    **Raises:** `InputError` as in `creature`.
+    **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or a seed whose
+    body intersects itself (rare).
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")

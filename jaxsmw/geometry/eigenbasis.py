@@ -24,12 +24,12 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
 
-# For a surface of area 1, whose first non-zero eigenvalue lies between 1 and 30 for a body.
+# For a surface of area 1. The first non-zero eigenvalue of a body is then between 1 and 30.
 _SHIFT = -1e-2
 # Limits for an accurate eigenbasis: residuals relative to the largest eigenvalue, and |Phi^T A Phi - I|.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
-# Up to this many vertices, a dense solver is as fast and always succeeds.
+# Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
 _DENSE = 400
 
 
@@ -40,7 +40,7 @@ def compute_spectrum(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> Spectrum:
-    """Compute the Spectrum of a mesh, scaled to area 1 so that the unit of the file has no effect.
+    """Compute the Spectrum of a mesh, scaled to area 1 to cancel the unit of the file.
 
     The computation is in float64 on the host, from fixed seeds, so the same mesh gives the same Spectrum. The
     largest entry of each eigenvector is positive. Connected components are solved one by one and merged.
@@ -48,9 +48,9 @@ def compute_spectrum(
     The exact solver is a shift-invert Lanczos method. It counts eigenvalues and checks residuals and
     orthonormality; if it does not converge, ARPACK takes over. The approximate solver is the Rayleigh–Ritz
     method in a smooth subspace of far fewer dimensions (`jaxsmw.geometry.coarsening`). Its eigenvectors are
-    orthonormal up to rounding, too, and its time is nearly proportional to the number of vertices. It
-    requires triangles of similar size and shape; if the triangles prove to be too different, the exact
-    solver takes over with a warning. Results are cached on disk (`jaxsmw.runtime.cache`).
+    also orthonormal up to rounding, and its time is nearly proportional to the number of vertices. It
+    requires triangles of similar size and shape. If the triangles prove to be too different, the exact solver
+    takes over with a warning. Results are cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -60,10 +60,12 @@ def compute_spectrum(
     - `eigensolver`: `"exact"`; `"approximate"`, which is exact for connected components with fewer than 400
       vertices or fewer than 30 vertices per eigenvector; or `"auto"`, approximate from 50 000 vertices.
 
-    **Returns:** A `Spectrum` of JAX's default float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` with n vertices and k eigenvectors, in units in which the area of the surface is
+    1, with positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
     Unreferenced vertices are masked.
 
-    **Raises:** `InputError` if k does not fit the mesh, or the eigenproblem cannot be solved accurately.
+    **Raises:** `InputError` if k does not fit the mesh, the Laplacian or the eigensolver is unknown, or the
+    eigenproblem cannot be solved accurately; `TypeError` if `mesh` is not a `Mesh`.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return as_spectrum(mesh, *pairs)
@@ -75,9 +77,18 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """The `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type, with positions and normals."""
+    """Return the `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type.
+
+    The function adds positions, relative to the centroid and in units in which the area is 1, and outward
+    normals.
+
+    **Arguments:**
+
+    - `mesh`: the surface with n vertices, in any unit.
+    - `eigenvalues`, `eigenvectors`, `vertex_areas`: the result of `eigenpairs`.
+    """
     referenced = mesh.referenced_vertices
-    # Relative to the centroid, single precision suffices wherever the mesh lies.
+    # Relative to the centroid, single precision suffices for a mesh at any distance from the origin.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
@@ -93,7 +104,12 @@ def eigenpairs(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
-    """`compute_spectrum` in NumPy float64: eigenvalues, eigenvectors and vertex areas, for total area 1."""
+    """Compute the arrays of `compute_spectrum`, in NumPy float64.
+
+    The arguments and the errors are those of `compute_spectrum`.
+
+    **Returns:** Eigenvalues (k,), eigenvectors (n, k) and vertex areas (n,), in units in which the area is 1.
+    """
     check_kind("mesh", mesh, Mesh)
     referenced = np.flatnonzero(mesh.referenced_vertices)
     if not isinstance(number_of_eigenvectors, int | np.integer):
@@ -138,7 +154,10 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """Resolve `"auto"` for meshes that will be compared: all get the solver of the largest mesh."""
+    """Resolve `"auto"` for meshes that will be compared. All meshes get the solver of the largest mesh.
+
+    **Returns:** `"approximate"` if a mesh has 50 000 referenced vertices or more, else `"exact"`.
+    """
     most = max(int(mesh.referenced_vertices.sum()) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
 
@@ -146,7 +165,7 @@ def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
 def _solve(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest eigenpairs of all connected components together."""
+    """Return the k smallest eigenpairs of all connected components together."""
     number_of_components, component = connected_components(stiffness, directed=False)
     if number_of_components == 1:
         return _solve_component(stiffness, areas, k, eigensolver, name)
@@ -172,10 +191,11 @@ def _solve(
 def _solve_component(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest eigenpairs of one connected component, after checks of their accuracy."""
+    """Return the k smallest eigenpairs of one connected component, after checks of their accuracy."""
     n = len(areas)
-    # Renumbering puts neighbors close to each other, for the processor's cache. Besides, the ordering that
-    # keeps factors sparse is several times worse for some numberings, such as those of subdivided meshes.
+    # Renumbering stores neighbors close to each other, for the processor's cache. Besides, for some
+    # numberings, such as those of subdivided meshes, the ordering that keeps factors sparse is several times
+    # worse.
     order = reverse_cuthill_mckee(stiffness, symmetric_mode=True)
     stiffness, areas = stiffness[order][:, order], areas[order]
     mass = sp.diags(areas).tocsc()
@@ -218,7 +238,7 @@ def _dense(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.nd
 
 
 def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> SuperLU:
-    """The LU factors of W - shift A."""
+    """Return the LU factors of W - shift A."""
     # Without symmetric mode, this ordering would be slower by orders of magnitude.
     return splu(
         (stiffness - shift * mass).tocsc(),
@@ -229,15 +249,15 @@ def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> 
 
 
 def _number_below(factors: SuperLU) -> int:
-    """The number of eigenvalues below the shift, which is the number of negative pivots (Sylvester's law)."""
+    """Return the number of eigenvalues below the shift: the number of negative pivots (Sylvester's law)."""
     return int((factors.U.diagonal() < 0).sum())
 
 
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
-    """A shift amid the first k eigenvalues, and the factors of W - shift A.
+    """Return a shift in the middle of the first k eigenvalues, and the factors of W - shift A.
 
-    Weyl's law predicts a shift above k/2 eigenvalues. Where the law fails, as on a thin tube, the number of
-    eigenvalues below the shift leads to a better one.
+    Weyl's law predicts a shift above k/2 eigenvalues. If the prediction is wrong, as on a thin tube, the
+    number of eigenvalues below the shift leads to a better shift.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -251,7 +271,7 @@ def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) ->
 
 
 def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.ndarray) -> bool:
-    """Whether eigenvalues are missing below the last one. Further copies of the last one are not counted."""
+    """Return whether eigenvalues below the last one are missing. Copies of the last one are not counted."""
     if len(eigenvalues) == 1:
         return False
     shift = float(eigenvalues[-1]) * (1 - 1e-6)
@@ -261,13 +281,14 @@ def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.
 def _lanczos(
     stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int, *, tolerance: float = 1e-10
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The block Lanczos method for (W - shift A)^-1 A, without restarts, until all k eigenpairs converge.
+    """Return the k smallest eigenpairs by the block Lanczos method for (W - shift A)^-1 A, without restarts.
 
-    With a shift amid the wanted eigenvalues, they lie at both ends of the spectrum of the inverse, and two
-    products per eigenpair suffice. Keeping every vector A-orthogonal to all earlier ones costs less than
-    ARPACK's restarts. A block of b vectors finds at most b copies of a multiple eigenvalue. So eigenvalues
-    are counted, and if some are missing, larger blocks are tried. An eigenpair has converged when its
-    residual for the inverse, relative to the eigenvalue, is below the tolerance.
+    The shift is in the middle of the wanted eigenvalues, so the wanted eigenpairs are at both ends of the
+    spectrum of the inverse. Two products per eigenpair then suffice. Keeping every vector A-orthogonal to all
+    earlier vectors costs less than ARPACK's restarts. A block of b vectors finds at most b copies of a
+    multiple eigenvalue. So eigenvalues are counted, and if some eigenvalues are missing, larger blocks are
+    tried. An eigenpair has converged when its residual for the inverse, relative to the eigenvalue, is below
+    the tolerance.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """
@@ -279,17 +300,18 @@ def _lanczos(
     raise RuntimeError("not all copies of a multiple eigenvalue were found")
 
 
-# The number of vectors in a block. Several vectors per solve pay because SuperLU takes Python's lock for its
-# memory, so that two threads wait for each other. Larger blocks need more products to converge.
+# The number of vectors in a block. Several vectors per solve are faster, because SuperLU holds Python's
+# global lock while it manages memory, and two threads then wait for each other. Larger blocks need more
+# products to converge.
 _BLOCK = 4
 
 
 def _converged(
     inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first k eigenpairs that blocks of `size` vectors find.
+    """Return the first k eigenpairs that blocks of `size` vectors find.
 
-    **Raises:** `RuntimeError` if they do not converge.
+    **Raises:** `RuntimeError` if the eigenpairs do not converge.
     """
     n = mass.shape[0]
     diagonal = mass.diagonal() if mass.nnz == n else None
@@ -305,7 +327,7 @@ def _converged(
     # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
     # The initial block is smoothed, because eigenvectors are smooth: rounding errors in the weights of rough
-    # vectors would show in derivatives of the eigenvectors.
+    # vectors would affect derivatives of the eigenvectors.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -319,8 +341,8 @@ def _converged(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # The overlaps with the last blocks are large, and are removed first: otherwise their rounding errors
-        # would hide the small overlaps with earlier blocks.
+        # The large overlaps with the last blocks are removed first. Otherwise their rounding errors would
+        # hide the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
         overlaps[:, before:] += large
@@ -329,9 +351,9 @@ def _converged(
         if end < look:
             continue
         look = end + max(5, k // 20)
-        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's `eigh` holds Python's lock
+        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's `eigh` holds the GIL
         eigenvalues = shift + 1 / inverted
-        # Negative values belong to eigenvalues beyond all wanted ones.
+        # Negative values correspond to eigenvalues beyond all wanted eigenvalues.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -347,7 +369,7 @@ def _remove(
     vectors: Float64[np.ndarray, "b n"],
     weighted: Callable[[np.ndarray], np.ndarray],
 ) -> Float64[np.ndarray, "b j"]:
-    """Make vectors A-orthogonal to known vectors, in place, and return the overlaps that were removed."""
+    """Make vectors A-orthogonal to known vectors in place. Return the removed overlaps."""
     overlaps = weighted(vectors) @ known.T
     vectors -= overlaps @ known
     return overlaps
@@ -370,7 +392,7 @@ def _orthonormal(
 
 
 def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest eigenpairs by ARPACK, which restarts, to machine precision."""
+    """Return the k smallest eigenpairs to machine precision, by ARPACK, which uses restarts."""
     n = stiffness.shape[0]
     inverse = LinearOperator((n, n), matvec=_factorized(stiffness, mass, _SHIFT).solve, dtype=float)
     start = np.random.default_rng(0).standard_normal(n)
@@ -378,12 +400,14 @@ def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.n
 
 
 def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The Rayleigh–Ritz method in a coarse subspace, and again in the smoothed span of its eigenvectors.
+    """Return the k smallest eigenpairs by the Rayleigh–Ritz method in a coarse subspace.
 
-    A few more than k eigenvectors are computed, because the last ones of a subspace are the least accurate.
+    The method is applied again in the smoothed span of the resulting eigenvectors. A few more than k
+    eigenvectors are computed, because the last eigenvectors of a subspace are the least accurate.
 
-    **Raises:** `RuntimeError` if another smoothing would still lower eigenvalues much, since the subspace
-    then does not suit the mesh. (Missing eigenvalues are not counted, because that takes the factors of W.)
+    **Raises:** `RuntimeError` if the subspace does not suit the mesh: if it is too small, or if another
+    smoothing would still lower eigenvalues considerably. (Missing eigenvalues are not detected, because
+    counting them requires the factors of W.)
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -404,7 +428,8 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
-    # If all triangles are bad, the last eigenvectors are the least accurate; if a region is bad, any may be.
+    # If all triangles are bad, the last eigenvectors are the least accurate. If only a region is bad, any
+    # eigenvectors can be the least accurate.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
@@ -422,14 +447,14 @@ _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Groups of columns, because the memory may not hold another copy of all columns of a large mesh."""
+    """Return groups of columns, because a further copy of all columns may not fit into the memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
 def _check(
     stiffness: sp.csc_matrix, areas: np.ndarray, eigenvalues: np.ndarray, eigenvectors: np.ndarray
 ) -> tuple[float, float]:
-    """The largest relative residual |A^-1 W phi - lambda phi|_A / lambda_max, and max |Phi^T A Phi - I|."""
+    """Return two errors: max |A^-1 W phi - lambda phi|_A / lambda_max, and max |Phi^T A Phi - I|."""
     deviation, highest = 0.0, 0.0
     for columns in _slices(len(eigenvalues)):
         weighted = areas[:, None] * eigenvectors[:, columns]
@@ -439,5 +464,5 @@ def _check(
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
         # `np.maximum` keeps NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # A single eigenvalue, zero, gives no scale; 1 is a scale on a surface of area 1.
+    # If zero is the only eigenvalue, the residual is compared with 1, which suits a surface of area 1.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

@@ -1,11 +1,13 @@
-"""Geodesic distances on the piecewise flat surface, accurate for short distances, too.
+"""Geodesic distances on piecewise flat surfaces, accurate even for short distances.
 
 Evaluation measures the distance between a match and the true point, which is short for good matches. For
 short distances the heat method has errors of several percent. Exact window propagation takes tens of times
-longer than the method here: Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of
-triangles around each vertex are unfolded into the plane. Each vertex that a straight line within a strip
-reaches becomes a neighbor, at the exact length of the line. Paths in this graph are paths on the surface, so
-distances are never too short. On bodies they are too long by 0.03 to 0.07 % on average.
+longer than the method of this module.
+
+The method is Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of triangles around each
+vertex are unfolded into the plane. Each vertex that a straight line within a strip reaches becomes a
+neighbor, at the exact length of the line. Paths in this graph are paths on the surface, so distances are
+never too short. On bodies they are too long by 0.03 to 0.07 % on average.
 """
 
 from __future__ import annotations
@@ -30,12 +32,12 @@ from jaxsmw.runtime.cache import cached
 # The number of edges that a straight line of the graph may cross.
 _DEPTH = 10
 
-# The number of sides from which strips are unfolded at once, and of distances stored at once: both small
-# enough for the processor's cache.
+# The number of sides from which strips are unfolded at once, and the number of distances stored at once. Both
+# numbers are small enough for the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
-# Radii, in square roots of the area, of the searches for partners before the search of the whole surface.
-# Each search costs a small fraction of the next.
+# The radii, in square roots of the area, of the searches for partners before the search of the whole surface.
+# Each search takes a small fraction of the time of the next search.
 _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
@@ -62,11 +64,11 @@ class SurfacePoints:
         return SurfacePoints(self.faces[rows], self.weights[rows])
 
     def positions(self, mesh: Mesh) -> Float64[np.ndarray, "p 3"]:
-        """The positions of the points in space."""
+        """Return the positions (p, 3) of the points in space, in the unit of their mesh."""
         return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
 
     def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """The corner nearest to each point, among the corners of its face."""
+        """Return the corner of its face that is nearest to each point, as a vertex of the mesh (p,)."""
         corners = mesh.faces[self.faces]
         distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
         return corners[np.arange(len(corners)), distances.argmin(axis=1)]
@@ -75,10 +77,10 @@ class SurfacePoints:
 class _Sides(NamedTuple):
     """The 6 f sides of all triangles and of their mirror images.
 
-    Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the faces 0 … f
-    - 1 with reversed order of corners. So a line that crosses from one face into another always enters by a
-    side that runs opposite to the side by which it leaves. This holds for any orientation of the faces, and
-    for any number of faces at the edge.
+    Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
+    images: the faces 0 … f - 1 with reversed order of corners. So when a line crosses from one face into
+    another, the sides by which it leaves and enters have opposite directions. This rule holds for any
+    orientation of the faces, and for any number of faces at the edge.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -116,7 +118,7 @@ def _sides(mesh: Mesh) -> _Sides:
 
 
 def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs i and start[i] + j with 0 <= j < count[i]."""
+    """Return all pairs of i and start[i] + j with 0 <= j < count[i]."""
     row = np.repeat(np.arange(len(count)), count)
     return row, np.arange(len(row)) + np.repeat(start - (np.cumsum(count) - count), count)
 
@@ -124,9 +126,9 @@ def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
 class _Beams(NamedTuple):
     """Cones of straight lines from points, each within a strip of triangles unfolded into the plane.
 
-    The plane is the complex plane, and the point lies at 0. The side by which a beam enters or leaves a
-    triangle has its ends at `right` and `left`. The lines that pass through all sides so far lie between the
-    directions `rightmost` and `leftmost`.
+    The plane is the complex plane, and the point is at 0. The side by which a beam enters or leaves a
+    triangle has its ends at `right` and `left`. The lines that pass through all sides so far have directions
+    between `rightmost` and `leftmost`.
     """
 
     origin: Int64[np.ndarray, " b"]
@@ -141,12 +143,12 @@ class _Beams(NamedTuple):
 
 
 def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Whether b is to the left of a, seen from 0."""
+    """Return whether b is to the left of a, seen from 0."""
     return a.real * b.imag - a.imag * b.real > 0
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Whether a line of each beam reaches a position in the triangle that the beam enters."""
+    """Return whether a line of each beam reaches a position in the triangle that the beam enters."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -163,7 +165,7 @@ def _unfold(
 
     - `origin`: the number of the point of each initial beam (b,).
     - `side`: the side by which the beam leaves the triangle of the point (b,).
-    - `position`: the position of the point if this side leads from 0 to 1 (b,).
+    - `position`: the position of the point in the complex plane in which this side leads from 0 to 1 (b,).
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with one item per crossing: the beams that enter the next triangles, and the
@@ -203,7 +205,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """The straight lines to the vertices that `_unfold` finds."""
+    """Return the straight lines to the vertices that `_unfold` finds."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)
@@ -212,7 +214,7 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """The lengths of lines as a square matrix, with the shortest of several lines between the same nodes."""
+    """Return the lengths of lines as a square matrix, with the shortest line between any two nodes."""
     origins, ends, lengths = (np.concatenate(part) for part in zip(*lines, strict=True))
     key = origins.astype(np.int64) * size + ends
     order = np.lexsort([lengths, key])
@@ -224,7 +226,7 @@ def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
 
 @lru_cache(maxsize=4)
 def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
-    """The graph of the edges of a mesh, and of straight lines between vertices through strips of triangles.
+    """Return the graph of the edges of a mesh and of straight lines through strips of triangles.
 
     Graphs are cached on disk (`jaxsmw.runtime.cache`), and for the last four meshes in memory.
 
@@ -233,11 +235,12 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
     - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, shortest paths are
-        too long by 0.1 to 0.2 % on average for a depth of 6, and by 0.03 to 0.07 % for 10. A search with
-        depth 10 takes 1.4 times as long as with 6.
+        too long by 0.1 to 0.2 % on average for a depth of 6, and by 0.03 to 0.07 % for a depth of 10. A
+        search with depth 10 takes 1.4 times as long as a search with depth 6.
 
-    **Returns:** Lengths (n, n) in the unit of the mesh, symmetric. A stored zero is a line between two
-    vertices at the same position. All callers share the matrix and must not change it.
+    **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
+    mesh. A stored zero is a line between two vertices at the same position. All callers share the matrix and
+    must not change it.
     """
     n, s = len(mesh.vertices), 3 * len(mesh.faces)
 
@@ -246,7 +249,8 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
         smaller, larger = mesh.edges.T
         edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
         lines = [_Lines(smaller, larger, edge_lengths)]
-        # The first half of the sides suffices, because mirrored triangles give the same lines, mirrored.
+        # The first half of the sides suffices, because mirrored triangles give the mirror images of these
+        # lines.
         for start in range(0, s, _SIDES_AT_ONCE):
             side = np.arange(start, min(start + _SIDES_AT_ONCE, s))
             origins, ends, lengths = _lines(sides, sides.apex[side], side, sides.shape[side], depth)
@@ -273,17 +277,19 @@ def geodesic_distances(
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `sources`: s vertex indices, or `SurfacePoints`. The result is s x n, so divide very many sources into
-        several calls. For distances between given pairs, use `geodesic_distances_between`.
+    - `sources`: s vertex indices, or `SurfacePoints`. The result contains s x n numbers, so divide very
+        many sources into several calls. For distances between given pairs, use `geodesic_distances_between`.
     - `method`: `"strips"` searches `geodesic_graph`. `"exact"` propagates windows (Mitchell, Mount and
-        Papadimitriou 1987, in libigl). It works only between vertices of manifold meshes, and takes about 100
-        times as long.
-    - `limit`: distances above the limit, in the unit of the mesh, are inf. A limit saves time with
-      `"strips"`.
+        Papadimitriou 1987, in libigl). `"exact"` works only between vertices of manifold meshes, and takes
+        about 100 times as long as `"strips"`.
+    - `limit`: a distance in the unit of the mesh. Larger distances become inf. With `"strips"`, a limit saves
+        time.
 
     **Returns:** Distances (s, n) in the unit of the mesh; inf where there is no path.
 
-    **Raises:** `InputError` for sources that are not on the mesh, or if the exact method cannot be used.
+    **Raises:** `InputError` for sources that are not on the mesh. With `"exact"`, also `InputError` for
+    `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces almost without
+    height.
     """
     points = check_points(sources, mesh, "sources")
     if method == "exact":
@@ -306,19 +312,20 @@ def geodesic_distances_between(
 ) -> Float64[np.ndarray, " p"]:
     """Compute the geodesic distance between each point and its partner.
 
-    The search starts from the points or the partners, whichever has fewer different ones, and widens in
-    steps. For partners that are close together, like good matches and true points, it takes a fraction of
-    the time of all distances. It never stores p x n numbers.
+    The search starts from the points or from the partners, whichever has fewer distinct points, and widens in
+    steps. For partners that are close together, such as good matches and true points, the search takes a
+    fraction of the time of all distances. It never stores p x n numbers.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `points`, `partners`: p vertex indices or `SurfacePoints` each.
-    - `method`: as in `geodesic_distances`.
+    - `points`, `partners`: p vertex indices, or p `SurfacePoints`.
+    - `method`: `"strips"` or `"exact"`; see `geodesic_distances`.
 
     **Returns:** Distances (p,) in the unit of the mesh; inf where there is no path.
 
-    **Raises:** `InputError` as in `geodesic_distances`, or if the numbers of points and partners differ.
+    **Raises:** `InputError` for points that are not on the mesh, for different numbers of points and
+    partners, or if the exact method cannot be used (see `geodesic_distances`).
     """
     starts, ends = check_points(points, mesh, "points"), check_points(partners, mesh, "partners")
     if len(starts) != len(ends):
@@ -359,7 +366,7 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arguments of `_unfold` for points: origin, side and position of three beams out of each face."""
+    """Return the arguments of `_unfold` for points: origins, sides and positions of three beams per point."""
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]
@@ -368,7 +375,7 @@ def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray
 def _straight_distances(
     mesh: Mesh, points: SurfacePoints, partners: SurfacePoints
 ) -> Float64[np.ndarray, " p"]:
-    """The length of the straight line from each point to its partner, or inf if there is no such line."""
+    """Return the length of the straight line from each point to its partner, or inf without such a line."""
     lengths = np.linalg.norm(points.positions(mesh) - partners.positions(mesh), axis=1)
     lengths[points.faces != partners.faces] = np.inf
     sides = _sides(mesh)
@@ -389,9 +396,9 @@ def _straight_distances(
 def _network(
     mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints, ends: Int64[np.ndarray, " q"] | SurfacePoints
 ) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
-    """Add surface points to the geodesic graph, as nodes with lines from points and to ends.
+    """Add surface points to the geodesic graph, as nodes with lines from the points and to the ends.
 
-    No path leads through an added node, so a distance does not depend on the other points.
+    No path leads through an added node, so a distance does not depend on the other added points.
 
     **Returns:** The graph, the nodes of the points, and the nodes of the ends.
     """
@@ -423,11 +430,11 @@ def _network(
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
-    """A function that computes exact distances from a source to targets.
+    """Return a function that computes exact distances from a source to targets.
 
-    **Raises:** `InputError` for meshes that libigl cannot handle. It crashes at edges with three faces, stops
-    early at vertices that join several fans, and never ends on slivers. (It never ends in very small units,
-    either, so the mesh is scaled first.)
+    **Raises:** `InputError` for meshes that libigl cannot handle. libigl crashes at edges with three faces,
+    stops early at vertices that join several fans, and never ends on slivers. (libigl also never ends in very
+    small units, so the mesh is scaled first.)
     """
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -456,7 +463,7 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
 def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarray, " p"]:
     if isinstance(points, SurfacePoints):
         raise InputError(
-            "exact geodesic distances lead from vertices to vertices, not to points on faces: use "
+            "exact geodesic distances are computed between vertices, not to points on faces: use "
             "method='strips'."
         )
     return points
@@ -465,7 +472,7 @@ def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarr
 def check_points(
     points: ArrayLike | SurfacePoints, mesh: Mesh, name: str
 ) -> Int64[np.ndarray, " p"] | SurfacePoints:
-    """Check that points lie on a mesh.
+    """Check that points belong to a mesh.
 
     **Arguments:**
 
@@ -475,7 +482,8 @@ def check_points(
 
     **Returns:** The points, with int64 indices.
 
-    **Raises:** `InputError` if a point is not on the mesh.
+    **Raises:** `InputError` if a vertex or face does not exist, or barycentric weights are negative or do not
+    sum to 1.
     """
     if not isinstance(points, SurfacePoints):
         return check_indices(points, len(mesh.vertices), f"{name} on {mesh.name}: vertex")
@@ -483,7 +491,10 @@ def check_points(
 
 
 def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
-    """`check_points` for `SurfacePoints`."""
+    """Check that `SurfacePoints` belong to a mesh.
+
+    The arguments, the result and the errors are those of `check_points`.
+    """
     faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)
@@ -497,9 +508,11 @@ def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> Surfac
 
 
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
-    """Check that values are indices (p,) from 0 to `count` - 1.
+    """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
 
-    **Raises:** `InputError`, with the name of the indices, if not.
+    `name` is the name of the indices in messages, in the singular, such as "vertex".
+
+    **Raises:** `InputError` if the values are not a list of integers in this range, or are masked in part.
     """
     if np.ma.is_masked(values):
         raise InputError(f"{name} indices are masked in part: fill in the masked ones, or drop them.")

@@ -16,7 +16,11 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
-    """Resolve `"auto"`: robust if cotangents are undefined or an edge has more than two faces."""
+    """Resolve `"auto"` for a mesh.
+
+    **Returns:** `"robust"` if a triangle is degenerate or an edge has more than two faces, else
+    `"cotangent"`.
+    """
     return "robust" if mesh.degenerate_faces.any() or len(mesh.nonmanifold_edges) else "cotangent"
 
 
@@ -32,15 +36,16 @@ def assemble_laplacian(
       intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles non-manifold and badly shaped
       meshes; `"auto"` for the cotangent Laplacian unless the mesh needs the robust one (`choose_laplacian`).
 
-    **Returns:** W (n, n), symmetric and positive semi-definite, and A (n,) in squared units of the mesh. Both
-    are zero in rows of unreferenced vertices.
+    **Returns:** W (n, n), symmetric and positive semi-definite, without unit, and A (n,), in the squared unit
+    of the mesh. Both are zero in rows of unreferenced vertices.
 
-    **Raises:** `InputError` if the cotangent Laplacian is undefined.
+    **Raises:** `InputError` if the cotangent Laplacian is requested but undefined, because faces have no
+    area.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
-        # robust_laplacian requires that every vertex has a face.
+        # robust_laplacian requires that every vertex belongs to a face.
         referenced = np.flatnonzero(mesh.referenced_vertices)
         compact = np.full(len(mesh.vertices), -1)
         compact[referenced] = np.arange(len(referenced))

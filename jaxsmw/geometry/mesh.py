@@ -21,16 +21,16 @@ from jaxsmw.errors import InputError
 MeshLike: TypeAlias = Any
 
 # A triangle whose height is less than this fraction of its longest edge is degenerate. The fraction is far
-# above the rounding errors of a mesh that lies a few extents from the origin, and far below any intended
+# above the rounding errors of a mesh that is a few extents from the origin, and far below any intended
 # triangle.
 DEGENERATE_HEIGHT = 1e-10
 
-# The coordinates that can be computed with; any others are damaged, or in a useless unit.
-# Between these extents of a mesh, squares of areas (which occur in descriptors) neither overflow nor vanish.
+# Limits for coordinates. Meshes beyond these limits are damaged, or in an unsuitable unit. Between these
+# extents of a mesh, squares of areas (which occur in descriptors) neither overflow nor vanish.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
-# In median edge lengths. So far from the origin float64 rounds positions by 1e-4 of an edge. So far from the
-# middle of a mesh float32, in which maps are refined, rounds positions by 0.1 of an edge. (The meshes of the
-# data sets reach to 1e4.)
+# Limits in median edge lengths. At the first distance from the origin, float64 rounds positions by 1e-4 of an
+# edge. At the second distance from the middle of a mesh, float32 rounds positions by 0.1 of an edge; maps are
+# refined in float32. (The meshes of the data sets extend to 1e4.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
@@ -39,7 +39,7 @@ class Mesh:
     """A triangle mesh whose vertices keep their numbers from the file.
 
     Vertex i of the mesh is always vertex i of the user's file. Cleaning drops faces only. A vertex without
-    faces keeps its place and its number; `referenced_vertices` is False there.
+    faces keeps its position and its number; its entry in `referenced_vertices` is False.
 
     `read_mesh` and `make_mesh` check everything and return a `Mesh`. The class itself checks nothing.
 
@@ -48,9 +48,9 @@ class Mesh:
     - `vertices`: positions (n, 3), float64, in the unit of the file.
     - `faces`: vertex indices (f, 3), 0-based.
     - `name`: the name of the mesh in messages; for a file, its path.
-    - `notes`: repairs and peculiarities, one sentence each.
+    - `notes`: the changes by cleaning and the peculiarities of the mesh, one sentence each.
     - `dropped_faces`: the numbers (d,), 0-based and ascending, of the given faces that cleaning dropped.
-      Files that refer to faces by number count the dropped faces, too.
+      Files that refer to faces by number also count the dropped faces.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -61,7 +61,7 @@ class Mesh:
 
     @property
     def face_numbers(self) -> Int64[np.ndarray, " f"]:
-        """The number (0-based) of each face among the given faces, by which files refer to it."""
+        """The number of each face among the given faces (f,), 0-based, by which files refer to the face."""
         return np.delete(np.arange(len(self.faces) + len(self.dropped_faces)), self.dropped_faces)
 
     @cached_property
@@ -72,28 +72,32 @@ class Mesh:
 
     @cached_property
     def face_areas(self) -> Float64[np.ndarray, " f"]:
-        """Triangle areas, in the squared unit of the vertices."""
+        """The areas of the faces (f,), in the squared unit of the vertices."""
         return 0.5 * np.linalg.norm(self._area_vectors, axis=1)
 
     @cached_property
     def area(self) -> float:
-        """The total surface area."""
+        """The total surface area, in the squared unit of the vertices."""
         return float(self.face_areas.sum())
 
     @cached_property
     def vertex_areas(self) -> Float64[np.ndarray, " n"]:
-        """Lumped barycentric areas: a third of each face at the vertex. Unreferenced vertices have area 0."""
+        """The vertex areas (n,), in the squared unit of the vertices.
+
+        A vertex area is a third of the area of the faces around the vertex. Unreferenced vertices have area
+        0.
+        """
         return self._sum_at_vertices(self.face_areas / 3)
 
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "n 3"]:
-        """Unit normals: the mean normals of the faces, weighted by area.
+        """Unit normals (n, 3): the area-weighted means of the normals of the faces around each vertex.
 
         The normal is 0 where the normals of the faces cancel, and at vertices without faces.
         """
         total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        # Without cancellation, the length is about twice the area of the faces, which is six vertex areas.
+        # Without cancellation, the length is about twice the area of the faces, or six vertex areas.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
 
@@ -105,40 +109,43 @@ class Mesh:
 
     @cached_property
     def referenced_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True for vertices with at least one face, False for unreferenced vertices."""
+        """True for vertices with at least one face, False for unreferenced vertices; (n,)."""
         referenced = np.zeros(len(self.vertices), dtype=bool)
         referenced[self.faces] = True
         return referenced
 
     @cached_property
     def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
-        """True for triangles without area: their height is at most 1e-10 of their longest edge."""
+        """True for triangles without area (f,): their height is at most 1e-10 of their longest edge."""
         longest = igl.squared_edge_lengths(self.vertices, self.faces).max(axis=1)
         return 2 * self.face_areas <= DEGENERATE_HEIGHT * longest
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """Undirected edges in lexicographic order, each once, with the smaller vertex first."""
+        """The undirected edges (e, 2) in lexicographic order, each once, with the smaller vertex first."""
         return self._edge_table.edges
 
     @cached_property
     def boundary_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """Edges with exactly one face."""
+        """The edges with exactly one face, (b, 2)."""
         return self.edges[self._edge_table.faces == 1]
 
     @cached_property
     def nonmanifold_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """Edges with more than two faces."""
+        """The edges with more than two faces, (b, 2)."""
         return self.edges[self._edge_table.faces > 2]
 
     @cached_property
     def misoriented_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """Edges whose two faces have opposite orientations: both run along the edge in the same direction."""
+        """The edges whose two faces have opposite orientations, (b, 2).
+
+        The corners of both faces follow such an edge in the same direction.
+        """
         return self.edges[(self._edge_table.faces == 2) & (self._edge_table.balance != 0)]
 
     @cached_property
     def nonmanifold_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True for vertices whose faces form several fans that share no edge."""
+        """True for vertices whose faces form several fans that share no edge; (n,)."""
         one_fan = igl.is_vertex_manifold(self.faces)
         pinched = self.referenced_vertices.copy()
         pinched[: len(one_fan)] &= ~one_fan
@@ -166,19 +173,19 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Counts of everything unusual in a mesh. Nothing here is an error; `str` explains the counts.
+    """Counts of everything unusual in a mesh. None of these counts is an error. `str` explains the counts.
 
     **Attributes:**
 
-    - `vertices`, `faces`: their numbers.
+    - `vertices`, `faces`: the numbers of vertices and of faces.
     - `components`: the number of connected components, without unreferenced vertices.
     - `unreferenced_vertices`: the number of vertices that no face references.
     - `boundary_edges`, `boundary_loops`: the numbers of edges with one face, and of the connected chains that
       these edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
     - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
-    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. In a consistently
-      oriented mesh it is 0.
+    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. This number
+      is 0 in a consistently oriented mesh.
     - `degenerate_faces`: the number of triangles without area.
     """
 
@@ -194,7 +201,7 @@ class Diagnosis:
     degenerate_faces: int
 
     def sentences(self) -> tuple[str, ...]:
-        """One sentence about the size of the mesh, then one sentence for each count that is not zero."""
+        """Return one sentence about the size of the mesh, then one sentence for each unusual count."""
         shape = "open" if self.boundary_edges else "closed"
         found = [
             f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
@@ -241,7 +248,7 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     **Arguments:**
 
-    - `mesh`: a mesh of `read_mesh` or `make_mesh`.
+    - `mesh`: a mesh from `read_mesh` or `make_mesh`.
 
     **Returns:**
 
@@ -264,23 +271,28 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
 
 def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
-    """The connected components of a graph with n vertices.
+    """Compute the connected components of a graph with n vertices.
 
-    **Returns:** The number of components, and the component of each vertex (n,).
+    **Arguments:**
+
+    - `edges`: pairs of vertices (e, 2).
+    - `n`: the number of vertices.
+
+    **Returns:** The number of components, and the number of each vertex's component (n,), counted from 0.
     """
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return csgraph.connected_components(graph, directed=False)
 
 
 def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
-    """Copy to each unreferenced vertex the match of the nearest referenced vertex.
+    """Copy the match of the nearest referenced vertex to each unreferenced vertex.
 
     **Arguments:**
 
     - `mesh_x`: X with m vertices.
     - `matches`: one row per vertex of X (m, ...): matches, points, or any other values.
 
-    **Returns:** The rows (m, ...), unchanged at referenced vertices.
+    **Returns:** One row per vertex of X (m, ...). The rows of referenced vertices are unchanged.
     """
     referenced = mesh_x.referenced_vertices
     if referenced.all():
@@ -292,7 +304,7 @@ def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -
 
 
 def count_of(number: int, noun: str) -> str:
-    """A number with its noun in the singular or the plural."""
+    """Return a number with its noun in the singular or the plural."""
     if number != 1:
         noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"
     return f"{number} {noun}"
@@ -308,34 +320,38 @@ def make_mesh(
 ) -> Mesh:
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
-    All meshes are made by this function. It drops faces that repeat a vertex, and faces with the same three
-    vertices as an earlier face. It never drops or renumbers vertices.
+    The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
+    It never drops or renumbers vertices. `read_mesh` also makes its meshes by this function.
 
     **Arguments:**
 
-    - `vertices`: positions (n, 3) of any integer or float type, in any unit; copied. Or, without `faces`, a
-        mesh of another library: of trimesh, pyFM or geomfum (any object with `vertices` and `faces`), a
-        `PolyData` of PyVista (`points` and `faces`), or a tuple of vertices and faces, as in potpourri3d.
+    - `vertices`: positions (n, 3) of any integer or float type, in any unit; copied. Without `faces`, a mesh
+        of another library: an object with `vertices` and `faces`, as in trimesh, pyFM and geomfum; an object
+        with `points` and `faces`, such as a `PolyData` of PyVista; or a tuple of vertices and faces, as in
+        potpourri3d.
     - `faces`: vertex indices (f, 3), 0-based, of any integer type (or whole floats); copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position; the other
-        vertices stay, unreferenced. This closes seams along which some programs duplicate vertices.
+    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position. The other
+        vertices at this position remain, but are unreferenced. Welding closes seams along which some programs
+        duplicate vertices.
     - `notes`: sentences that precede the notes of this function.
 
     **Returns:**
 
-    A `Mesh`. Its `notes` say which faces were dropped or welded, and where vertices look like a seam.
+    A `Mesh`. Its `notes` report how many faces were dropped or welded, and how many vertices look like a
+    seam.
 
     **Raises:**
 
-    `InputError` for arrays of another shape or type, coordinates that are not finite, an extent outside
-    1e-60 … 1e60, a vertex more than 1e12 median edge lengths from the origin or (on a face) 1e6 from the
-    middle of the mesh, indices out of range, no faces, no area, or an object that is not a triangle mesh.
+    `InputError` for arrays of another shape or type, coordinates that are not finite, indices out of range,
+    no faces, no area, or an object that is not a triangle mesh. Also `InputError` for an extent outside 1e-60
+    … 1e60, a vertex more than 1e12 median edge lengths from the origin, or a vertex of a face more than 1e6
+    median edge lengths from the middle of the mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
     position = _numeric(vertices, "vertices", name)
-    with np.errstate(over="ignore"):  # wider float types may overflow; the check below reports infinities
+    with np.errstate(over="ignore"):  # wider float types can overflow; `_check_extent` reports infinities
         position = np.array(position, dtype=np.float64, order="C")
     _check_extent(position, name)
     triangles = _indices(_numeric(faces, "faces", name), len(position), name)
@@ -350,6 +366,24 @@ def make_mesh(
             if welded
             else "Welding changed nothing: no two vertices of faces have the same position."
         )
+    number, dropped = _distinct_faces(triangles)
+    notes += dropped
+    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
+    if mesh.degenerate_faces.all():
+        raise InputError(
+            f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
+            "check the positions and the faces."
+        )
+    _check_resolution(mesh)
+    return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
+
+
+def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarray, " g"], list[str]]:
+    """Return the numbers of the faces to keep (g,), and notes about the dropped faces.
+
+    Faces that repeat a vertex, and faces with the vertices of an earlier face, are dropped.
+    """
+    notes = []
     ordered = np.sort(triangles, axis=1)
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeating.any():
@@ -358,17 +392,14 @@ def make_mesh(
     first = first_equal_rows(ordered) == np.arange(len(ordered))
     if not first.all():
         notes.append(f"{count_of(int((~first).sum()), 'face')} with the vertices of an earlier face dropped.")
-    number = number[first]
+    return number[first], notes
 
-    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
-    if mesh.degenerate_faces.all():
-        raise InputError(
-            f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
-            "check the positions and the faces."
-        )
-    _check_resolution(mesh)
+
+def _unusual_vertices(mesh: Mesh) -> list[str]:
+    """Return notes about vertices that look like a seam, and about unreferenced vertices."""
+    notes = []
     boundary = np.unique(mesh.boundary_edges)
-    lowest = first_equal_rows(position[boundary])
+    lowest = first_equal_rows(mesh.vertices[boundary])
     seam = int((np.bincount(lowest, minlength=len(boundary))[lowest] > 1).sum())
     if seam:
         notes.append(
@@ -377,29 +408,29 @@ def make_mesh(
         )
     unreferenced = int((~mesh.referenced_vertices).sum())
     if unreferenced:
-        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {len(position)}.")
-    return replace(mesh, notes=tuple(notes))
+        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {len(mesh.vertices)}.")
+    return notes
 
 
 def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
-    """Refuse coordinates that are not finite, and a mesh too large or too small for float64."""
+    """Refuse coordinates that are not finite, and a mesh that is too large or too small for float64."""
     lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(lost):
         raise InputError(
-            f"{name}: {count_of(len(lost), 'vertex')}, the first of them number {lost[0]} (counted from 0), "
-            "with a coordinate that is not a finite number: repair the positions."
+            f"{name}: a coordinate is not a finite number at {count_of(len(lost), 'vertex')}, the first of "
+            f"them number {lost[0]} (counted from 0): repair the positions."
         )
     with np.errstate(over="ignore"):
         extent = float(np.ptp(position, axis=0).max())
     if extent > LARGEST_EXTENT or 0 < extent < SMALLEST_EXTENT:
         raise InputError(
-            f"{name}: the mesh measures {extent:.0e} across, which is beyond what can be computed with: "
-            "choose another unit."
+            f"{name}: the mesh measures {extent:.0e} across, which is outside the range from "
+            f"{SMALLEST_EXTENT:.0e} to {LARGEST_EXTENT:.0e}: choose another unit."
         )
 
 
 def _check_resolution(mesh: Mesh) -> None:
-    """Refuse positions that floating-point numbers cannot tell from those of their neighbors."""
+    """Refuse positions that floating-point numbers cannot distinguish from those of their neighbors."""
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
     median = np.median(lengths[lengths > 0])
     referenced = np.flatnonzero(mesh.referenced_vertices)
@@ -412,13 +443,13 @@ def _check_resolution(mesh: Mesh) -> None:
         if distances.max() > limit:
             raise InputError(
                 f"{mesh.name}: vertex {vertices[distances.argmax()]} (counted from 0) lies "
-                f"{distances.max():.0e} median edge lengths from the {place}, where numbers are too coarse "
-                "for its triangles: repair the position, or move the mesh to the origin."
+                f"{distances.max():.0e} median edge lengths from the {place}, where numbers are "
+                "rounded too much for its triangles: repair the position, or move the mesh to the origin."
             )
 
 
 def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
-    """The vertices and faces of a mesh of another library, recognized by its attributes."""
+    """Return the vertices and faces of a mesh of another library, recognized by its attributes."""
     if isinstance(mesh, tuple) and len(mesh) == 2:
         return mesh
     faces = getattr(mesh, "faces", None)
@@ -440,28 +471,28 @@ def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
 
 
 def to_host(values: Any) -> Any:
-    """Values that NumPy can convert, even if they are a PyTorch tensor on a device or with a gradient."""
+    """Return values that NumPy can convert. PyTorch tensors are detached and copied to the host."""
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 
 def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
-    """The values as a non-empty array (number of values, 3) of integers or floats."""
+    """Return the values as a non-empty array (number of values, 3) of integers or floats."""
     expected = f"{name}: {what} must be a numeric array of shape (number of {what}, 3)"
     try:
         array = np.asarray(to_host(values))
         if array.dtype == object:  # NumPy stores integers too large for any integer type as objects
             array = array.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{expected}, but these cannot be converted to one.") from None
+        raise InputError(f"{expected}, but these values cannot be converted to an array.") from None
     if array.size == 0:
         raise InputError(f"{name}: there are no {what}: a triangle mesh is needed.")
     if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{expected}, but these are {array.dtype.name} of shape {array.shape}.")
+        raise InputError(f"{expected}, but these values are {array.dtype.name} of shape {array.shape}.")
     return array
 
 
 def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
-    """The faces as valid indices of n vertices."""
+    """Return the faces as valid indices of n vertices."""
     # The comparison precedes the cast, which would wrap numbers too large for int64.
     outside = ~((faces >= 0) & (faces < n))
     if outside.any():
@@ -482,7 +513,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 
 
 def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """For each row of numbers (n, 3), the index of the first equal row."""
+    """Return the index of the first equal row for each row of numbers (n, 3), as an array (n,)."""
     order = np.lexsort(rows.T)  # a stable sort puts the first of equal rows first
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)

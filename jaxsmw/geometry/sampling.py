@@ -15,19 +15,19 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarray, " s"]:
-    """Choose vertices one by one, each as far as possible from all earlier ones, in Euclidean distance.
+    """Choose vertices one by one, each as far as possible from all earlier samples, in Euclidean distance.
 
-    The first sample is the vertex farthest from the centroid, so the samples do not depend on the order of
-    the vertices. (Ties go to the lowest index.)
+    The first sample is the vertex farthest from the centroid of the vertices, so the samples do not depend on
+    the order of the vertices. (Ties go to the lowest index.)
 
     **Arguments:**
 
     - `mesh`: the surface. Unreferenced vertices are never chosen.
     - `number_of_samples`: s, from 1 to the number of referenced vertices.
 
-    **Returns:** The samples (s,), in the order of choice.
+    **Returns:** The samples (s,), as vertex indices in the order of choice.
 
-    **Raises:** `InputError` if the mesh has fewer referenced vertices.
+    **Raises:** `InputError` if the number of samples is below 1 or above the number of referenced vertices.
     """
     referenced = np.flatnonzero(mesh.referenced_vertices)
     if not 1 <= number_of_samples <= len(referenced):
@@ -52,7 +52,7 @@ class SurfaceSamples(NamedTuple):
     **Attributes:**
 
     - `vertices`: the sampled vertices (s,), ascending.
-    - `nearest`: for every vertex of the mesh (n,), the position of the nearest sample in `vertices`.
+    - `nearest`: for every vertex of the mesh, the position of the nearest sample in `vertices` (n,).
     """
 
     vertices: Int64[np.ndarray, " s"]
@@ -63,16 +63,17 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
     This is Poisson-disk sampling: no two samples are closer in space than a distance derived from the area,
-    and no sample can be added. It is much faster than `farthest_point_samples` for many samples. Two sheets
-    of surface that are closer than this distance share their samples.
+    and no candidate can be added. (Candidates are one vertex per box of a grid with a third of this
+    distance.) For many samples, the function is much faster than `farthest_point_samples`. Two sheets of
+    surface that are closer than this distance share their samples.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices. Unreferenced vertices are never chosen.
-    - `number_of_samples`: the approximate number of samples. There are fewer where the mesh is coarser than
-      the samples.
+    - `number_of_samples`: the approximate number of samples. Where the mesh is coarser than the samples,
+      there are fewer samples.
 
-    **Returns:** The samples, and the nearest sample of each vertex.
+    **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
     candidates = np.flatnonzero(mesh.referenced_vertices)
     # A maximal set of samples at this distance has about 0.7 area / distance² members on a surface.
@@ -92,12 +93,14 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
 
 @lru_cache(maxsize=2)
 def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
-    """The edges of a coarse graph of the surface.
+    """Return the edges of a coarse graph of the surface.
 
-    These are the edges of the mesh or, if it has more than 15 000 vertices, the edges between 5000 evenly
-    spread samples. Samples are connected if an edge of the mesh connects vertices nearest to them.
+    If the mesh has at most 15 000 vertices, its edges are returned. Otherwise the nodes of the graph are
+    about 5000 evenly spread samples. Two samples are connected if an edge of the mesh connects two vertices
+    to which these samples are nearest.
 
-    **Returns:** The edges (e, 2), as pairs of vertices of the mesh, and the node nearest to each vertex (n,).
+    **Returns:** The edges (e, 2), as pairs of vertices of the mesh, and the node nearest to each vertex (n,),
+    as a vertex of the mesh.
     """
     n = len(mesh.vertices)
     if n <= _DENSE:
@@ -107,12 +110,13 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
 
 
-# Between vertices much closer together than the accuracy of maps, every map looks discontinuous.
+# Every map looks discontinuous between vertices that are much closer together than the accuracy of maps. So a
+# mesh with more vertices than the first number is reduced to the second number of samples.
 _DENSE, _SPREAD = 15_000, 5000
 
 
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
-    """A maximal set of vertices of a graph that are more than `radius` edges apart.
+    """Choose a maximal set of vertices of a graph that are more than `radius` edges apart.
 
     Luby, "A simple parallel algorithm for the maximal independent set problem", SIAM J. Comput. 1986, with a
     fixed seed.

@@ -14,7 +14,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` relies on the twos
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` relies on the values 2
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
@@ -31,15 +31,15 @@ def shot_descriptors(
 
     Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
     CVIU 2014. The weighted scatter of the neighbors gives a local reference frame, and the majority of the
-    neighbors gives its signs. The frame divides the neighborhood into 8 sectors of azimuth, 2 of elevation
-    and 2 of distance. Each sector has a histogram, with 11 bins, of the cosine between a neighbor's normal
-    and the z axis of the frame. Binning is soft in all four directions, and descriptors have unit length.
-    All vertices within the radius are neighbors, with equal weights in the histograms.
+    neighbors gives the signs of its axes. The frame divides the neighborhood into 8 sectors of azimuth, 2 of
+    elevation and 2 of distance. Each sector has a histogram, with 11 bins, of the cosine between a neighbor's
+    normal and the z axis of the frame. Binning is soft in all four directions, and descriptors have unit
+    length. All vertices within the radius are neighbors, with equal weights in the histograms.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
-    left from right. Renumbering vertices renumbers descriptors. Normals are first turned outward, by the
-    sign of the enclosed volume, so an inside-out mesh has the same descriptors. Results are cached on disk
-    (`jaxsmw.runtime.cache`).
+    left from right. Renumbering the vertices only renumbers the descriptors. Normals are first turned
+    outward, by the sign of the enclosed volume, so an inside-out mesh has the same descriptors. Results are
+    cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -49,8 +49,9 @@ def shot_descriptors(
       (`jaxsmw.geometry.sampling`). Each sample has the mean normal of the vertices nearest to it. Without
       samples, the time grows with the square of the number of vertices.
 
-    **Returns:** One row per vertex, or per sample. The row is zero for unreferenced vertices and for vertices
-    with fewer than 3 neighbors; a warning is given if more than 1 % of the vertices have so few.
+    **Returns:** One row per vertex (n, 352) or, with samples, per sample (s, 352), float32, without unit. The
+    row is zero for unreferenced vertices and for vertices with fewer than 3 neighbors. The function warns if
+    more than 1 % of the vertices have fewer than 3 neighbors.
 
     **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbors.
     """
@@ -114,7 +115,7 @@ def _describe(
     distance: Float64[np.ndarray, " p"],
     radius: float,
 ) -> Float64[np.ndarray, "b 352"]:
-    """The descriptors of a block of vertices.
+    """Return the descriptors of a block of vertices.
 
     **Arguments:**
 
@@ -163,7 +164,10 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """One right-handed frame per center: rows x, y, z; x along the largest scatter, z along the least."""
+    """Return one right-handed frame per center, with the axes x, y and z as rows.
+
+    The x axis points along the largest scatter, and the z axis along the smallest scatter.
+    """
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
         for column in range(row, 3):
@@ -186,7 +190,7 @@ def _local_frames(
 def _two_nearest(
     coordinate: Float64[np.ndarray, " p"],
 ) -> list[tuple[Int32[np.ndarray, " p"], Float64[np.ndarray, " p"]]]:
-    """The two nearest bins and their linear weights."""
+    """Return the two nearest bins and their linear weights."""
     lower = np.floor(coordinate)
     upper_weight = coordinate - lower
     bins = lower.astype(np.int32)

@@ -1,4 +1,4 @@
-"""The maps from which refinement starts: one module per way to find one."""
+"""The initial maps, from which refinement begins. Each kind of initial map has its own module."""
 
 from jaxsmw.initial_maps.initial_map import INITIAL_MAPS, InitialMap, initial_map
 

@@ -21,7 +21,7 @@ from jaxsmw.initial_maps.signatures import SIGNATURES, signature_features
 from jaxsmw.pair import Pair
 
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
-"""The initial maps that have a name."""
+"""The names of the initial maps."""
 
 
 def initial_map(
@@ -31,18 +31,27 @@ def initial_map(
     *,
     init: InitialMap | ArrayLike | SurfacePoints = "shot",
 ) -> Int64[np.ndarray, " m"]:
-    """The map T: X -> Y (m,) from which refinement starts; `match` explains the choices.
+    """Compute the pointwise map T: X -> Y from which refinement begins.
 
-    On a mesh with more than 15 000 vertices, descriptors are computed and compared at about 10 000 evenly
-    spread vertices. The other vertices of X get the match of the nearest of these.
+    On a mesh with more than 15 000 vertices, descriptors are computed and compared only at about 10 000
+    evenly spread samples. Each other vertex of X gets the match of the nearest sample. An unreferenced vertex
+    of X gets the match of the nearest referenced vertex.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: see `paired_spectra`.
-    - `init`: a name, a map (m,) of vertices or `SurfacePoints` of Y, or landmarks (l, 2).
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units; see `paired_spectra`.
+    - `init`: one of the following; `match` explains the choices.
+        - a name: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`.
+        - a pointwise map: vertices of Y (m,), or m `SurfacePoints` on Y, which are moved to the nearest
+          corner of their face.
+        - landmarks (l, 2): a vertex of X and its match on Y in each row.
 
-    **Raises:** `InputError` for an unknown name, or an array that is neither a map nor landmarks;
-    `ArithmeticError` if the functional map of `"functional"` cannot be computed.
+    **Returns:** The initial map (m,), 0-based vertices of Y.
+
+    **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, indices out of
+    range, a spectrum of another mesh, or a mesh that is too coarse for SHOT. `ArithmeticError` if the
+    functional map of `"functional"` cannot be computed.
     """
     if isinstance(init, SurfacePoints):
         init = check_surface_points(init, pair.mesh_y, "initial map").nearest_corners(pair.mesh_y)
@@ -51,7 +60,9 @@ def initial_map(
         return extend_to_unreferenced(pair.mesh_x, nearest_map(sampled, *_features(sampled, init)))
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
-        raise InputError(f"the initial map has type {given.dtype}; it must be integer vertex indices.")
+        raise InputError(
+            f"the initial map has type {given.dtype}, but must be integer vertex indices: convert it."
+        )
     if given.ndim == 1:
         return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
     sampled = sample_pair(pair, spectrum_x, spectrum_y)
@@ -64,7 +75,7 @@ _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 
 
 def _features(sampled: SampledPair, init: str) -> _Features:
-    """The features of both shapes by which a named initial map compares vertices."""
+    """Compute the features of both shapes by which a named initial map compares vertices."""
     if init == "shot":
         features = paired_shot(sampled)
     elif init in SIGNATURES:
@@ -73,17 +84,18 @@ def _features(sampled: SampledPair, init: str) -> _Features:
         features = functional_features(sampled)
     else:
         raise InputError(
-            f"{init!r} is not an initial map: choose {', '.join(INITIAL_MAPS)}, landmarks or a map."
+            f"{init!r} is not an initial map: choose {', '.join(INITIAL_MAPS)}, or give landmarks or a map."
         )
     return _finite(sampled, init, features)
 
 
 def _finite(sampled: SampledPair, init: str, features: _Features) -> _Features:
+    """Return the features after a check that all of their numbers are finite."""
     if all(np.isfinite(of_shape).all() for of_shape in features):
         return features
     raise InputError(
         f"{sampled.pair.name}: {init} descriptors are not defined on these meshes with "
-        f"{len(sampled.x.spectrum.eigenvalues)} eigenvectors; ask for more eigenvectors, or give another "
+        f"{len(sampled.x.spectrum.eigenvalues)} eigenvectors: compute more eigenvectors, or choose another "
         "initial map."
     )
 
@@ -92,11 +104,14 @@ def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     mesh_x, mesh_y = pair.meshes
     given = check_indices(init, len(mesh_y.vertices), f"initial map on {mesh_y.name}: vertex")
     if len(given) != (m := len(mesh_x.vertices)):
-        raise InputError(f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices.")
+        raise InputError(
+            f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices: give one entry "
+            "for each vertex."
+        )
     unused = ~mesh_y.referenced_vertices[given] & mesh_x.referenced_vertices
     if unused.any():
         raise InputError(
-            f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that no face uses, "
-            f"for example {np.flatnonzero(unused)[0]} to {given[unused][0]}; send them to the surface."
+            f"the initial map sends {unused.sum()} vertices to unreferenced vertices of {mesh_y.name} (in no "
+            f"face), for example {np.flatnonzero(unused)[0]} to {given[unused][0]}: choose vertices in faces."
         )
     return given

@@ -1,4 +1,4 @@
-"""Initial maps from landmarks: SHOT beside geodesic distances to the landmarks."""
+"""Features of initial maps from landmarks: SHOT and geodesic distances to the landmarks."""
 
 from __future__ import annotations
 
@@ -9,34 +9,39 @@ from jaxsmw.descriptors import SampledPair, SampledShape, paired_shot
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
-# The weight of distances to landmarks beside SHOT descriptors, which are unit vectors: half the square root
-# of the area weighs as much as a SHOT descriptor. From 1 to 3 the maps of real pairs hardly change.
+# The weight of distances to landmarks relative to SHOT descriptors, which are unit vectors. With this weight,
+# a distance of half the square root of the area has the norm of a SHOT descriptor. Weights from 1 to 3 give
+# nearly the same maps of real pairs.
 _WEIGHT = 2.0
-# The distance to another connected component, farther than any distance on one component.
+# The distance between two connected components, larger than any distance within a component.
 _ELSEWHERE = 100.0
 
 
 def landmark_features(
     sampled: SampledPair, landmarks: np.ndarray
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """SHOT, and geodesic distances to each landmark.
+    """Compute SHOT and weighted geodesic distances to each landmark, on both shapes.
 
     **Arguments:**
 
-    - `landmarks`: (l, 2), a vertex of X and its match on Y in each row.
+    - `sampled`: the pair. Rows of the result belong to the vertices of its sampled spectra.
+    - `landmarks`: integers (l, 2), a vertex of X and its match on Y in each row.
 
-    **Raises:** `InputError` for another shape, contradicting landmarks, or vertices outside of the surface.
+    **Returns:** The features of X (m, d) and of Y (n, d): 352 columns of SHOT, then l columns of distances.
+
+    **Raises:** `InputError` if `landmarks` has another shape, gives two matches to one vertex of X, or
+    contains a number that is not a referenced vertex; or if a mesh is too coarse for SHOT.
     """
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
-            f"the initial map is an array of shape {landmarks.shape}; it must be (m,) for a map or (l, 2) "
+            f"the initial map is an array of shape {landmarks.shape}: give shape (m,) for a map, or (l, 2) "
             "for landmarks."
         )
     for vertex in landmarks[:, 0]:
         if len(matches := np.unique(landmarks[landmarks[:, 0] == vertex, 1])) > 1:
             raise InputError(
                 f"landmark {vertex} of {sampled.x.mesh.name} has two matches, {matches[0]} and {matches[1]} "
-                f"of {sampled.y.mesh.name}: keep one of them."
+                f"of {sampled.y.mesh.name}: remove one of them."
             )
     features = []
     zipped = zip(sampled.sides, landmarks.T, sampled.pair.units_of_length, paired_shot(sampled), strict=True)
@@ -46,8 +51,8 @@ def landmark_features(
         if outside.any() or not mesh.referenced_vertices[vertices].all():
             wrong = vertices[outside] if outside.any() else vertices[~mesh.referenced_vertices[vertices]]
             raise InputError(
-                f"landmark {wrong[0]} is not a vertex of the surface of {mesh.name}, whose vertices are 0 to "
-                f"{len(mesh.vertices) - 1}."
+                f"landmark {wrong[0]} is not a vertex in a face of {mesh.name}: choose a vertex in a face, "
+                f"from 0 to {len(mesh.vertices) - 1}."
             )
         features.append(np.hstack([described, distance_features(side, vertices.astype(np.int64), unit)]))
     return features[0], features[1]
@@ -56,7 +61,17 @@ def landmark_features(
 def distance_features(
     side: SampledShape, vertices: Int64[np.ndarray, " l"], unit: float
 ) -> Float[np.ndarray, "n l"]:
-    """Weighted geodesic distances from the compared vertices to some vertices, as features beside SHOT."""
+    """Compute weighted geodesic distances to some vertices, as additional features to SHOT.
+
+    **Arguments:**
+
+    - `side`: the shape.
+    - `vertices`: vertices of the mesh (l,), to which distances are computed.
+    - `unit`: the length that counts as 1, in the unit of the mesh; see `Pair.units_of_length`.
+
+    **Returns:** The distances (n, l), multiplied by their weight relative to SHOT. Rows belong to the samples
+    of the shape, or to all vertices of a shape without samples.
+    """
     distances = geodesic_distances(side.mesh, vertices).T / unit
     distances = _WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)
     return distances if side.samples is None else distances[side.samples.vertices]

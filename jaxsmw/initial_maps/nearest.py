@@ -1,4 +1,4 @@
-"""Maps by nearest neighbours of features, from the compared vertices to all vertices."""
+"""Pointwise maps by nearest neighbours of features, extended from samples to all vertices."""
 
 from __future__ import annotations
 
@@ -15,14 +15,32 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 def nearest_map(
     sampled: SampledPair, features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"]
 ) -> Int64[np.ndarray, " m"]:
-    """The map of all vertices of X (m,) by nearest neighbours among features of the compared vertices."""
+    """Compute a pointwise map of all vertices of X by nearest neighbours of features.
+
+    **Arguments:**
+
+    - `sampled`: the pair.
+    - `features_x`, `features_y`: the features (a, d) and (b, d). Rows belong to the samples of a shape, or to
+      all vertices of a shape without samples.
+
+    **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
+    """
     return to_all_vertices(sampled, nearest_among_compared(features_x, features_y, sampled.y))
 
 
 def nearest_among_compared(
     features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"], y: SampledShape
 ) -> Int64[np.ndarray, " a"]:
-    """For every row of features of X the nearest compared vertex of Y."""
+    """Find the nearest row of `features_y` for every row of `features_x`.
+
+    **Arguments:**
+
+    - `features_x`, `features_y`: the features (a, d) and (b, d). Rows belong to the samples of a shape, or to
+      all vertices of a shape without samples.
+    - `y`: the shape Y. Rows that its spectrum masks are never chosen.
+
+    **Returns:** The row numbers (a,).
+    """
     dtype = y.spectrum.eigenvectors.dtype
 
     def padded(rows: np.ndarray) -> Array:
@@ -36,7 +54,16 @@ def nearest_among_compared(
 
 
 def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int64[np.ndarray, " m"]:
-    """A map between compared vertices as a map of all vertices of X to vertices of Y."""
+    """Extend a map between samples to a pointwise map of all vertices of X.
+
+    **Arguments:**
+
+    - `sampled`: the pair.
+    - `found`: for each sample of X (a,), the number of a sample of Y. On a shape without samples, all
+      vertices count as samples.
+
+    **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
+    """
     if sampled.y.samples is not None:
         found = sampled.y.samples.vertices[found]
     return found if sampled.x.samples is None else found[sampled.x.samples.nearest]

@@ -1,4 +1,7 @@
-"""The initial maps `wks`, `hks` and `wavelet`: spectral signatures, which do not tell left from right."""
+"""Features of the initial maps `wks`, `hks` and `wavelet`: spectral signatures.
+
+Spectral signatures do not tell left from right.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,20 @@ SIGNATURES: dict[str, Callable[[Spectrum], Array]] = {
     "hks": heat_kernel_signature,
     "wavelet": wavelet_signature,
 }
-"""The signatures by the names of their initial maps."""
+"""The functions that compute the signatures, by the names of their initial maps."""
 
 
 def signature_features(
     sampled: SampledPair, name: str
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """A signature of both shapes."""
+    """Compute a spectral signature on both shapes.
+
+    **Arguments:**
+
+    - `sampled`: the pair. Rows of the result belong to the vertices of its sampled spectra.
+    - `name`: a key of `SIGNATURES`.
+
+    **Returns:** The features of X (m, d) and of Y (n, d).
+    """
     signature = SIGNATURES[name]
     return np.asarray(signature(sampled.x.spectrum)), np.asarray(signature(sampled.y.spectrum))

@@ -1,8 +1,8 @@
 """Pointwise maps and landmarks in files.
 
 A file is text with one row per line, an array in NumPy's `.npy` format, or a matrix in MATLAB's `.mat`
-format. Files do not say whether their indices count from 0 or from 1. By default `.mat` files count from 1,
-as MATLAB does, and all others from 0; `index_base` overrides the default.
+format. Files do not say whether their indices count from 0 or from 1. By default, indices count from 1 in
+`.mat` files, as in MATLAB, and from 0 in all other files. The argument `index_base` overrides the default.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ def read_pointwise_map(
 
     **Arguments:**
 
-    - `path`: the file: text with one target vertex per line, or `.npy` or `.mat`. A `.mat` file holds a
-      single list of numbers, or a list called `T12` among other variables (X is shape 1, Y is shape 2).
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y.
-    - `index_base`: the index of the first vertex in the file. The default is 1 for `.mat` files and 0 for all
-      others, although many published maps count from 1.
+    - `path`: a text file with one target vertex per line, a `.npy` file or a `.mat` file. A `.mat` file
+      contains either a single list of numbers, or a list called `T12` among other variables (X is shape 1, Y
+      is shape 2).
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
+    - `index_base`: the index of the first vertex in the file, 0 or 1. The default is 1 for `.mat` files and 0
+      for all other files, although many published maps count from 1.
 
     **Returns:** The target vertex of each source vertex (m,), 0-based.
 
-    **Raises:** `InputError` that names the file, the line and the fault.
+    **Raises:** `InputError` if the file cannot be read, does not have m rows, or contains a number that is
+    not a vertex of Y. The message names the file, the line and the fault.
     """
     table = Table(Path(path), columns=1)
     table.require_rows(mesh_x)
@@ -52,11 +54,18 @@ def read_landmarks(
 ) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks: pairs of a vertex of X and the corresponding vertex of Y, in two columns.
 
-    **Arguments:** As in `read_pointwise_map`; a `.mat` file holds a single matrix of two columns.
+    **Arguments:**
 
-    **Returns:** Pairs of vertices (l, 2), 0-based.
+    - `path`: a text file with two vertices per line, a `.npy` file or a `.mat` file. A `.mat` file contains
+      either a single matrix with two columns, or such a matrix called `T12` among other variables.
+    - `mesh_x`, `mesh_y`: the source X and the target Y.
+    - `index_base`: the index of the first vertex in the file, 0 or 1. The default is 1 for `.mat` files and 0
+      for all other files.
 
-    **Raises:** `InputError` that names the file, the line and the fault.
+    **Returns:** Pairs of vertices (l, 2), 0-based: a vertex of X and its match on Y in each row.
+
+    **Raises:** `InputError` if the file cannot be read, does not have two columns, or contains a number that
+    is not a vertex. The message names the file, the line and the fault.
     """
     table = Table(Path(path), columns=2)
     base = table.index_base(index_base)
@@ -64,25 +73,26 @@ def read_landmarks(
 
 
 def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) -> None:
-    """Write a pointwise map T: X -> Y. The file appears whole or not at all.
+    """Write a pointwise map T: X -> Y.
 
-    The suffix of the file chooses the format: `.mat` for the column `T12` of 1-based vertices, as MATLAB
-    counts; `.npy` for an array of 0-based vertices; any other for text with one 0-based vertex per line.
+    The suffix of the file determines the format. A `.mat` file contains the column `T12` of 1-based vertices,
+    as in MATLAB. A `.npy` file contains an array of 0-based vertices. A file with any other suffix is text
+    with one 0-based vertex per line. The write is atomic: an incomplete file never appears under this name.
 
     **Arguments:**
 
     - `path`: the file to create or to replace.
-    - `pointwise_map`: the target vertex of each source vertex (m,), 0-based.
+    - `pointwise_map`: the target vertex of each source vertex (m,), 0-based integers.
 
     **Raises:** `InputError` if the array is not a list of vertices, the suffix belongs to another kind of
-    file, or the file cannot be written.
+    file (see `check_map_name`), or the file cannot be written.
     """
     check_map_name(path)
     targets = np.asarray(pointwise_map)
     if targets.ndim != 1 or targets.dtype.kind not in "iu" or (targets < 0).any():
         raise InputError(
-            f"{path}: the array to write is not a pointwise map: give one vertex index, at least 0, for each "
-            "source vertex."
+            f"{path}: the array to write is not a pointwise map: give one non-negative integer vertex index "
+            "for each source vertex."
         )
     if is_mat_file(path):
         write_variables(path, {POINTWISE_MAP: targets.astype(np.float64) + 1})
@@ -95,14 +105,19 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Refuse a name whose suffix promises something other than a pointwise map.
+    """Check that the suffix of a file name does not belong to another kind of file than a pointwise map.
+
+    **Arguments:**
+
+    - `path`: the name of a file, which need not exist.
 
     **Raises:** `InputError` for the suffixes `.npz`, `.baryc_gt`, `.vts` and `.json`.
     """
     suffix = Path(path).suffix.lower()
     if suffix in (".npz", ".baryc_gt", ".vts", ".json"):
         raise InputError(
-            f"{path}: a map is written as text, .npy or .mat, not as {suffix}: choose another name."
+            f"{path}: maps are written as text, .npy or .mat, not as {suffix}: choose a name with another "
+            "suffix."
         )
 
 
@@ -113,18 +128,23 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 class Table:
     """The numbers of a file as a matrix: one row per line of text, or per row of a stored array.
 
-    Maps, landmarks and ground truth are read through this class, so that all refuse the same faults with the
-    same sentences. In text, numbers are separated by spaces or tabs. Commas are refused: a decimal comma
-    would turn the single number `3,5` into the two vertices 3 and 5.
+    Maps, landmarks and ground truth are all read through this class, so the same fault causes the same
+    message. In text files, spaces or tabs separate numbers. Commas are refused: with a decimal comma, the
+    single number `3,5` would become the two vertices 3 and 5.
+
+    **Arguments:**
+
+    - `path`: the file: `.npy`, `.mat`, or text with any other suffix.
+    - `columns`: the required number of columns; None accepts any number.
 
     **Attributes:**
 
     - `path`: the file.
-    - `values`: the numbers, float64.
+    - `values`: the numbers (rows, columns), float64.
     - `rows`, `columns`: the shape of `values`.
 
-    **Raises:** `InputError` if the file cannot be read, or is not a matrix of numbers with the given
-    `columns`.
+    **Raises:** `InputError` if the file cannot be read, or does not contain a matrix of numbers with the
+    required number of columns.
     """
 
     def __init__(self, path: Path, *, columns: int | None = None) -> None:
@@ -140,26 +160,27 @@ class Table:
         self.rows, self.columns = self.values.shape
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
-        """An array of the `.npy` format. Where one column is wanted, a list or a single row will do."""
+        """Read an array in the `.npy` format. If `columns` is 1, the array may be a list or a single row."""
         data = io.BytesIO(read_bytes(self.path))
         try:
             array = np.lib.format.read_array(data, allow_pickle=False)
         except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
             raise InputError(
-                f"{self.path}: is not an array that NumPy saved: give such an array, or text."
+                f"{self.path}: is not an array saved by NumPy: save it with numpy.save, or as text."
             ) from error
         is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
         table = array.reshape(-1, 1) if is_list else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size
         if not fits or table.dtype.kind not in "iuf":
-            wanted = "a list of numbers" if columns == 1 else f"numbers in {columns or 'some'} columns"
+            expected = "a list of numbers" if columns == 1 else f"numbers in {columns or 'some'} columns"
             raise InputError(
-                f"{self.path}: holds {array.dtype} of shape {array.shape}: give the file with {wanted}."
+                f"{self.path}: contains an array of type {array.dtype} and shape {array.shape}: give a file "
+                f"with {expected}."
             )
         return table.astype(np.float64)
 
     def _read_text(self, columns: int | None) -> list[list[str]]:
-        """The words of each line, all of them numbers."""
+        """Read a text file, and return the words of each line after a check that every word is a number."""
         path = self.path
         try:
             text = read_bytes(path).decode("utf-8-sig")
@@ -177,73 +198,81 @@ class Table:
             for word in words:
                 if not is_number(word):
                     mark = re.search("[,;]", word)
-                    cure = f"separate numbers by spaces, not by {mark[0]!r}" if mark else "correct the line"
+                    cure = (
+                        f"separate numbers with spaces, not with {mark[0]!r}" if mark else "correct the line"
+                    )
                     raise InputError(f"{self.place(row)}: {word[:40]!a} is not a number: {cure}.")
             if len(words) != columns:
                 raise InputError(
-                    f"{self.place(row)}: has {count_of(len(words), 'number')} where {columns} should be: "
-                    "correct the line, or give the file that belongs here."
+                    f"{self.place(row)}: has {count_of(len(words), 'number')} instead of {columns}: "
+                    "correct the line, or give another file."
                 )
         return rows
 
     def index_base(self, chosen: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
-        """The index of the first vertex or face in the file.
+        """Return the index of the first vertex or face in the file, 0 or 1.
 
         **Arguments:**
 
-        - `chosen`: the user's choice, or None.
-        - `default`: the base of this kind of file, unless MATLAB wrote it: `.mat` files count from 1.
+        - `chosen`: the user's choice; None uses the default for this file.
+        - `default`: the default for files other than `.mat` files. For `.mat` files the default is 1.
         """
         if chosen is not None:
             return chosen
         return 1 if is_mat_file(self.path) else default
 
     def place(self, row: int) -> str:
-        """The file and the line of a row, as messages name them."""
+        """Return the file and the line of a row (0-based), as text for messages."""
         return f"{self.path}, {'line' if self._is_text else 'row'} {row + 1}"
 
     def word(self, row: int, column: int) -> str:
-        """A number as the file writes it, for messages."""
+        """Return a number as it is written in the file, for messages. Row and column are 0-based."""
         return self._words[row][column][:40] if self._is_text else f"{self.values[row, column]:.15g}"
 
     def require_rows(self, mesh_x: Mesh) -> None:
-        """Check that there is one row for each source vertex.
+        """Check that the file has one row for each vertex of X.
 
-        **Raises:** `InputError` if not.
+        **Raises:** `InputError` if the number of rows differs from the number of vertices of `mesh_x`.
         """
         m = len(mesh_x.vertices)
         if self.rows != m:
             raise InputError(
                 f"{self.path}: has {self.rows} {'lines' if self._is_text else 'rows'}, but one is "
-                f"needed for each of the {m} vertices of {mesh_x.name}: give the file that belongs to this "
-                "pair, in this direction."
+                f"needed for each of the {m} vertices of {mesh_x.name}: give the file for this pair, from "
+                "source to target."
             )
 
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """A column as 0-based vertices of a mesh.
-
-        **Raises:** `InputError` for the first row that is not a vertex.
-        """
-        return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
-
-    def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """A column as 0-based indices.
+        """Return a column as 0-based vertices of a mesh (p,), where p is the number of rows.
 
         **Arguments:**
 
         - `column`: the position of the column.
-        - `count`: the number of things that the indices count.
-        - `what`: the name of these things, in the plural, for messages.
-        - `base`: the index of the first thing in the file.
+        - `mesh`: the mesh to which the vertices belong.
+        - `base`: the index of the first vertex in the file.
 
-        **Raises:** `InputError` for the first row that is not an index, with the other base as the cure if
-        that base fits.
+        **Raises:** `InputError` that names the first row whose number is not a vertex of the mesh.
+        """
+        return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
+
+    def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
+        """Return a column as 0-based indices (p,), where p is the number of rows.
+
+        **Arguments:**
+
+        - `column`: the position of the column.
+        - `count`: the number of indexed elements, such as vertices or faces.
+        - `what`: the name of these elements in messages, in the plural.
+        - `base`: the index of the first element in the file, 0 or 1.
+
+        **Raises:** `InputError` that names the first row whose number is not a valid index. If all numbers
+        are consistent with the other index base, the message recommends it.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)
         if not good.all():
             row = int(good.argmin())
-            cure = "correct it, or give the file that belongs to this pair"
+            cure = "correct the number, or give the file for this pair"
             if base == 0 and numbers.min() >= 1 and numbers.max() == count:
                 cure = "the file looks 1-based: pass index_base=1 (--index-base 1)"
             elif base == 1 and numbers.min() == 0 and numbers.max() < count:

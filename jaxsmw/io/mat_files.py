@@ -1,9 +1,9 @@
-"""Variables of MATLAB's `.mat` files.
+"""Variables in MATLAB's `.mat` files.
 
-MATLAB code for functional maps uses these names: `T12` is the pointwise map from shape 1 to shape 2, counted
-from 1. `C21` is the functional map that takes functions on shape 2 to functions on shape 1. A shape is a
-struct with the fields `surface` (`X`, `Y`, `Z`, `TRIV`), `evals`, `evecs` and the areas `A`. Our X is shape
-1 and our Y is shape 2, so `T12` is T and `C21` is C.
+MATLAB code for functional maps uses the following names. `T12` is the pointwise map from shape 1 to shape 2,
+with 1-based vertices. `C21` is the functional map that takes functions on shape 2 to functions on shape 1. A
+shape is a struct with the fields `surface` (`X`, `Y`, `Z`, `TRIV`), `evals`, `evecs` and the areas `A`. In
+this library, X is shape 1 and Y is shape 2, so `T12` is T and `C21` is C.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
 
 
 def is_mat_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a name has the suffix `.mat`."""
+    """Return whether a file name has the suffix `.mat`, in upper or lower case."""
     return Path(path).suffix.lower() == ".mat"
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
-    """The variables of a `.mat` file. Structs become dictionaries, and axes of length 1 are dropped.
+    """Parse the variables of a `.mat` file. Structs become dictionaries, and axes of length 1 are dropped.
 
     **Arguments:**
 
     - `data`: the contents of the file.
 
-    **Returns:** The variables by name.
+    **Returns:** A dictionary from the names of the variables to their values.
 
-    **Raises:** `InputError`, without the name of the file, if the contents are damaged, too large for the
-    memory (`jaxsmw.io.mat_format`), or in format 7.3.
+    **Raises:** `InputError` if the contents are damaged, implausibly large (see
+    `jaxsmw.io.mat_format.unpacked`), or in format 7.3. The message does not name the file.
     """
     try:
         variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
@@ -49,16 +49,19 @@ def parse_variables(data: bytes) -> dict[str, Any]:
         raise
     except Exception:  # damaged files can raise any exception in SciPy
         raise InputError(
-            "is damaged or not a .mat file: save it again, with save(..., '-v7') in MATLAB or "
+            "is damaged or not a .mat file: save it again, with save(..., '-v7') in MATLAB or with "
             "scipy.io.savemat in Python."
         ) from None
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
 def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file with `parse_variables`.
+    """Read the variables of a `.mat` file of any size; see `parse_variables`.
 
-    **Raises:** `InputError` that names the file.
+    **Returns:** A dictionary from the names of the variables to their values.
+
+    **Raises:** `InputError` if the file cannot be read or `parse_variables` refuses its contents. The message
+    names the file.
     """
     data = read_bytes(path, largest=None)
     try:
@@ -68,14 +71,14 @@ def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mapping[str, Any]]:
-    """Find all structs that have certain fields.
+    """Find all structs, including nested structs, that have all of the given fields.
 
     **Arguments:**
 
     - `variables`: the variables of a file. The file itself counts as a struct with an empty name.
-    - `fields`: the names of the fields.
+    - `fields`: the names of the required fields.
 
-    **Returns:** The structs, nested ones included, by name, such as `S.surface`.
+    **Returns:** A dictionary from the full names of the structs, such as `S.surface`, to the structs.
     """
     found: dict[str, Mapping[str, Any]] = {}
     pending: list[tuple[str, Mapping[str, Any]]] = [("", variables)]
@@ -92,20 +95,22 @@ def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mappin
 def read_matrix(
     path: str | os.PathLike[str], name: str, *, columns: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Read a matrix of real numbers.
+    """Read a matrix of real numbers from a `.mat` file.
 
-    A single matrix in a file may have any name. A single row is read as a column, because lists in MATLAB may
-    be either.
+    If the file contains only one suitable matrix, that matrix may have any name. A matrix with a single row
+    is read as a column, because a list in MATLAB may be either a row or a column.
 
     **Arguments:**
 
     - `path`: the file.
-    - `name`: the name of the matrix, if the file holds more than one.
-    - `columns`: the number of columns; matrices with another number are ignored. 1 stands for a list.
+    - `name`: the name of the matrix, if the file contains several suitable matrices.
+    - `columns`: the number of columns, where 1 means a list. Matrices with another number of columns are
+      ignored. None accepts any number of columns.
 
-    **Returns:** The matrix as float64 (rows, columns).
+    **Returns:** The matrix (rows, columns), float64.
 
-    **Raises:** `InputError` that names the file and lists its variables if there is no such matrix.
+    **Raises:** `InputError` if the file cannot be read, contains no suitable matrix, or contains several and
+    none has the given name. The message names the file and the variables.
     """
     variables = read_variables(path)
     matrices = {key: value for key, value in variables.items() if is_real(value)}
@@ -120,17 +125,17 @@ def read_matrix(
         (chosen,) = matrices.values()
     elif matrices:
         raise InputError(
-            f"{path}: holds more than one {what}, {', '.join(matrices)}: save the right one as {name}."
+            f"{path}: contains more than one {what} ({', '.join(matrices)}): save the right one as {name}."
         )
     else:
-        held = f"holds {', '.join(map(ascii, variables))}" if variables else "is empty"
-        raise InputError(f"{path}: {held}, but no {what}: save one as {name}.")
+        found = f"contains {', '.join(map(ascii, variables))}" if variables else "is empty"
+        raise InputError(f"{path}: {found}, but no {what}: save the {what} as {name}.")
     matrix = chosen.astype(np.float64)
     return matrix[:, None] if matrix.ndim == 1 else matrix
 
 
 def is_real(value: Any) -> bool:
-    """Whether a variable is a list or a matrix of real numbers."""
+    """Return whether a variable is a non-empty list or matrix of real numbers."""
     return (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "iuf"
@@ -140,7 +145,14 @@ def is_real(value: Any) -> bool:
 
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
-    """Write variables for MATLAB, lists as columns. The file appears whole or not at all.
+    """Write variables to a `.mat` file. Lists are written as columns.
+
+    The write is atomic: an incomplete file never appears under this name.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace.
+    - `variables`: a dictionary from names to arrays, numbers, or dictionaries (which become structs).
 
     **Raises:** `InputError` if a variable is too large for the format, or the file cannot be written.
     """

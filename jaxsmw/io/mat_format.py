@@ -1,8 +1,8 @@
-"""The size of a `.mat` file's contents, checked before SciPy reads them.
+"""A check of the size of a `.mat` file's contents before SciPy reads them.
 
-A compressed variable can unpack to a thousand times its size, and a cell array can declare a billion cells
-that the file does not hold. SciPy allocates memory for all of that. So this module unpacks the variables
-itself, up to a limit, and adds up the sizes of all arrays, nested ones included.
+A compressed variable can unpack to a thousand times its size. A cell array can declare a billion cells that
+the file does not contain. SciPy allocates memory for all of these bytes and cells. Therefore this module
+unpacks the variables itself, up to a limit, and adds up the sizes of all arrays, including nested arrays.
 
 Format: The MathWorks, "MAT-File Format", level 5.
 """
@@ -20,19 +20,19 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import largest_contents
 
 _MATRIX, _COMPRESSED = 14, 15
-# By data type; 1 for all others.
+# The number of bytes per number, by data type; 1 for all data types that are not listed.
 _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18: 4}
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# SciPy takes 10 microseconds for an array however small, as long as for a few KiB of numbers.
+# SciPy takes at least 10 microseconds for every array, which is as long as it takes for a few KiB of numbers.
 _LEAST_BYTES_OF_ARRAY = 4096
-# The names of a struct's fields: 64 bytes for each of 1000 fields. Shapes have about ten fields.
+# The longest list of a struct's field names: 64 bytes for each of 1000 fields. Shapes have about ten fields.
 _LONGEST_NAMES = 64 * 1000
 
 
 def unpacked(data: bytes) -> bytes:
-    """Unpack all variables of a file and check their sizes.
+    """Unpack all variables of a `.mat` file and check their sizes.
 
     **Arguments:**
 
@@ -40,13 +40,16 @@ def unpacked(data: bytes) -> bytes:
 
     **Returns:** The contents of an equivalent file in which no variable is compressed.
 
-    **Raises:** `InputError`, without the name of the file, for format 7.3 and for contents larger than
-    `largest_contents`; `ValueError`, `struct.error` or `zlib.error` if the file is damaged.
+    **Raises:** `InputError` for format 7.3, and for contents larger than
+    `jaxsmw.runtime.files.largest_contents`, which is 1 GiB or, if larger, four times the size of the file.
+    The message does not name the file. `ValueError`, `struct.error` or `zlib.error` if the file is damaged.
     """
     if data.startswith((b"MATLAB 7.3", b"\x89HDF")) or matfile_version(io.BytesIO(data))[0] == 2:
-        raise InputError("is in MATLAB's format 7.3, which is not read: save it there with save(..., '-v7').")
+        raise InputError(
+            "is in MATLAB's format 7.3, which is not supported: save it in MATLAB with save(..., '-v7')."
+        )
     if matfile_version(io.BytesIO(data))[0] == 0:
-        return data  # level 4 knows neither compression nor nesting
+        return data  # level 4 has neither compression nor nesting
     order = "<" if data[126:128] == b"IM" else ">"
     remaining = largest_contents(len(data))
     elements, position = [data[:128]], 128
@@ -64,7 +67,7 @@ def unpacked(data: bytes) -> bytes:
 
 
 def _inflated(data: bytes, order: str, limit: int) -> bytes:
-    """A variable, unpacked to the size that it declares."""
+    """Unpack a variable to the size that its tag declares; `limit` is the largest allowed size in bytes."""
     stream = zlib.decompressobj()
     tag = stream.decompress(data, 8)
     _, size = struct.unpack(f"{order}II", tag)
@@ -77,13 +80,13 @@ def _inflated(data: bytes, order: str, limit: int) -> bytes:
 
 
 def _memory(variable: bytes, order: str, limit: int) -> int:
-    """The memory that a variable takes, in bytes, if every number becomes a float64."""
+    """Return the memory in bytes that a variable takes if every number becomes a float64."""
     memory, pending = 0, [(0, len(variable), False)]
     while pending:
         position, stop, in_container = pending.pop()
         while position + 8 <= stop:
             kind, size = struct.unpack_from(f"{order}II", variable, position)
-            if kind >> 16:  # a small element, whose data of up to 4 bytes lie within the tag
+            if kind >> 16:  # a small element, whose tag contains its data of up to 4 bytes
                 position += 8
                 continue
             start, end = position + 8, position + 8 + size
@@ -104,9 +107,9 @@ def _memory(variable: bytes, order: str, limit: int) -> int:
 
 
 def _is_container(variable: bytes, start: int, size: int, order: str) -> bool:
-    """Whether an array is a cell, struct or object array.
+    """Return whether an array is a cell, struct or object array.
 
-    **Raises:** `ValueError` if it declares more elements than it holds.
+    **Raises:** `ValueError` if the array declares more elements than it contains.
     """
     kind, length, flags, _, _, bytes_of_shape = struct.unpack_from(f"{order}6I", variable, start)
     if (kind, length) != (6, 8):
@@ -116,12 +119,12 @@ def _is_container(variable: bytes, start: int, size: int, order: str) -> bool:
     shape = struct.unpack_from(f"{order}{min(bytes_of_shape, size) // 4}i", variable, start + 24)
     # Every element takes at least a tag of 8 bytes.
     if min(shape) < 0 or math.prod(shape) > size // 8:
-        raise ValueError("a cell array declares more cells than it holds")
+        raise ValueError("a cell array declares more cells than it contains")
     return True
 
 
 def _too_large() -> InputError:
     return InputError(
-        "would take more than 1 GiB of memory and more than four times its own size: save only the variables "
-        "that are needed."
+        "would take more than 1 GiB of memory and more than four times the size of the file: save only the "
+        "variables that are needed."
     )

@@ -1,8 +1,9 @@
 """Mesh files: OFF, OBJ, PLY, STL and MAT.
 
-We read files with our own code, because vertex i must stay vertex i and a damaged file must end in one
-sentence. libigl's reader accepts indices out of range and aborts the process on some bad headers. trimesh
-splits and drops vertices of OBJ files, and cannot read polygons of mixed size from binary PLY files.
+This module has its own readers for two reasons: vertices must keep their order, and a damaged file must cause
+one clear error message. libigl's reader accepts indices out of range and aborts the process on some invalid
+headers. trimesh splits and drops vertices of OBJ files, and cannot read polygons of mixed size from binary
+PLY files.
 """
 
 from __future__ import annotations
@@ -28,23 +29,27 @@ from jaxsmw.runtime.files import atomic_write, read_bytes
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     """Read a triangle mesh from an OFF, OBJ, PLY, STL or MAT file.
 
-    Vertex i of the mesh is the i-th vertex of the file. An STL file has no vertices, only corners of
-    triangles: corners at exactly the same position become one vertex, and vertices are numbered in the order
-    of the file. Faces with more than three corners are split into fans of triangles. Colors, normals and
-    texture coordinates are ignored.
+    Vertex i of the mesh is the i-th vertex of the file. An STL file contains only the corners of triangles,
+    so corners at exactly the same position become one vertex. Vertices are numbered in the order in which
+    their positions first appear. Faces with more than three corners are split into fans of triangles. Colors,
+    normals and texture coordinates are ignored.
 
     **Arguments:**
 
-    - `path`: the file. The suffix, in either case, tells the format. OFF: text, also with colors or normals
-        (COFF, NOFF). OBJ: `v` and `f` lines. PLY: text and binary, either byte order. STL: text and binary.
-        MAT: a struct `surface` with X, Y, Z (or VERT) and TRIV, counted from 1, as in the TOSCA data set. The
-        struct may be a field of another struct, as in the files of `write_spectrum`.
-    - `weld`: as in `make_mesh`. Welding changes nothing in an STL file, because its corners are merged
-        already.
+    - `path`: the file. The suffix, in upper or lower case, determines the format:
+        - OFF: text, optionally with colors or normals (COFF, NOFF).
+        - OBJ: the `v` and `f` lines.
+        - PLY: text or binary, in either byte order.
+        - STL: text or binary.
+        - MAT: a struct with X, Y, Z (or VERT) and 1-based TRIV, such as `surface` in the TOSCA data set. The
+          struct may be a field of another struct, as in the files of `write_spectrum`.
+    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position; see
+        `make_mesh`. Welding has no effect on an STL file, whose corners are always merged.
 
     **Returns:**
 
-    A `Mesh` named by its path. Its `notes` list repairs and peculiarities.
+    A `Mesh` whose name is its path. Positions keep the unit of the file, and faces are 0-based. The `notes`
+    of the mesh list repairs and peculiarities.
 
     **Raises:**
 
@@ -56,8 +61,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     parse = _PARSERS.get(path.suffix.lower())
     if parse is None:
         raise InputError(
-            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the mesh to "
-            f"one of {', '.join(_PARSERS)}."
+            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
+            f"mesh to one of {', '.join(_PARSERS)}."
         )
     try:
         polygons = parse(data)
@@ -72,7 +77,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
 
 class _Polygons(NamedTuple):
-    """The polygons of a file: positions, the corners of all faces in one list, and the size of each face."""
+    """The polygons of a file: vertex positions, the corners of all faces in one list, and face sizes."""
 
     vertices: Float64[np.ndarray, "n 3"]
     corners: np.ndarray
@@ -81,11 +86,11 @@ class _Polygons(NamedTuple):
 
 
 def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
-    """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1); (t, 3)."""
+    """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1), and return all triangles (t, 3)."""
     if (sizes < 3).any():
         at = int((sizes < 3).argmax())
         raise InputError(
-            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs three: remove the face."
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
         )
     per_face = sizes - 2
     apex = np.repeat(np.cumsum(sizes) - sizes, per_face)
@@ -94,14 +99,14 @@ def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
 
 
 def _text(data: bytes) -> str:
-    """Text without comments, with a newline at the end of each line on all systems."""
-    # Latin-1 decodes all bytes, and the parsers only look for ASCII.
+    """Decode the text of a file, convert all line ends to newlines, and remove comments."""
+    # Latin-1 decodes every byte, and the parsers need only ASCII characters.
     text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
     return re.sub("#[^\n]*", "", text) if "#" in text else text
 
 
 def _numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines columns"]:
-    """The numbers in the first columns of each line."""
+    """Return the numbers in the first columns of each line."""
     if not lines:
         return np.empty((0, columns))
     try:
@@ -111,8 +116,8 @@ def _numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines colum
     except ValueError:
         culprit = next((line for line in lines if not _starts_with_numbers(line, columns)), lines[0])
         raise InputError(
-            f"{_excerpt(culprit)} stands where {count_of(columns, 'number')} should be: "
-            "the file is damaged or its header is wrong, export the mesh again."
+            f"{_excerpt(culprit)} is written where {count_of(columns, 'number')} should be, so the file is "
+            "damaged or its header is wrong: export the mesh again."
         ) from None
 
 
@@ -122,19 +127,19 @@ def _starts_with_numbers(line: str, columns: int) -> bool:
 
 
 def _excerpt(line: str) -> str:
-    """The beginning of a line, escaped for a message."""
+    """Return the first 40 characters of a line, escaped for a message."""
     return ascii(" ".join(line.split())[:40])
 
 
 def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], Int64[np.ndarray, " f"]]:
-    """Corners and sizes of faces written `size corner corner …`, one per line."""
+    """Parse faces written as `size corner corner …`, one per line, into corners and sizes."""
     sizes = _numbers(lines, 1)[:, 0]
     longest = max(map(len, lines), default=0)
     possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
     if not possible.all():
         raise InputError(
-            f"{_excerpt(lines[int(possible.argmin())])} stands where a face should be, with its number of "
-            "corners first: the file is damaged or its header is wrong, export the mesh again."
+            f"{_excerpt(lines[int(possible.argmin())])} is written where a face with its number of corners "
+            "should be, so the file is damaged or its header is wrong: export the mesh again."
         )
     sizes = sizes.astype(np.int64)
     starts = np.cumsum(sizes) - sizes
@@ -147,9 +152,9 @@ def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], I
 
 
 def _parse_off(data: bytes) -> _Polygons:
-    """Object File Format, text, in three dimensions: http://www.geomview.org/docs/html/OFF.html."""
+    """Parse the Object File Format, as text with 3D vertices: http://www.geomview.org/docs/html/OFF.html."""
     lines = [line for line in _text(data).split("\n") if line and not line.isspace()]
-    # Some programs write the counts on the line of the keyword, even without a space.
+    # Some programs write the counts on the line of the keyword, sometimes without a space between them.
     keyword = re.match(r"\s*(?:ST)?C?N?OFF\s*(.*)", lines[0]) if lines else None
     if keyword is None:
         raise InputError("does not begin with OFF, COFF or NOFF: export the mesh again as an OFF file.")
@@ -158,19 +163,22 @@ def _parse_off(data: bytes) -> _Polygons:
     lines = ([keyword[1]] if keyword[1] else []) + lines[1:]
     counts = re.match(r"\s*(\d{1,18})\s+(\d{1,18})(\s|$)", lines[0]) if lines else None
     if counts is None:
-        raise InputError("lacks the numbers of vertices and faces after OFF: export the mesh again.")
+        raise InputError(
+            "lacks the numbers of vertices and faces after the keyword OFF: export the mesh again."
+        )
     n, f = int(counts[1]), int(counts[2])
     lines = lines[1:]
     if len(lines) != n + f:
         raise InputError(
-            f"the header promises {n} vertices and {f} faces, but {count_of(len(lines), 'line')} follow: "
-            "the file is truncated or its header is wrong, export the mesh again."
+            f"the header declares {n} vertices and {f} faces, but is followed by "
+            f"{count_of(len(lines), 'line')}, so the file is truncated or its header is wrong: export the "
+            "mesh again."
         )
     return _Polygons(_numbers(lines[:n], 3), *_polygon_lines(lines[n:]))
 
 
 def _parse_obj(data: bytes) -> _Polygons:
-    """Wavefront OBJ: the `v` and `f` statements. All groups and objects become one mesh."""
+    """Parse the `v` and `f` statements of Wavefront OBJ. All groups and objects become one mesh."""
     text = re.sub(r"\\\n+", " ", _text(data)) if b"\\" in data else _text(data)
     vertex, face = (re.compile(rf"^[^\S\n]*{keyword}(?!\S)[^\S\n]*(.*)$", re.MULTILINE) for keyword in "vf")
     vertices = _numbers(vertex.findall(text), 3)
@@ -182,7 +190,7 @@ def _parse_obj(data: bytes) -> _Polygons:
         lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
     corners, sizes = _polygon_lines([f"{len(line.split())} {line}" for line in lines])
     if ends_in_face and sizes[-1] < 3:
-        raise InputError("ends in the middle of a face: the file is truncated, export the mesh again.")
+        raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
     if (corners < 0).any():  # negative indices count backward from the last vertex above the face
@@ -197,10 +205,10 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 
 
 def _parse_stl(data: bytes) -> _Polygons:
-    """Stereolithography, a list of triangles without shared vertices: https://www.fabbers.com/tech/STL_Format."""
+    """Parse an STL file, a list of separate triangles: https://www.fabbers.com/tech/STL_Format."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
-    # Binary files may begin with "solid", too, so the length decides.
+    # Binary files may also begin with "solid", so the length of the file determines whether it is binary.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
         corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
@@ -212,12 +220,12 @@ def _parse_stl(data: bytes) -> _Polygons:
         if len(corners) != 3 * facets or "endsolid" not in text:
             raise InputError(
                 f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in all "
-                "are not triangles: the file is truncated or damaged, export the mesh again."
+                "are not triangles, so the file is truncated or damaged: export the mesh again."
             )
     elif len(data) >= header:
         raise InputError(
-            f"the header promises {count} triangles, which does not fit the file's {len(data)} bytes: "
-            "the file is truncated or not in the STL format, export the mesh again."
+            f"the header declares {count} triangles, which does not fit the file's {len(data)} bytes, so the "
+            "file is truncated or not in the STL format: export the mesh again."
         )
     else:
         raise InputError("is neither a text nor a binary STL file: export the mesh again.")
@@ -238,33 +246,35 @@ _PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endia
 
 
 class _Property(NamedTuple):
-    """A property of a PLY element: one number per row, or a list whose length has the type `length`."""
+    """A property of a PLY element: one number per row, or a list whose length is stored as type `length`."""
 
     type: np.dtype
     length: np.dtype | None
 
 
 class _Column(NamedTuple):
-    """All numbers of one property, and the number of them in each row."""
+    """All numbers of one property in one array, and the count of numbers in each row."""
 
     values: np.ndarray
     sizes: np.ndarray
 
 
 def _parse_ply(data: bytes) -> _Polygons:
-    """Polygon File Format, text and binary: https://paulbourke.net/dataformats/ply/."""
+    """Parse the Polygon File Format, text or binary: https://paulbourke.net/dataformats/ply/."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
         raise InputError("does not begin with ply: export the mesh again as a PLY file.")
     newline = first[1]
     last = re.search(newline + rb"end_header[ \t]*" + newline, data)
     if last is None:
-        raise InputError("the header has no end: the file is truncated or damaged, export the mesh again.")
+        raise InputError(
+            "the header has no end_header line, so the file is truncated or damaged: export the mesh again."
+        )
     header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
     encoding, elements = _ply_header(header)
     body = data[last.end() :]
     if encoding == "ascii":
-        # The text becomes a binary body in which every number is a float64.
+        # Text is converted to a binary body of float64 numbers, so one parser serves both encodings.
         words = body.split()
         try:
             if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
@@ -273,7 +283,9 @@ def _parse_ply(data: bytes) -> _Polygons:
         except ValueError:
             texts = (word.decode("latin-1") for word in words)
             culprit = _excerpt(next(text for text in texts if not is_number(text, finite=False)))
-            raise InputError(f"{culprit} stands where a number should be: export the mesh again.") from None
+            raise InputError(
+                f"{culprit} is written where a number should be: export the mesh again."
+            ) from None
 
     tables, offset = {}, 0
     for name, (count, properties) in elements.items():
@@ -281,29 +293,31 @@ def _parse_ply(data: bytes) -> _Polygons:
             tables[name], offset = _ply_table(body, offset, count, properties)
         except EOFError:
             raise InputError(
-                f"the header promises {count} rows of {_excerpt(name)}, but the file ends within them: "
-                "the file is truncated or its header is wrong, export the mesh again."
+                f"the header declares {count} rows of {_excerpt(name)}, but the file ends within these rows, "
+                "so the file is truncated or its header is wrong: export the mesh again."
             ) from None
     if body[offset:].strip():
-        raise InputError("continues after the last promised row: the header is wrong, export the mesh again.")
+        raise InputError(
+            "continues after the last declared row, so the header is wrong: export the mesh again."
+        )
 
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
     if len(position) < 3:
-        raise InputError("has no x, y and z for its vertices: export the mesh again.")
+        raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
     corners = face.get("vertex_indices", face.get("vertex_index"))
     if corners is None:
-        raise InputError("has no faces with vertex_indices: a triangle mesh is needed.")
+        raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
     return _Polygons(np.stack(position, axis=1, dtype=np.float64), *corners)
 
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
-    """The encoding, and the number of rows and the properties of each element."""
+    """Return the encoding, and by element name the number of rows and the properties."""
     formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
     if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
         raise InputError(
-            f"the header names none of the formats {', '.join(_PLY_BYTE_ORDERS)} in version 1.0: "
-            "export the mesh again."
+            f"the header does not name exactly one of the formats {', '.join(_PLY_BYTE_ORDERS)} in version "
+            "1.0: export the mesh again."
         )
     encoding = formats[0][0]
 
@@ -332,7 +346,7 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
                 properties[name] = _Property(number(kind), None)
             case _:
                 raise InputError(
-                    f"the header has a line {_excerpt(line)} that makes no sense: export the mesh again."
+                    f"the header contains the invalid line {_excerpt(line)}: export the mesh again."
                 )
     return encoding, elements
 
@@ -340,9 +354,9 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
 def _ply_table(
     body: bytes, offset: int, count: int, properties: dict[str, _Property]
 ) -> tuple[dict[str, _Column], int]:
-    """The columns of the table that begins at `offset`, and the end of the table.
+    """Return the columns of the table that begins at `offset`, and the offset of the table's end.
 
-    **Raises:** `EOFError` if the body ends early.
+    **Raises:** `EOFError` if the body ends within the table.
     """
     shortest = sum((p.length or p.type).itemsize for p in properties.values())
     if count * shortest > len(body) - offset:
@@ -350,7 +364,8 @@ def _ply_table(
     if not count or not properties:
         return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
 
-    # If all lists of a property have the same length, as in most files, the table is one array of records.
+    # If all lists of a property have the same length, as in most files, the table is one array of records,
+    # and NumPy reads all rows at once.
     spans, _ = _ply_row(body, offset, properties)
     sizes = {name: size for name, (_, size) in zip(properties, spans, strict=True)}
     lengths = {name: f"length of {name}" for name, (_, length) in properties.items() if length}
@@ -379,7 +394,7 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """The start and the number of each property's values in a row, and the end of the row."""
+    """Return the offset and the count of each property's values in a row, and the offset of the row's end."""
     spans = []
     for kind, length in properties.values():
         size = 1
@@ -390,8 +405,7 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
             written = np.frombuffer(body, length, 1, start)[0]
             if not 0 <= written <= len(body) or written % 1:
                 raise InputError(
-                    f"a list claims to have {written:.15g} numbers: the file is damaged, export the mesh "
-                    "again."
+                    f"a list declares {written:.15g} numbers, so the file is damaged: export the mesh again."
                 )
             size = int(written)
         spans.append((offset, size))
@@ -402,11 +416,11 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
 
 
 def _parse_mat(data: bytes) -> _Polygons:
-    """MATLAB's format: a struct, at any depth, with faces TRIV and columns X, Y, Z (or a matrix VERT)."""
+    """Parse a struct of a `.mat` file, at any depth, with faces TRIV and columns X, Y, Z (or matrix VERT)."""
     structs = find_structs(parse_variables(data), "TRIV")
     if len(structs) > 1:
         raise InputError(
-            f"holds {len(structs)} shapes, {', '.join(structs)}: save each shape in a separate file."
+            f"contains {len(structs)} shapes ({', '.join(structs)}): save each shape in a separate file."
         )
     name, surface = next(iter(structs.items()), ("", {}))
     columns = ("X", "Y", "Z") if "X" in surface else ("VERT",)
@@ -423,8 +437,8 @@ def _parse_mat(data: bytes) -> _Polygons:
         faces = surface["TRIV"].astype(np.float64)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(
-            "holds no struct 'surface' with X, Y, Z (or VERT) and TRIV, as the TOSCA shapes do: save such a "
-            "struct, or export the mesh as OFF or PLY."
+            "contains no struct 'surface' with X, Y, Z (or VERT) and TRIV, as in the TOSCA data set: save "
+            "such a struct, or export the mesh as OFF or PLY."
         )
     return _Polygons(vertices, faces.ravel() - 1, np.full(len(faces), 3))
 
@@ -442,15 +456,15 @@ MESH_SUFFIXES = tuple(_PARSERS)
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None) -> None:
     """Write a mesh to an OFF (text) or PLY (binary, little endian) file.
 
-    `read_mesh` reads back the same vertices, bit for bit, and the same faces. The file appears whole or not
-    at all.
+    `read_mesh` then returns the same faces, and bit for bit the same vertex positions. The write is atomic:
+    an incomplete file never appears under this name.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix, `.off` or `.ply`, tells the format.
-    - `mesh`: the mesh.
-    - `colors`: red, green and blue of each vertex (n, 3), as floats from 0 to 1 or as uint8. An OFF file with
-        colors begins with COFF.
+    - `path`: the file to create or to replace. The suffix, `.off` or `.ply`, determines the format.
+    - `mesh`: the mesh with n vertices.
+    - `colors`: the red, green and blue of each vertex (n, 3), as floats from 0 to 1 or as uint8. An OFF file
+        with colors begins with COFF.
 
     **Raises:**
 
@@ -460,7 +474,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | 
     form = _FORMATTERS.get(path.suffix.lower())
     if form is None:
         raise InputError(
-            f"{path}: meshes are not written as {path.suffix!r}: choose a name that ends in "
+            f"{path}: meshes cannot be written as {path.suffix!r}: choose a name that ends in "
             f"{' or '.join(_FORMATTERS)}."
         )
     content = form(mesh, None if colors is None else _bytes_of_colors(colors, len(mesh.vertices)))
@@ -477,12 +491,14 @@ def _bytes_of_colors(colors: ArrayLike, n: int) -> UInt8[np.ndarray, "n 3"]:
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
-        raise InputError("colors are neither uint8 nor floats from 0 to 1: convert the colors.")
+        raise InputError(
+            "colors are neither uint8 nor floats from 0 to 1: convert the colors to one of these."
+        )
     return np.rint(255 * array.astype(np.float64)).astype(np.uint8)
 
 
 def _format_off(mesh: Mesh, colors: UInt8[np.ndarray, "n 3"] | None) -> bytes:
-    # `repr` gives the shortest text that is read back as the same float.
+    # `repr` returns the shortest text that parses to the same float.
     vertices = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     if colors is not None:
         vertices = [f"{v} {r} {g} {b} 255" for v, (r, g, b) in zip(vertices, colors.tolist(), strict=True)]

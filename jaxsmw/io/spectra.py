@@ -1,6 +1,7 @@
-"""Spectra and functional maps of files and of other libraries; `docs/exchange.md` explains the conventions.
+"""Spectra and functional maps from files and from other libraries.
 
-No other library is imported here. Objects of other libraries are recognized by their attributes.
+`docs/exchange.md` explains the conventions. This module recognizes objects of other libraries by their
+attributes and does not import these libraries.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from jaxsmw.io.mat_files import (
 )
 from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
 
-# A shape of another library, and a matrix that may be sparse; see `make_spectrum`.
+# A shape of another library, and a dense or sparse mass matrix; see `make_spectrum`.
 SpectrumLike: TypeAlias = Any
 MassMatrix: TypeAlias = Any
 
-# In single precision, eigenvectors of a lumped mass matrix deviate less from orthonormality. Eigenvectors of
-# a finite-element mass matrix deviate far more when they are measured in lumped areas.
+# Eigenvectors of a lumped mass matrix deviate less from orthonormality, even in single precision.
+# Eigenvectors of a finite-element mass matrix deviate far more with respect to lumped areas.
 _ORTHONORMALITY_TOLERANCE = 1e-3
-# Allowance for rounding errors of eigenvalues, relative to the largest.
+# The tolerated rounding error of eigenvalues, relative to the largest eigenvalue.
 _EIGENVALUE_TOLERANCE = 1e-5
 
 
@@ -47,26 +48,26 @@ def make_spectrum(
     *,
     name: str = "spectrum",
 ) -> Spectrum:
-    """Check an eigenbasis of your own or of another library, and scale its surface to area 1.
+    """Check an eigenbasis that was computed elsewhere, and scale its surface to area 1.
 
-    For a surface of area a, eigenvalues are multiplied by a, eigenvectors by the square root of a, and areas
-    are divided by a. The result is a `Spectrum` like those of `compute_spectrum`. A functional map between
-    bases on areas a_X and a_Y becomes a map between the scaled bases when it is multiplied by sqrt(a_Y /
-    a_X).
+    For a surface of area a, eigenvalues are multiplied by a, eigenvectors are multiplied by the square root
+    of a, and vertex areas are divided by a. To convert a functional map between bases on surfaces of areas
+    a_X and a_Y to the scaled bases, multiply the map by sqrt(a_Y / a_X).
 
     **Arguments:**
 
-    - `eigenvalues`: (k,), ascending and not negative. Or, as the only argument, a shape of another library:
-        a `TriMesh` of pyFM after `process` (any object with `eigenvalues`, `eigenvectors` and
-        `vertex_areas`), or a shape of geomfum with its `basis`.
-    - `eigenvectors`: (n, k), orthonormal with respect to the areas.
-    - `vertex_areas`: (n,), or the lumped mass matrix (n, n), dense or sparse. Vertices without area are
-      masked.
+    - `eigenvalues`: (k,), ascending and not negative, in units of 1 / length². Alternatively, as the only
+        argument, a shape of another library: a `TriMesh` of pyFM after `process` (any object with
+        `eigenvalues`, `eigenvectors` and `vertex_areas`), or a shape of geomfum with its `basis`.
+    - `eigenvectors`: (n, k), orthonormal with respect to the vertex areas.
+    - `vertex_areas`: (n,), in units of length², or the lumped mass matrix (n, n), dense or sparse. Vertices
+        of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
 
-    **Returns:** A `Spectrum` of JAX's default float type, for total area 1.
+    **Returns:** A `Spectrum` of JAX's default float type, for total area 1, without positions and normals.
 
-    **Raises:** `InputError` if the arrays do not fit each other or are not an eigenbasis.
+    **Raises:** `InputError` if the arrays do not fit each other, are not finite real numbers, or are not an
+    eigenbasis.
     """
     if eigenvectors is None and vertex_areas is None:
         eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
@@ -80,7 +81,7 @@ def make_spectrum(
         )
     total = areas.sum()
     if (areas < 0).any() or not total > 0:
-        raise InputError(f"{name}: vertex areas are negative, or all zero: correct the areas.")
+        raise InputError(f"{name}: some vertex areas are negative or all are zero: correct the areas.")
     largest = np.abs(values).max()
     if values.min() < -_EIGENVALUE_TOLERANCE * largest:
         raise InputError(
@@ -95,15 +96,16 @@ def make_spectrum(
     deviation = np.abs(vectors.T @ (areas[:, None] * vectors) - np.eye(k)).max()
     if deviation > _ORTHONORMALITY_TOLERANCE:
         raise InputError(
-            f"{name}: the eigenvectors are not orthonormal in the vertex areas (off by {deviation:.2g}): "
-            "give the lumped mass matrix with which the eigenvectors were computed, in the same unit."
+            f"{name}: the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
+            f"{deviation:.2g}): give the lumped mass matrix with which the eigenvectors were computed, in "
+            "the same unit."
         )
     arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
     return Spectrum(*map(jax.device_put, arrays))
 
 
 def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
-    """The eigenvalues, eigenvectors and areas of a shape of another library."""
+    """Return the eigenvalues, eigenvectors and vertex areas of a shape of another library."""
     if hasattr(shape, "eigenvectors") and hasattr(shape, "vertex_areas"):
         if shape.eigenvectors is None:
             raise InputError(f"{name}: the shape has no eigenvectors yet: call its method process first.")
@@ -117,16 +119,16 @@ def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
 
 
 def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
-    """Vertex areas as a list, also from a mass matrix: the sums of its rows.
+    """Return vertex areas as a list. A mass matrix is lumped: each vertex area is the sum of a row.
 
-    `shape` is that of the eigenvectors, (n, k).
+    `shape` is the shape (n, k) of the eigenvectors.
     """
     areas = to_host(areas)
     if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a tensor of PyTorch
         matrix = areas.to_sparse_coo().coalesce()
         areas = sp.coo_array((np.asarray(matrix.values()), np.asarray(matrix.indices())), shape=matrix.shape)
     if sp.issparse(areas) or np.ndim(areas) == 2:
-        # A sparse matrix of a hostile file can have so many rows that their sums would fill the memory.
+        # A sparse matrix in a malicious file can have so many rows that the row sums would fill the memory.
         if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
             raise InputError(
                 f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
@@ -137,56 +139,64 @@ def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
 
 
 def _real(values: Any, what: str, name: str) -> np.ndarray:
-    """Values as a finite float64 array of any shape."""
+    """Convert values to a float64 array of any shape, and check that all numbers are finite."""
     try:
         array = np.asarray(to_host(values))
     except (TypeError, ValueError, RuntimeError):
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{name}: its {what} are not an array of real numbers: give such an array.")
+        raise InputError(
+            f"{name}: the {what} are not an array of real numbers: give an array of real numbers."
+        )
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(f"{name}: its {what} are not all finite: compute them again.")
+        raise InputError(f"{name}: the {what} are not all finite: compute them again.")
     return array
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """Read an eigenbasis from a `.npz` file of `write_spectrum`, or from MATLAB's `.mat` format.
+    """Read an eigenbasis from a `.npz` file of `write_spectrum`, or from a `.mat` file.
 
     **Arguments:**
 
-    - `path`: the file. A `.mat` file holds one struct, or the fields of one struct as variables: `evals`
-        (k), `evecs` (n, k) and the areas, as the mass matrix or its diagonal `A`, or as a list `area`. Any
-        unit will do.
+    - `path`: the file. A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas`
+        (n,). A `.mat` file contains either one struct, or the fields of one struct as variables. The fields
+        are `evals` (k), `evecs` (n, k) and the vertex areas. The areas are either `A`, a mass matrix (n, n)
+        or its diagonal, or a list `area` (n). The unit of length is arbitrary.
 
-    **Returns:** A `Spectrum` for total area 1; see `make_spectrum`.
+    **Returns:** A `Spectrum` of JAX's default float type, for total area 1; see `make_spectrum`.
 
-    **Raises:** `InputError` that names the file and the fault.
+    **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
+    does not contain exactly one eigenbasis. The message names the file and the fault.
     """
     name = os.fspath(path)
     if is_mat_file(path):
         structs = find_structs(read_variables(path), "evals", "evecs")
         if len(structs) != 1:
-            held = f"{len(structs)} eigenbases, {', '.join(structs)}," if structs else "no evals and evecs"
-            raise InputError(f"{path}: holds {held} but needs one: save a single struct with both.")
+            found = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
+            raise InputError(f"{path}: contains {found}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
         return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
     if Path(path).suffix != ".npz":
-        raise InputError(f"{path}: spectra are read from .npz and .mat files: give one of these.")
+        raise InputError(
+            f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
+        )
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
     limit = largest_contents(size_of_file(path))
     try:
         with np.load(path, allow_pickle=False) as file:
             if sum(member.file_size for member in file.zip.infolist()) > limit:
                 raise InputError(
-                    f"{path}: would take more than 1 GiB of memory and more than four times its own size: "
-                    "write it again, with nothing but a spectrum in it."
+                    f"{path}: would take more than 1 GiB of memory and more than four times the size of the "
+                    "file: write the spectrum again, without other arrays."
                 )
             arrays = [file[field] for field in fields]
     except InputError:
         raise
     except Exception:  # damaged files can raise any exception in NumPy
-        raise InputError(f"{path}: is damaged or lacks one of {', '.join(fields)}: write it again.") from None
+        raise InputError(
+            f"{path}: is damaged or lacks one of {', '.join(fields)}: write the spectrum again."
+        ) from None
     return make_spectrum(*arrays, name=name)
 
 
@@ -194,24 +204,28 @@ def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
     for field in ("A", "area"):
         if field in struct and (sp.issparse(struct[field]) or np.ndim(struct[field])):
             return struct[field]
-    raise InputError(f"{name}: has evecs but no areas: save the mass matrix as A.")
+    raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
-    """Write an eigenbasis as `.npz`, or as `.mat` with a struct `S` in the layout of MATLAB code for shapes.
+    """Write an eigenbasis to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
 
-    `S` has the fields `evals`, `evecs`, the sparse mass matrix `A`, `area`, `sqrt_area` and `nv`. If a mesh
-    is given, `S` also has `nf` and `surface` with `X`, `Y`, `Z` and `TRIV`, counted from 1. The surface is
-    scaled to the area of the spectrum (usually 1), so that all fields describe one surface. Numbers are
-    written in double precision; to compute the spectrum in double precision, use `jax.enable_x64`.
+    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). In a `.mat`
+    file, `S` has the fields `evals`, `evecs`, the sparse mass matrix `A`, the total `area`, `sqrt_area` and
+    the number of vertices `nv`. If a mesh is given, `S` also has the number of faces `nf`, and `surface` with
+    `X`, `Y`, `Z` and 1-based `TRIV`. The surface is scaled to the area of the spectrum (usually 1), so all
+    fields describe the same surface. Numbers are written in double precision. To compute the spectrum in
+    double precision as well, use `jax.enable_x64`.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, tells the format.
-    - `spectrum`: the eigenbasis. Positions and normals are not written.
-    - `mesh`: the surface of the spectrum, for `.mat` files.
+    - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
+    - `spectrum`: the eigenbasis (n vertices, k eigenvectors). Its positions, normals, mask and descriptors
+        are not written.
+    - `mesh`: the mesh of the spectrum (n vertices). A `.npz` file does not contain the mesh.
 
-    **Raises:** `InputError` for another suffix, a mesh of another size, or a file that cannot be written.
+    **Raises:** `InputError` for another suffix, a mesh with another number of vertices (for `.mat`), or a
+    file that cannot be written.
     """
     values, vectors, areas = (
         np.asarray(array, np.float64)
@@ -234,8 +248,8 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
     if mesh is not None:
         if len(mesh.vertices) != len(areas):
             raise InputError(
-                f"{path}: the spectrum has {len(areas)} vertices and {mesh.name} {len(mesh.vertices)}: give "
-                "the mesh of this spectrum."
+                f"{path}: the spectrum has {len(areas)} vertices, but {mesh.name} has {len(mesh.vertices)}: "
+                "give the mesh of this spectrum."
             )
         position = mesh.vertices * np.sqrt(area / mesh.area)
         surface = dict(zip("XYZ", position.T, strict=True)) | {"TRIV": mesh.faces + 1.0}
@@ -244,9 +258,13 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
 
 
 def check_spectrum_path(path: str | os.PathLike[str]) -> None:
-    """Check that a name has a suffix of a spectrum.
+    """Check that a file name has the suffix `.npz` or `.mat`, as `write_spectrum` requires.
 
-    **Raises:** `InputError` if not.
+    **Arguments:**
+
+    - `path`: the name of a file, which need not exist.
+
+    **Raises:** `InputError` for any other suffix.
     """
     if Path(path).suffix != ".npz" and not is_mat_file(path):
         raise InputError(
@@ -257,16 +275,20 @@ def check_spectrum_path(path: str | os.PathLike[str]) -> None:
 def read_functional_map(
     path: str | os.PathLike[str], spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> Float64[np.ndarray, "k_x k_y"]:
-    """Read a functional map, from functions on Y to functions on X, in MATLAB's `.mat` format.
+    """Read a functional map (pullback, from functions on Y to functions on X) from a `.mat` file.
 
     **Arguments:**
 
-    - `path`: the file. It holds a single matrix, or a matrix `C21` among others (X is shape 1, Y is shape 2).
-    - `spectrum_x`, `spectrum_y`: the bases of the map. The map may use only the first few functions of each.
+    - `path`: the file. The file contains either a single matrix, or a matrix `C21` among other variables (X
+        is shape 1, Y is shape 2).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, whose eigenbases the map uses. The map may use only
+        the first few eigenvectors of each.
 
-    **Returns:** C (k_X, k_Y), as stored.
+    **Returns:** The functional map C (k_X, k_Y), as stored, float64. k_X and k_Y are at most the numbers of
+    eigenvectors of the spectra.
 
-    **Raises:** `InputError` that names the file and the fault.
+    **Raises:** `InputError` if the file cannot be read, contains no suitable matrix, or contains a matrix
+    that is too large for the spectra or not finite. The message names the file and the fault.
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
@@ -275,8 +297,8 @@ def read_functional_map(
         if np.less_equal(matrix.shape[::-1], most).all():
             cure = "transpose the map"
         raise InputError(
-            f"{path}: the functional map is {matrix.shape}, but from functions on Y to functions on X it can "
-            f"be at most {most}: {cure}."
+            f"{path}: the functional map has shape {matrix.shape}, but from functions on Y to functions on X "
+            f"the shape can be at most {most}: {cure}."
         )
     if not np.isfinite(matrix).all():
         raise InputError(f"{path}: the functional map is not finite: compute it again.")
@@ -286,18 +308,18 @@ def read_functional_map(
 def write_functional_map(
     path: str | os.PathLike[str], functional_map: Float[Array, "k_x k_y"] | Float[np.ndarray, "k_x k_y"]
 ) -> None:
-    """Write a functional map as the matrix `C21` in MATLAB's `.mat` format.
+    """Write a functional map as the matrix `C21` to a `.mat` file.
 
-    The file appears whole or not at all.
+    The write is atomic: an incomplete file never appears under this name.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace; the name ends in `.mat`.
-    - `functional_map`: C (k_X, k_Y), from functions on Y to functions on X, between the bases on area 1 that
-        `write_spectrum` writes.
+    - `path`: the file to create or to replace, with the suffix `.mat`.
+    - `functional_map`: the pullback C (k_X, k_Y), from functions on Y to functions on X, between eigenbases
+        on area 1, as `write_spectrum` writes them.
 
-    **Raises:** `InputError` for another suffix, entries that are not finite, or a file that cannot be
-    written.
+    **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
+    cannot be written.
     """
     matrix = _real(functional_map, "entries", "functional map")
     if not is_mat_file(path):

@@ -1,4 +1,4 @@
-"""What counts as a number in a text file."""
+"""Recognition of numbers in text files."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
 def is_number(word: str, *, finite: bool = True) -> bool:
-    """Whether a word is a decimal number, as every program writes them.
+    """Return whether a word is a decimal number in the usual notation, such as `-1.5e3`.
 
-    Python's `float` also accepts underscores (`1_0`) and digits of other scripts, which are typing errors
-    here.
+    Python's `float` also accepts underscores (`1_0`) and the digits of other scripts. In data files such
+    words are errors, so this function refuses them.
 
     **Arguments:**
 
     - `word`: a word without spaces.
-    - `finite`: False accepts `nan` and `inf`, too, where a later check reports them with the vertex.
+    - `finite`: if False, `nan` and `inf` are accepted as well. A later check reports them with the vertex.
     """
     return bool(_NUMBER.fullmatch(word)) or (not finite and bool(_NOT_FINITE.fullmatch(word)))

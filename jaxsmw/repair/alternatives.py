@@ -1,4 +1,4 @@
-"""Alternative initial maps, for pairs on which SHOT alone exchanges limbs."""
+"""Alternative initial maps, for pairs on which nearest neighbours in SHOT exchange limbs."""
 
 from __future__ import annotations
 
@@ -40,21 +40,28 @@ def alternative_initial_maps(
     spectrum_y: Spectrum,
     settings: RepairSettings = RepairSettings(),  # noqa: B008 (immutable)
 ) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Initial maps (m,), computed one by one: where one exchanges limbs, another often does not.
+    """Yield alternative initial maps, which are computed one by one.
 
-    The first maps come from functional maps. Nearest neighbours of SHOT from X to Y and from Y to X each give
-    a functional map. Their weighted mean is filtered as in the paper and converted to a pointwise map.
-    `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+    On a pair on which one initial map exchanges limbs, another initial map often does not.
 
-    Two full shapes with descriptors (`describe`) have further maps, from pairings of their extremities.
-    Distances between extremities choose the pairings. Each pairing gives a map by nearest neighbours in SHOT
-    and in distances to the extremities, which a coarse regression refines. The maps with the best scores that
-    differ from each other are returned.
+    The first maps come from functional maps. Nearest neighbours in SHOT from X to Y and from Y to X each give
+    a functional map. The weighted mean of both functional maps is filtered as in the MWP paper and converted
+    to a pointwise map. `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+
+    For two full shapes with descriptors (`describe`), further maps come from pairings of their extremities.
+    The pairings are selected by the distances between extremities. Each pairing gives a map by nearest
+    neighbours in SHOT and in distances to the extremities. A coarse regression refines this map. Among the
+    refined maps that differ from each other, the maps with the best scores are yielded.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: see `paired_spectra`.
-    - `settings`: the numbers.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units; see `paired_spectra`.
+    - `settings`: the settings of the repair.
+
+    **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
+
+    **Raises:** `InputError` if a mesh is too coarse for SHOT, or a spectrum belongs to another mesh.
     """
     sampled = sample_pair(pair, spectrum_x, spectrum_y)
     shot: dict[float, _Shot] = {}
@@ -83,7 +90,11 @@ def _in_both_directions(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
 ) -> Int64[np.ndarray, " m"]:
-    """The map of the mean of the functional maps of the nearest neighbours in both directions."""
+    """Compute the map that follows from the mean of the functional maps in both directions.
+
+    The functional maps come from nearest neighbours of the features from X to Y, and from Y to X. `weight` is
+    the weight of the second functional map.
+    """
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
     backward = nearest_map(reversed_, features_y, features_x)
@@ -109,7 +120,7 @@ def _decode_mean(
 def _by_extremities(
     sampled: SampledPair, shot: _Shot, spectrum_x: Spectrum, settings: RepairSettings
 ) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Maps by pairings of extremities; `spectrum_x`, of all of X, serves for the scores."""
+    """Yield maps from pairings of extremities. `spectrum_x`, of all vertices of X, is used for the scores."""
     pair = sampled.pair
     refinement = _CoarseRefinement(sampled, settings)
     ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
@@ -137,13 +148,14 @@ def _by_extremities(
 
 
 class _CoarseRefinement:
-    """Nearest neighbours of features, refined by a coarse regression: enough to find the place of limbs.
+    """Maps by nearest neighbours of features, refined by a coarse feature regression.
 
-    The regression starts with few eigenvectors, so the nearest neighbours of evenly spread vertices suffice.
+    The coarse regression suffices to determine the match of each limb. The regression starts with few
+    eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
     """
 
     def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
-        fewest = min(int(mesh.referenced_vertices.sum()) for mesh in sampled.pair.meshes)
+        fewest = sampled.pair.fewest_vertices()
         self.stage = Stage(
             FeatureRegression(levels=settings.extremity_levels),
             number_of_descriptors=settings.extremity_descriptors,
@@ -164,7 +176,7 @@ class _CoarseRefinement:
         )
 
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
-        """The outcome of the regression, not yet judged; unsuccessful if numbers went wrong."""
+        """Return the outcome of the regression, without its distortion. The regression may have failed."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
         padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
         first = jax.device_put(padded.astype(np.int32))

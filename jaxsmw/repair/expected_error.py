@@ -1,4 +1,4 @@
-"""An estimate of the error of every match that needs no ground truth."""
+"""An estimate of the error of every match, without ground truth."""
 
 from __future__ import annotations
 
@@ -19,20 +19,25 @@ def expected_error(
     spectrum_x: Spectrum,
     settings: ExpectedErrorSettings = ExpectedErrorSettings(),  # noqa: B008 (immutable)
 ) -> Float[np.ndarray, " m"]:
-    """The expected distance of every match from the truth (m,), in square roots of Y's area.
+    """Estimate the geodesic error of every match without ground truth.
 
-    Two signs of an error are averaged over the neighbourhood: the distance between a vertex and the vertex to
-    which the reverse map takes its match; and the change in length of the edges at a vertex. Where limbs look
-    swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows with the size of
-    the limb. docs/accuracy.md measures how well the estimate ranks vertices. A map that is wrong but
-    consistent everywhere passes for right.
+    The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
+    first is the distance between a vertex and the vertex to which the reverse map takes its match. The second
+    is the mean change in length of the edges at a vertex. Where limbs look swapped (`discontinuous_parts`,
+    `orientation_reversal`), the expected error also grows with the size of the limb. docs/accuracy.md
+    measures how well the estimate ranks vertices. The estimate does not detect a map that is wrong but
+    consistent everywhere.
 
     **Arguments:**
 
-    - `pointwise_map`: T: X -> Y (m,).
-    - `reverse_map`: a map Y -> X (n,).
-    - `spectrum_x`: of X, without padding.
-    - `settings`: the weights.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
+    - `spectrum_x`: the spectrum of X, in `Pair.units_of_length` and without padding.
+    - `settings`: the weights of the estimate.
+
+    **Returns:** The expected distance of every match from the true match (m,), divided by the square root of
+    Y's area.
     """
     mesh_x = pair.mesh_x
     unit_x, unit_y = pair.units_of_length
@@ -49,7 +54,7 @@ def expected_error(
     heat = np.exp(-settings.heat_time * eigenvalues) * (eigenvectors.T @ (areas * signs))
     misplaced = discontinuous_parts(pair, pointwise_map)
     misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x)
-    # The larger a limb, the farther it can be from its place.
+    # The matches of a misplaced limb can be as far from the true matches as the limb is large.
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]

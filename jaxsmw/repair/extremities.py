@@ -15,19 +15,22 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import coarse_edges, poisson_disk_samples
 from jaxsmw.repair.settings import ExtremitySettings
 
-# The distance between connected components: larger than any distance within one, and equal on both bodies.
+# The distance between two connected components: larger than any distance within a component, and equal on
+# both bodies.
 _ELSEWHERE = 10.0
 
 
 class Extremities(NamedTuple):
-    """Points farther from the rest of a body than all points around them, the farthest first.
+    """The extremities of a body, in descending order of their remoteness.
+
+    The remoteness of a vertex is its root mean square distance to the surface.
 
     **Attributes:**
 
-    - `vertices`: (e,).
-    - `distances`: (e, e), along the surface, in units of the mean remoteness; inf between connected
-      components.
-    - `remoteness`: (e,), the root mean square distance to the rest of the body, in the same unit.
+    - `vertices`: the vertices at the extremities (e,).
+    - `distances`: the distances between extremities (e, e) along the surface, in units of the mean remoteness
+      of the extremities; inf between connected components.
+    - `remoteness`: the remoteness of each extremity (e,), in the same unit.
     """
 
     vertices: Int64[np.ndarray, " e"]
@@ -39,10 +42,18 @@ def extremities(
     mesh: Mesh,
     settings: ExtremitySettings = ExtremitySettings(),  # noqa: B008 (immutable)
 ) -> Extremities:
-    """The local maxima of the mean squared distance to the whole surface.
+    """Find the extremities of a body: the local maxima of the mean squared distance to the whole surface.
 
-    The function is that of Hilaga et al., "Topology matching for fully automatic similarity estimation of 3D
-    shapes", SIGGRAPH 2001. Distances run along edges, and are a few per cent too long everywhere.
+    The mean squared distance is taken from Hilaga et al., "Topology matching for fully automatic similarity
+    estimation of 3D shapes", SIGGRAPH 2001. Distances are measured along edges and are a few per cent too
+    long everywhere.
+
+    **Arguments:**
+
+    - `mesh`: the surface.
+    - `settings`: the number of samples, the smallest distance between extremities, and their largest number.
+
+    **Returns:** The `Extremities`, at most `settings.most`.
     """
     edges, nearest = coarse_edges(mesh)
     nodes, tails_and_heads = np.unique(edges, return_inverse=True)
@@ -67,17 +78,19 @@ def extremities(
 
 
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
-    """Pairings of the extremities of two bodies, the most plausible first.
+    """Return pairings of the extremities of two bodies, the most plausible pairing first.
 
-    Every extremity of the body with fewer of them has a partner. A pairing is the more plausible, the smaller
-    the squared differences of distances between extremities, and of their remoteness. Distances do not tell
-    left from right.
+    Every extremity of the body with fewer extremities has a partner on the other body. A pairing is plausible
+    if the distances between extremities, and their remoteness, are similar on both bodies. The cost of a
+    pairing is the sum of the squared differences. Distances do not tell left from right.
 
     **Arguments:**
 
+    - `x`, `y`: the extremities of X and of Y.
     - `number`: the largest number of pairings.
 
-    **Returns:** Arrays (l, 2), in each row the number of an extremity of X and that of its partner on Y.
+    **Returns:** A list of arrays (l, 2), where l is the smaller number of extremities. Each row gives the
+    index of an extremity of X and the index of its partner on Y.
     """
     fewer, more = (x, y) if len(x.vertices) <= len(y.vertices) else (y, x)
     partners = np.array(list(permutations(range(len(more.vertices)), len(fewer.vertices))))

@@ -1,4 +1,4 @@
-"""The outcome of several stages, and how it is scored and judged."""
+"""The outcome of several stages of refinement, its score, and the decision whether it needs repair."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from jaxsmw.repair.settings import RepairSettings
 
 
 class Outcome(NamedTuple):
-    """The outcome of several stages.
+    """The outcome of several stages of refinement.
 
     **Attributes:**
 
-    - `refinements`: one per stage, up to the first stage that failed.
-    - `initial_map`: the map from which the first stage started, (m,).
-    - `distortion`: `jaxsmw.repair.scores.distortion` of the last map; None if nobody looked.
+    - `refinements`: one `Refinement` per stage, up to the first stage that failed.
+    - `initial_map`: the map from which the first stage started, (m,), 0-based vertices of Y. Like the maps of
+      the refinements, it may be padded.
+    - `distortion`: `jaxsmw.repair.scores.distortion` of the last map; None if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
     """
 
@@ -35,19 +36,27 @@ class Outcome(NamedTuple):
 
     @property
     def successful(self) -> bool:
-        """Whether no stage failed."""
+        """Whether all stages succeeded."""
         return all(bool(found.result == RESULTS.successful) for found in self.refinements)
 
     @property
     def pointwise_map(self) -> Int[Array, " m"]:
-        """The map of the last stage."""
+        """The map of the last stage (m,), or the initial map if no stage has run."""
         return self.refinements[-1].pointwise_map if self.refinements else self.initial_map
 
 
 def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncertainty_weight) -> float:
-    """The score of an outcome beside other outcomes of the same two shapes: lower is better.
+    """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
-    The logarithm of the distortion, plus the weighted uncertainty of the last state that has one.
+    The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty is that of the
+    last refiner state that has an uncertainty, or zero if no state has one.
+
+    **Arguments:**
+
+    - `outcome`: the outcome. A missing distortion counts as 1.
+    - `uncertainty_weight`: the weight of the uncertainty; see `RepairSettings`.
+
+    **Returns:** The score, without unit; infinity if a stage failed.
     """
     if not outcome.successful:
         return np.inf
@@ -58,13 +67,14 @@ def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncerta
 
 @dataclass(frozen=True)
 class Judge:
-    """Judges outcomes for one pair without ground truth.
+    """The criteria by which outcomes for one pair are judged without ground truth.
 
     **Attributes:**
 
-    - `pair`: the meshes.
-    - `spectrum_x`: X's spectrum with the most eigenvectors, which show faults best; may be padded.
-    - `settings`: the numbers.
+    - `pair`: the source X (m vertices) and the target Y.
+    - `spectrum_x`: X's spectrum with the largest number of eigenvectors, because more eigenvectors show
+      faults better. The spectrum may be padded.
+    - `settings`: the thresholds and weights.
     """
 
     pair: Pair
@@ -72,18 +82,26 @@ class Judge:
     settings: RepairSettings
 
     def judged(self, outcome: Outcome) -> Outcome:
-        """The outcome with its distortion."""
+        """Return the outcome with its distortion and its flag `suspicious`.
+
+        An outcome with a failed stage gets an infinite distortion and is suspicious.
+        """
         if not outcome.successful:
             return outcome._replace(distortion=np.inf, suspicious=True)
         found = distortion(self.pair, self._matches(outcome), self.spectrum_x, self.settings.scores)
         return outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
 
     def score(self, outcome: Outcome) -> float:
-        """See `score`."""
+        """Return the score of an outcome with the weight in the settings; lower is better. See `score`."""
         return score(outcome, self.settings.uncertainty_weight)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
-        """The vertices with reversed orientation, and the discontinuous parts, if worth a repair."""
+        """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
+
+        One fault is the set of vertices with orientation reversal, the other is the set of discontinuous
+        parts. A fault is left out if its share of the area is too small or too large (`negligible_area` and
+        `excessive_area` in the settings).
+        """
         mesh_x, found, scores = self.pair.mesh_x, self._matches(outcome), self.settings.scores
         both = (
             orientation_reversal(self.pair, found, self.spectrum_x, scores),
@@ -94,19 +112,26 @@ class Judge:
         return [fault for fault in both if low < areas[fault].sum() < high]
 
     def looks_right(self, outcome: Outcome) -> bool:
-        """Whether nothing is left to repair."""
+        """Return whether a judged outcome needs no further repair.
+
+        This is the case if the outcome is not suspicious, or if its distortion is below `doubtful` in the
+        settings and it has no faults.
+        """
         assert outcome.distortion is not None
         slightly_distorted = outcome.distortion < self.settings.doubtful
         return not outcome.suspicious or (slightly_distorted and not self.faults(outcome))
 
     def same(self, first: Outcome, second: Outcome) -> bool:
-        """Whether two outcomes are the same map except for details."""
+        """Return whether the maps of two outcomes agree except for details; see `same_map`."""
         return same_map(self.pair, self._matches(first), self._matches(second), self.settings.scores)
 
     def largest_group(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
-        """The largest group of outcomes that are the same map as one of them."""
+        """Return the largest group of outcomes whose maps all agree with the map of one member.
+
+        **Raises:** `ValueError` if there are no outcomes.
+        """
         outcomes = list(outcomes)
-        return max(([o for o in outcomes if self.same(one, o)] for one in outcomes), key=len)
+        return max(([o for o in outcomes if self.same(member, o)] for member in outcomes), key=len)
 
     def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
         return np.asarray(outcome.pointwise_map)[: len(self.pair.mesh_x.vertices)].astype(np.int64)

@@ -31,31 +31,37 @@ def refine_in_stages(
     alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
     history: bool = False,
 ) -> Outcome:
-    """Refines the initial map of a pair by one stage after the other, and repairs a map that looks wrong.
+    """Refine the initial map of a pair by the given stages in order, and repair a map that looks wrong.
 
-    Symmetric limbs that the initial map exchanges stay exchanged: each limb fits the place of the other,
-    except for its left and right and for its connection to the body. With `repair`, the outcome is checked
-    for both (`jaxsmw.repair.scores`), and returned if it looks right. Otherwise repair proceeds as follows.
+    If the initial map exchanges symmetric limbs, refinement does not correct this error. The reason is that
+    each limb has the shape of the other limb, except for its orientation and its connection to the body. With
+    `repair`, the outcome is checked for orientation reversal and discontinuities (`jaxsmw.repair.scores`). An
+    outcome that looks correct is returned. Otherwise repair proceeds as follows.
 
     1. Rounds: the repaired stage and all later stages run again. They start from a functional map without
-       the faults of the round before: without reversed orientation and without discontinuous parts, in turn.
-    2. Fallback: the repaired stage runs from the best outcome with `fallback_levels`. The fallback is taken
-       if it looks right, or else if it has the better score.
-    3. Alternatives: if the outcome still looks wrong, alternative initial maps go up to the repaired stage
-       and through rough rounds of it. The best of these run through all stages and are repaired. The outcome
-       with the best score that looks right is returned. If no outcome looks right, the map to which at
-       least `agreeing` initial maps lead is returned, or else the outcome with the best score.
+       the faults of the previous round. Vertices with orientation reversal and discontinuous parts are left
+       out in alternate rounds.
+    2. Fallback: the repaired stage, with `fallback_levels`, and all later stages run from the best outcome.
+       The fallback is preferred if it looks correct and its score is worse by less than `score_tolerance`.
+       Otherwise the outcome with the better score is kept.
+    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to the repaired
+       stage, which then runs again in rough rounds. The best of these outcomes are refined by all stages and
+       repaired. The outcome with the best score among those that look correct is returned. If no outcome
+       looks correct, but at least `agreeing` initial maps lead to the same map, this map is returned.
+       Otherwise the outcome with the best score is returned.
 
     **Arguments:**
 
-    - `prepared`: the pair with its initial map.
+    - `prepared`: the pair with its spectra and its initial map.
     - `stages`: the stages, in order.
     - `repair`: the settings of the repair; None for no repair.
-    - `alternatives`: alternative initial maps, computed one by one and only if needed. By default
-      `jaxsmw.repair.alternatives`, if the initial map is `"shot"`.
-    - `history`: see `jaxsmw.refine`.
+    - `alternatives`: alternative initial maps (m,), computed one by one and only if needed. By default they
+      come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`; otherwise there are none.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** An `Outcome`. The refinement stops at the first stage that fails.
+    **Returns:** An `Outcome` with padded maps. Refinement stops at the first stage that fails.
+
+    **Raises:** `InputError` if alternative initial maps cannot be computed.
     """
     views = [prepared.view(stage) for stage in stages]
     runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
@@ -70,7 +76,7 @@ def refine_in_stages(
     if not (best.successful and best.suspicious):
         return best
     logger.info(
-        "limbs may be swapped (distortion %.3f; right maps have up to %.2f)",
+        "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
         best.distortion,
         repair.suspicious,
     )
@@ -92,14 +98,14 @@ _View = tuple[Spectrum, Spectrum]
 
 @dataclass(frozen=True)
 class _Runner:
-    """Runs stages on one pair."""
+    """A runner of stages on one pair. `steps` contains each stage with its view of the spectra."""
 
     prepared: PreparedPair
     steps: list[tuple[_View, Stage]]
     history: bool
 
     def run(self, first: int, before: Outcome, last: int | None = None) -> Outcome:
-        """The outcome of the stages from position `first` up to, but without, `last`."""
+        """Run the stages from position `first` up to, but not including, `last`, and return the outcome."""
         for view, stage in self.steps[first:last]:
             if not before.successful:
                 break
@@ -107,7 +113,7 @@ class _Runner:
         return before
 
     def run_one(self, view: _View, stage: Stage, before: Outcome) -> Outcome:
-        """The outcome of one more stage."""
+        """Run one more stage and return the outcome."""
         found = stage.run(
             *view,
             before.pointwise_map,
@@ -120,30 +126,31 @@ class _Runner:
 
 @dataclass(frozen=True)
 class _Repairer:
-    """Repairs outcomes by repeating the stage at position `settings.stage` and all later stages."""
+    """A repairer of outcomes, which repeats the stage at position `settings.stage` and all later stages."""
 
     runner: _Runner
     judge: Judge
     settings: RepairSettings
 
     def begun(self, first: Int[Array, " m"]) -> Outcome:
-        """The outcome up to the repaired stage, not yet judged."""
+        """Run all stages up to and including the repaired stage; the outcome is not yet judged."""
         return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
 
     def finished(self, outcome: Outcome) -> Outcome:
-        """The judged outcome of all later stages."""
+        """Run all stages after the repaired stage and return the judged outcome."""
         return self.judge.judged(self.runner.run(self.settings.stage + 1, outcome))
 
     def repaired(self, outcome: Outcome) -> Outcome:
-        """A finished outcome after rounds of repair and the fallback."""
+        """Repair a finished outcome by rounds and by the fallback."""
         outcome = self._without_faults(outcome, self.settings.rounds, finish=True)
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         fallback = stage.with_levels(
             tuple(min(level, stage.number_of_eigenvectors) for level in self.settings.fallback_levels)
         )
         last = self.finished(self._repeated(outcome, spectrum_x, fallback))
-        # The fallback knows least of the faults that misled earlier rounds. It is preferred if it looks right
-        # and its score is hardly worse: upside-down maps have a much worse score.
+        # The fallback depends least on the faults that misled earlier rounds. It is preferred if it looks
+        # correct and its score is not much worse. The tolerance excludes upside-down maps, whose scores are
+        # much worse.
         score = self.judge.score
         preferred = (
             self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
@@ -152,16 +159,16 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """The best outcome among a suspicious one and those of alternative initial maps."""
+        """Return the best among a suspicious outcome and the outcomes of alternative initial maps."""
         rough = self._rough_outcomes(alternatives)
-        # All alternatives are tried once the first map is in doubt, because a later one may be better.
+        # All alternatives are tried, because a later alternative may be better than an earlier one.
         finished, tried = [best], [best, *rough]
         for outcome in islice(distinct(rough, self.judge.same), self.settings.finalists):
             finished.append(self.repaired(self.finished(outcome)))
         best = min(finished, key=lambda outcome: (outcome.suspicious, self.judge.score(outcome)))
         if best.suspicious:
-            # With topological noise, right maps look discontinuous too. Most wrong maps are wrong in their
-            # own way, so agreement speaks for a map.
+            # With topological noise, correct maps also look discontinuous. Most wrong maps differ from each
+            # other, so a map on which several initial maps agree is probably correct.
             group = self.judge.largest_group(tried)
             if len(group) >= self.settings.agreeing:
                 known = [outcome for outcome in finished if self.judge.same(outcome, group[0])]
@@ -174,7 +181,7 @@ class _Repairer:
         return best
 
     def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
-        """The outcomes of alternative initial maps up to the repaired stage, best score first."""
+        """Refine alternative initial maps up to the repaired stage; return the outcomes, best score first."""
         rough: list[Outcome] = []
         for number, first in enumerate(alternatives, 2):
             logger.info("initial map %d ...", number)
@@ -184,7 +191,7 @@ class _Repairer:
         return sorted((outcome for outcome in rough if outcome.successful), key=self.judge.score)
 
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
-        """The best outcome of some rounds, each started without the faults of the round before."""
+        """Run rounds of repair, each without a fault of the previous round, and return the best outcome."""
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)
         best = last = outcome
@@ -199,7 +206,7 @@ class _Repairer:
         return best
 
     def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
-        """The outcome up to the repaired stage, repeated as `stage` from the last map; not yet judged."""
+        """Run `stage` from the last map instead of the repaired stage; the outcome is not yet judged."""
         (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
         found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))
         before = outcome.refinements[: self.settings.stage]

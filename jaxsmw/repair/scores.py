@@ -24,18 +24,21 @@ def dirichlet_energy_ratio(
     spectrum_x: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> float:
-    """The Dirichlet energy of the matched positions over that of X's own positions.
+    """Return the Dirichlet energy of the matched positions divided by that of X's own positions.
 
-    Both energies are taken in the span of X's eigenvectors, which leaves out the scatter of single matches:
-    the denser the mesh, the larger this scatter. The ratio is about 1 for the true map between poses of one
-    body, whatever the triangulations, and up to 1.1 between non-isometric shapes. Discontinuous maps have
-    more.
+    Both energies are computed in the span of X's eigenvectors. This excludes the scatter of single matches,
+    which grows with the density of the mesh. For the true map the ratio is about 1 between poses of one body,
+    for any triangulations, and up to 1.1 between non-isometric shapes. Discontinuous maps have larger ratios.
 
     **Arguments:**
 
-    - `pointwise_map`: T: X -> Y (m,).
-    - `spectrum_x`: of X, with some hundred eigenvectors. Padding beyond the vertices of X is ignored.
-    - `settings`: the numbers of the scores.
+    - `pair`: the source X (m vertices) and the target Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors. Padding beyond the vertices of X is
+      ignored.
+    - `settings`: the settings of the scores.
+
+    **Returns:** The ratio, without unit, for positions in `Pair.units_of_length`.
     """
     m, n = (len(mesh.vertices) for mesh in pair.meshes)
     resolved = max(2, min(m, n) // settings.vertices_per_eigenvector)
@@ -46,9 +49,10 @@ def dirichlet_energy_ratio(
     eigenvalues, eigenvectors = eigenvalues[:resolved], eigenvectors[:, :resolved]
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
-        # A constant has no energy, but would leave rounding errors.
+        # A constant offset has no energy but would cause rounding errors.
         centered = positions - np.average(positions, axis=0, weights=pair.mesh_x.vertex_areas)
-        # In the type of the eigenvectors: a copy of a large mesh's eigenvectors takes too much memory.
+        # The product uses the type of the eigenvectors, because a converted copy of the eigenvectors of a
+        # large mesh takes too much memory.
         weighted = (areas[:m] * centered.T).astype(eigenvectors.dtype)
         return float(np.sum(eigenvalues * (weighted @ eigenvectors[:m]) ** 2))
 
@@ -63,17 +67,24 @@ def distortion(
     spectrum_x: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> float:
-    """How much a map stretches, shrinks and mirrors X: 1 for isometries, larger for worse maps.
+    """Return the distortion of a map: 1 for isometries, larger for worse maps.
 
-    The `dirichlet_energy_ratio`, or its inverse if the map shrinks, times `1 + orientation_weight * share`,
-    where `share` is the share of X's area with `orientation_reversal`. The energy ratio alone would prefer
-    the mirror image of a body to a map with swapped legs. For a partial pair shrinking does not count,
-    because large parts of the full shape have no match.
+    The distortion is the `dirichlet_energy_ratio`, or its inverse if the ratio is below 1, times
+    `1 + orientation_weight * share`. Here `share` is the share of X's area with `orientation_reversal`. The
+    energy ratio alone would prefer the mirror image of a body to a map with swapped legs. For a partial pair
+    the inverse is not taken, because large parts of the full shape have no match.
 
-    Maps by `Registration` have at most 1.12 between poses of one body, and at most 1.2 between non-isometric
-    shapes, if the maps are right. With swapped limbs most maps have more than 1.3.
+    Correct maps by `Registration` have a distortion of at most 1.12 between poses of one body, and at most
+    1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
 
-    **Arguments:** see `dirichlet_energy_ratio`.
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors, which may be padded.
+    - `settings`: the settings of the scores.
+
+    **Returns:** The distortion, without unit.
     """
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
     share = float(pair.mesh_x.vertex_areas[reversed_].sum() / pair.mesh_x.area)
@@ -86,10 +97,19 @@ def distortion(
 def discontinuous_parts(
     pair: Pair, pointwise_map: Int64[np.ndarray, " m"], settings: ScoreSettings = _DEFAULT
 ) -> Bool[np.ndarray, " m"]:
-    """True for vertices of X that discontinuities of the map separate from the largest part of X.
+    """Find the vertices of X that discontinuities of the map separate from the largest part of X.
 
-    Edges are cut where the map is discontinuous (`ScoreSettings.discontinuity_distance`). Every connected
-    component but the largest is marked: limbs that are swapped as a whole, for example.
+    Discontinuous edges are removed from X (`ScoreSettings.discontinuity_distance`). All connected components
+    except the component of largest area are discontinuous parts. An example is a limb that is swapped as a
+    whole.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `settings`: the settings of the scores.
+
+    **Returns:** A mask (m,), True for vertices in discontinuous parts.
     """
     mesh = pair.mesh_x
     edges, nearest = coarse_edges(mesh)
@@ -106,12 +126,20 @@ def orientation_reversal(
     spectrum_x: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> Bool[np.ndarray, " m"]:
-    """True for vertices of X around which the map exchanges left and right, as on swapped limbs.
+    """Find the vertices of X around which the map exchanges left and right, as on swapped limbs.
 
-    Each triangle of X covers an area on Y, negative if its matches face the other way. The density of this
-    signed area is smoothed in the span of X's first eigenvectors and compared with a threshold.
+    The matches of the corners of each triangle of X form a triangle on Y. The area of this triangle counts as
+    negative if its orientation is opposite to that of Y's surface. The density of this signed area is
+    smoothed in the span of X's first eigenvectors and compared with a threshold.
 
-    **Arguments:** see `dirichlet_energy_ratio`.
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`, which may be padded.
+    - `settings`: the settings of the scores.
+
+    **Returns:** A mask (m,), True where the orientation is reversed.
     """
     mesh_x, mesh_y = pair.meshes
     unit_x, unit_y = pair.units_of_length
@@ -122,7 +150,7 @@ def orientation_reversal(
     covered = 0.5 * np.sum(np.cross(b - a, c - a) * normals, axis=1) / unit_y**2
     if mesh_x.is_inside_out != mesh_y.is_inside_out:
         covered = -covered
-    # One triangle with matches far apart must not outweigh all its neighbours.
+    # The limit prevents a single triangle whose matches are far apart from outweighing all of its neighbours.
     most = 2 * mesh_x.face_areas / unit_x**2
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
@@ -137,7 +165,17 @@ def same_map(
     second: Int64[np.ndarray, " m"],
     settings: ScoreSettings = _DEFAULT,
 ) -> bool:
-    """Whether two maps agree except for details."""
+    """Return whether two maps agree except for details.
+
+    Two maps agree if their matches differ by more than `settings.same_map_distance`, in Euclidean distance,
+    on less than the share `settings.same_map_area` of X's area.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y.
+    - `first`, `second`: maps X -> Y (m,), 0-based vertices of Y.
+    - `settings`: the settings of the scores.
+    """
     _, unit_y = pair.units_of_length
     distances = np.linalg.norm(pair.mesh_y.vertices[first] - pair.mesh_y.vertices[second], axis=1)
     apart = distances > settings.same_map_distance * unit_y
@@ -145,7 +183,13 @@ def same_map(
 
 
 def distinct(items: Iterable[_Item], same: Callable[[_Item, _Item], bool]) -> Iterator[_Item]:
-    """The items that are not the same as an earlier item."""
+    """Yield the items that are not the same as an earlier yielded item.
+
+    **Arguments:**
+
+    - `items`: the items, which are consumed one by one.
+    - `same`: a function that returns whether two items are the same.
+    """
     found: list[_Item] = []
     for item in items:
         if not any(same(item, other) for other in found):
@@ -156,7 +200,16 @@ def distinct(items: Iterable[_Item], same: Callable[[_Item, _Item], bool]) -> It
 def edge_lengths(
     pair: Pair, edges: Int64[np.ndarray, "e 2"], pointwise_map: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Lengths of edges of X, and distances between the matches of their ends, in `Pair.units_of_length`."""
+    """Compute the lengths of edges of X, and the distances between the matches of their ends.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y.
+    - `edges`: pairs of vertices of X (e, 2).
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+
+    **Returns:** The lengths on X (e,) and the Euclidean distances on Y (e,), both in `Pair.units_of_length`.
+    """
     unit_x, unit_y = pair.units_of_length
     placed = (pair.mesh_x.vertices / unit_x, pair.mesh_y.vertices[pointwise_map] / unit_y)
     before, after = (np.linalg.norm(np.diff(v[edges], axis=1)[:, 0], axis=1) for v in placed)

@@ -1,6 +1,6 @@
-"""Colours for positions on a body, errors and signed values.
+"""Colours for positions on a body, for errors and for signed values.
 
-Colours are mixed in OKLab, in which equal distances look equally large.
+Colours are interpolated in the colour space OKLab, in which equal distances look equally large.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from jaxsmw.geometry.mesh import Mesh
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
 
-The value is the largest threshold of the evaluation: a match that is farther off counts as wrong. The scale
-is the same for all maps and reports, so that their colours can be compared.
+The value is the largest threshold of the evaluation. A match with a larger error counts as wrong. The scale
+is the same for all maps and reports, so that their colours are comparable.
 """
 
-# Björn Ottosson, "A perceptual color space for image processing", 2020: the first matrix takes OKLab to the
-# cube roots of the cone responses, the second takes cone responses to linear sRGB.
+# Björn Ottosson, "A perceptual color space for image processing", 2020. The first matrix takes OKLab to the
+# cube roots of the cone responses. The second matrix takes cone responses to linear sRGB.
 _LAB_TO_ROOTS = np.array(
     [
         [1, 0.3963377774, 0.2158037573],
@@ -35,8 +35,8 @@ _CONES_TO_RGB = np.array(
     ]
 )
 
-# From no error (paper white) to large errors (dark plum), in OKLab. Lightness falls all the way, so that the
-# order is clear to colour-blind eyes and on a black-and-white print.
+# From no error (paper white) to large errors (dark plum), in OKLab. Lightness decreases monotonically, so
+# that the order is clear to colour-blind readers and in black-and-white prints.
 _ERROR_SCALE = np.array(
     [
         [0.95, 0.00, 0.015],
@@ -48,8 +48,8 @@ _ERROR_SCALE = np.array(
 )
 
 # From the most negative value (blue) through zero to the most positive value (red), in OKLab. Both ends have
-# the same lightness, so that neither sign stands out. Zero is paper white, or dark on a dark background
-# (True).
+# the same lightness, so that neither sign stands out. Zero is paper white, or dark in the scale for dark
+# backgrounds (True).
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -72,39 +72,44 @@ _SIGNED_SCALE = {
 }
 
 PLAIN = np.array([0.76, 0.77, 0.79])
-"""The grey of a surface without colours, and of vertices with an unknown error."""
+"""The grey of surfaces without colours and of vertices with an unknown error, in sRGB (3,) in [0, 1]."""
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts light intensities to screen colours in [0, 1], clipped to the sRGB gamut (IEC 61966-2-1)."""
+    """Converts light intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
+
+    Intensities outside of [0, 1] are clipped.
+    """
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts screen colours in [0, 1] to light intensities, which can be added and averaged."""
+    """Converts sRGB colours (…, 3) in [0, 1] to light intensities (…, 3), which can be added and averaged."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """A smooth colour for every vertex that shows where on the body the vertex is.
+    """A smooth colour for every vertex, which shows the position of the vertex on the body.
 
     Right and left differ in hue (green and red). Height or length, whichever is larger, runs from yellow to
-    blue. The remaining direction changes the lightness, which shading disturbs. So the limbs of people and
-    animals have hues of their own, and a map that swaps left and right is obvious.
+    blue. The remaining direction changes the lightness, which is the least visible because of shading. Each
+    limb of people and animals therefore has its own hue, and a map that swaps left and right is obvious.
 
-    Each coordinate is half the position between the extremes and half the rank among the vertices. The rank
-    keeps the trunk of a slender body from being uniformly grey.
+    Each coordinate is the mean of the relative position between the extremes and the relative rank among the
+    vertices. Without the rank, the trunk of a slender body would be uniformly grey.
 
     **Arguments:**
 
-    - `mesh`: standing (`jaxsmw.report.standing.stand`): x is lateral, y points up, z forward.
+    - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices: x runs across the body, y
+      points up and z forward.
 
     **Returns:** sRGB colours (n, 3) in [0, 1].
     """
     used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Coordinates that differ by rounding errors only get the same rank, or a flat mesh would show the noise.
+    # Coordinates that differ only by rounding errors get the same rank. Otherwise a flat mesh would show
+    # noise.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
@@ -123,11 +128,12 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) -> Float64[np.ndarray, "m 3"]:
-    """The colours of errors on a scale from 0 to `limit`; larger errors have the last colour.
+    """The colours of errors on a scale from 0 to `limit`. Larger errors have the last colour.
 
     **Arguments:**
 
-    - `errors`: non-negative; NaN where the error is unknown, which is shown as plain surface.
+    - `errors`: non-negative errors (m,); NaN where the error is unknown. Unknown errors have the colour
+      `PLAIN`.
     - `limit`: the end of the scale, positive, in the unit of the errors.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
@@ -140,13 +146,13 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) ->
 def signed_colors(
     values: Float[np.ndarray, " m"], limit: float, *, on_dark: bool = False
 ) -> Float64[np.ndarray, "m 3"]:
-    """The colours of values on a scale from `-limit` (blue) to `limit` (red); values beyond are clipped.
+    """The colours of values on a scale from `-limit` (blue) to `limit` (red).
 
     **Arguments:**
 
-    - `values`: of a function or a matrix.
-    - `limit`: positive.
-    - `on_dark`: zero is dark instead of white, for a dark background.
+    - `values`: the values (m,) of a function or a matrix. Values outside of the scale are clipped.
+    - `limit`: the end of the scale, positive, in the unit of the values.
+    - `on_dark`: whether zero is dark, for a dark background; otherwise zero is white.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """
@@ -154,7 +160,7 @@ def signed_colors(
 
 
 def _on_scale(values: np.ndarray, low: float, high: float, scale: np.ndarray) -> np.ndarray:
-    """Interpolates a scale whose first colour is for `low` and whose last colour is for `high`."""
+    """Interpolates a colour scale from `low` (the first colour) to `high` (the last colour)."""
     stops = np.linspace(low, high, len(scale))
     return _oklab_to_srgb(np.stack([np.interp(values, stops, channel) for channel in scale.T], axis=1))
 

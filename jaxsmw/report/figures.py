@@ -1,4 +1,7 @@
-"""Figures for papers and talks, drawn by matplotlib without a display (needs the extra `jaxsmw[report]`)."""
+"""Figures for papers and talks, drawn by matplotlib without a display (needs the extra `jaxsmw[report]`).
+
+All functions that draw a figure return a `matplotlib.figure.Figure`.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +28,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Pixels per inch. Bodies are rendered at exactly this resolution.
+# The resolution in pixels per inch. Bodies are rendered at exactly this resolution.
 _DPI = 200
 # The largest height and width of a body, in pixels.
 _BODY_SIZE = (800, 800)
 _LONGEST_NAME = 36
-# The height of one line of a legend, in inches. The width at the right edge for the error scale, in pixels.
+# The height of one line of a legend in inches, and the width of the error scale at the right edge in pixels.
 _LEGEND_LINE, _SCALE_WIDTH = 0.24, 190
 _INK, _FAINT = "#1d2430", "#79818c"
-# Okabe and Ito's colours, which colour-blind eyes can tell apart. Lines also differ in style, for print.
+# Okabe and Ito's colours, which colour-blind readers can tell apart. Lines also differ in style, for prints.
 _LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -49,26 +52,27 @@ def draw_correspondence(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Colour transfer: the colours of Y show positions, and every vertex of X has the colour of its match.
+    """A figure of a map by colour transfer: Y is coloured by position, and X has the colours of its matches.
 
-    Both bodies are shown at the same scale and from the same side. A good map gives X the smooth colours of
-    Y, limb by limb.
+    Both bodies are shown at the same scale and from the same direction. If the map is good, the colours of X
+    are as smooth as the colours of Y, and corresponding limbs have the same colours.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
-    - `pointwise_map`: a vertex of Y for every vertex of X.
-    - `errors`: by name, the error of the match of every vertex of X, as a fraction of sqrt(area of Y); NaN
-      where the error is unknown. Each entry adds a panel with these errors in colours on X.
-    - `error_limit`: the end of the colour scale of errors. Figures can be compared if they share the limit.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `errors`: by name, the error of the match of each vertex of X (m,), as a fraction of sqrt(area of Y);
+      NaN where the error is unknown. Each entry adds a panel that shows these errors as colours on X.
+    - `error_limit`: the end of the colour scale of errors, in the unit of the errors. The colours of two
+      figures are comparable if their limits are equal.
     - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
-    - `azimuth`: the viewer's place in degrees, from the front of the body towards its left; by default
-      a place from which both bodies show well.
+    - `azimuth`: the direction from which the bodies are seen, in degrees from the front of the body towards
+      its left. By default `jaxsmw.report.rendering.choose_azimuth` chooses a direction.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if the map or the errors do not fit the meshes, the limit is not positive, or
-    matplotlib is missing.
+    **Raises:** `InputError` if the map or the errors do not fit the meshes, if the limit is not positive, if
+    `up` is not an axis, or if matplotlib is missing.
     """
     indices = check_map(mesh_x, mesh_y, pointwise_map)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
@@ -92,17 +96,18 @@ def draw_mesh(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """One shaded mesh.
+    """A figure of one shaded mesh.
 
     **Arguments:**
 
     - `mesh`: a surface with n vertices.
-    - `colors`: one sRGB colour in [0, 1] per vertex; plain grey by default.
+    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); plain grey by default.
     - `up`, `azimuth`: as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if the colours do not fit the mesh, or matplotlib is missing.
+    **Raises:** `InputError` if the colours do not fit the mesh, if `up` is not an axis, or if matplotlib is
+    missing.
     """
     n = len(mesh.vertices)
     if colors is None:
@@ -118,16 +123,16 @@ def draw_mesh(
 def draw_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"], *, convention: Convention = "pullback"
 ) -> Figure:
-    """The functional map C as a picture: positive entries are red, negative entries blue.
+    """A figure of a functional map C. Positive entries are red, and negative entries are blue.
 
     **Arguments:**
 
-    - `functional_map`: C; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward.
+    - `functional_map`: C; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
     - `convention`: the convention of C, for the labels of the axes.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if C is not a finite matrix, or matplotlib is missing.
+    **Raises:** `InputError` if C is not a matrix of finite numbers, or if matplotlib is missing.
     """
     matrix = check_functional_map(functional_map)
     figure = _new_figure(5.0, 4.3, plot=True)
@@ -153,17 +158,18 @@ def draw_filters(
     responses: Float[np.ndarray | Array, "filters p"],
     eigenvalues: Float[np.ndarray | Array, " k"],
 ) -> Figure:
-    """Filter responses g_l(lambda), their frame function G (the sum of their squares), and eigenvalues.
+    """A figure of filter responses g_l(lambda), with the frame function G and the eigenvalues of a shape.
 
     **Arguments:**
 
-    - `eigenvalue_grid`: the p values of lambda at which the responses are given, ascending.
-    - `responses`: the scaling function first, then wavelets from the coarsest to the finest.
-    - `eigenvalues`: the eigenvalues of a shape, which are marked on the axis.
+    - `eigenvalue_grid`: the values of lambda at which the responses are given (p,), ascending.
+    - `responses`: the responses (filters, p): the scaling function first, then wavelets from the coarsest to
+      the finest.
+    - `eigenvalues`: the eigenvalues of a shape (k,), which are marked on the axis.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if the shapes do not fit, or matplotlib is missing.
+    **Raises:** `InputError` if the responses do not fit the grid, or if matplotlib is missing.
     """
     grid, curves = np.asarray(eigenvalue_grid, dtype=float), np.asarray(responses, dtype=float)
     if grid.ndim != 1 or curves.ndim != 2 or curves.shape[1:] != grid.shape:
@@ -212,22 +218,26 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """Correspondence quality: the share of matches whose geodesic error is at most a threshold.
+    """A figure of correspondence quality curves: the share of matches with an error of at most a threshold.
 
     **Arguments:**
 
-    - `curves`: by the name of a map, thresholds (fractions of sqrt(area), ascending) and shares in [0, 1].
+    - `curves`: by the name of a map, the thresholds (p,) in ascending order, as fractions of sqrt(area of Y),
+      and the shares (p,) in [0, 1].
     - `mean_errors`: mean errors by the same names, for the legend. Curves without a mean error are allowed.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if there is no curve, the arguments do not fit together, or matplotlib is
+    **Raises:** `InputError` if there is no curve, if the arguments do not fit together, or if matplotlib is
     missing.
     """
     if not curves:
-        raise InputError("there is no quality curve to draw; give at least one.")
-    if strangers := mean_errors.keys() - curves.keys():
-        raise InputError(f"there are mean errors but no quality curves for {', '.join(sorted(strangers))}.")
+        raise InputError("there is no quality curve to draw; give at least one curve.")
+    if unknown := mean_errors.keys() - curves.keys():
+        raise InputError(
+            f"there are mean errors but no quality curves for {', '.join(sorted(unknown))}; give these "
+            "curves, or leave out their mean errors."
+        )
     figure = _new_figure(6.8, max(3.8, 0.6 + _LEGEND_LINE * len(curves)), plot=True)
     axes = figure.add_subplot()
     lines, labels = [], []
@@ -276,22 +286,23 @@ def draw_functions(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Functions on bodies: one row per body and one column per function. Red is positive, blue negative.
+    """A figure of functions on bodies, with one row per body and one column per function.
 
-    All bodies of a column share one colour scale. The scale ends at the absolute value that 99.5 % of the
-    vertices do not exceed.
+    Positive values are red, and negative values are blue. All bodies of a column share one colour scale. The
+    scale ends at the absolute value that 99.5 % of the vertices do not exceed.
 
     **Arguments:**
 
-    - `meshes`: the bodies, with n vertices each.
-    - `functions`: the same functions for each body, one value per vertex.
+    - `meshes`: the bodies. Their numbers of vertices n may differ.
+    - `functions`: for each body, the values of all functions at its vertices (functions, n).
     - `titles`: the titles of the functions.
-    - `marked`: one vertex of each body, which gets a ring.
+    - `marked`: one 0-based vertex of each body, which is marked by a ring.
     - `up`, `azimuth`: as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if the functions do not fit the meshes or the titles, or matplotlib is missing.
+    **Raises:** `InputError` if the functions do not fit the meshes or the titles, if `up` is not an axis, or
+    if matplotlib is missing.
     """
     for mesh, values in zip(meshes, functions, strict=True):
         if np.shape(values) != (len(titles), len(mesh.vertices)):
@@ -342,28 +353,29 @@ def draw_forest(
     xlabel: str,
     linear_up_to: float = 1.0,
 ) -> Figure:
-    """A forest plot: estimates with intervals around a line at zero, one panel per group of cases.
+    """A forest plot: estimates with intervals, next to a line at zero, with one panel per group of cases.
 
-    The scale is linear around zero and logarithmic beyond, so that small and large differences can be read.
+    The scale is linear near zero and logarithmic beyond, so that small and large differences are visible.
 
     **Arguments:**
 
-    - `panels`: by the title of a panel and the name of a series, the estimate and the lower and upper end of
-      the interval of each row; NaN for a missing estimate. All panels have the same series.
+    - `panels`: by the title of a panel and the name of a series, an array (rows, 3). Each row has the
+      estimate and the lower and upper end of its interval; NaN for a missing estimate. All panels have the
+      same series.
     - `rows`: the names of the rows, from top to bottom.
-    - `xlabel`: the quantity that is estimated.
+    - `xlabel`: the name of the estimated quantity.
     - `linear_up_to`: the absolute value at which the scale becomes logarithmic.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if a series does not have three numbers per row, or matplotlib is missing.
+    **Raises:** `InputError` if a series does not have three numbers per row, or if matplotlib is missing.
     """
     for title, series in panels.items():
         for name, intervals in series.items():
             if np.shape(intervals) != (len(rows), 3):
                 raise InputError(
-                    f"{title}, {name}: {len(rows)} rows need an array of shape {(len(rows), 3)}, but it has "
-                    f"shape {np.shape(intervals)}."
+                    f"{title}, {name}: the array has shape {np.shape(intervals)}, but {len(rows)} rows need "
+                    f"shape {(len(rows), 3)}."
                 )
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     pitch = 0.075 * len(names) + 0.1
@@ -422,13 +434,15 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """Tables of positive numbers as colours on one logarithmic scale, with each number in its cell.
+    """A figure of tables of positive numbers: coloured cells that contain the numbers.
+
+    All tables share one logarithmic colour scale.
 
     **Arguments:**
 
-    - `panels`: the tables by title.
+    - `panels`: the tables (rows, columns) by title.
     - `rows`, `columns`: the name of the parameter that varies over the rows or columns, and its values.
-    - `label`: the quantity that the numbers measure.
+    - `label`: the name of the quantity that the numbers measure.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -475,9 +489,14 @@ def draw_heat_maps(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Writes a figure as PNG, PDF or SVG, as the file's suffix says; never leaves half a file.
+    """Writes a figure as PNG, PDF or SVG. The file is written completely or not at all.
 
-    **Raises:** `InputError` for any other suffix, or if the file cannot be written.
+    **Arguments:**
+
+    - `path`: the file, whose suffix (`.png`, `.pdf` or `.svg`) determines the format.
+    - `figure`: the figure.
+
+    **Raises:** `InputError` for any other suffix, if the file cannot be written, or if matplotlib is missing.
     """
     check_figure_path(path)
     suffix = Path(path).suffix.lower()
@@ -488,7 +507,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Checks before the work whether figures can be drawn after it.
+    """Checks that figures can be drawn. Call this function before a long computation whose result is drawn.
 
     **Raises:** `InputError` if matplotlib is missing.
     """
@@ -496,28 +515,28 @@ def check_drawable() -> None:
         import matplotlib.backends.backend_agg  # noqa: F401
     except ImportError as error:
         raise InputError(
-            "figures are drawn by matplotlib, which is not installed: pip install 'jaxsmw[report]'"
+            "matplotlib, which draws figures, is not installed: install it with pip install 'jaxsmw[report]'."
         ) from error
 
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
-    """Checks before the work whether `save_figure` can write a file after it.
+    """Checks that `save_figure` can write a file. Call this function before a long computation.
 
-    **Raises:** `InputError` if the suffix is not that of PNG, PDF or SVG, the file cannot be written, or
-    matplotlib is missing.
+    **Raises:** `InputError` if the suffix of the file is not `.png`, `.pdf` or `.svg`, if the file cannot be
+    written, or if matplotlib is missing.
     """
     if Path(path).suffix.lower() not in _METADATA:
-        raise InputError(f"{path}: figures are written as .png, .pdf or .svg; choose one of these suffixes.")
+        raise InputError(f"{path}: the suffix is not .png, .pdf or .svg; choose one of these suffixes.")
     check_drawable()
     check_writable(path)
 
 
-# No dates in the files: the same figure gives the same file.
+# The files contain no dates, so that equal figures give equal files.
 _METADATA: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 class _Panel(NamedTuple):
-    """One body in a figure: its role in the pair, the standing mesh, and the colours of its vertices."""
+    """One body in a figure: its role in the pair, its upright mesh, and its vertex colours (n, 3)."""
 
     role: str
     mesh: Mesh
@@ -527,7 +546,7 @@ class _Panel(NamedTuple):
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
     """Draws the bodies side by side at one scale, each below its role and name.
 
-    Bodies are shown pixel for pixel as `render` draws them.
+    One pixel of the figure shows one pixel of the picture that `render` returns.
     """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
@@ -575,7 +594,7 @@ def _shorten(name: str) -> str:
 
 
 def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
-    """Draws the colour bar of the errors at the right edge, and the colour of unknown errors if needed."""
+    """Draws the colour bar of the errors at the right edge, and if needed the colour of unknown errors."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.patches import Patch
@@ -596,7 +615,10 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
 
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
-    """An empty white figure with a canvas in memory, its size in inches; plots are laid out automatically."""
+    """An empty white figure with a canvas in memory; plots are laid out automatically.
+
+    The width and the height are in inches.
+    """
     check_drawable()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""Correspondences as an interactive web page: one file that needs nothing else, not even a network."""
+"""Correspondences as an interactive web page: a single file that needs no other files and no network."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from jaxsmw.report.rendering import ELEVATION, choose_azimuth
 from jaxsmw.report.standing import stand_pair
 from jaxsmw.runtime.files import atomic_write
 
-# Bodies that are wider than this multiple of their height are shown one above the other on narrow screens.
+# On narrow screens, bodies that are wider than this multiple of their height are shown one above the other.
 _WIDE = 0.65
 
 _EXPLANATIONS = {
@@ -48,11 +48,12 @@ _EXPLANATIONS = {
     ),
     "wavelets": (
         "A wavelet is a ripple around one point of a surface. Point at a body: if the map is good, the "
-        "ripple around that point and the ripple around its match look alike. Red is positive, blue negative."
+        "ripple around that point and the ripple around its match look similar. Red is positive, blue is "
+        "negative."
     ),
     "eigenfunctions": (
         "Eigenfunctions are the vibration patterns of a surface, like the tones of a drum. These two "
-        "patterns belong to the chosen entry of the functional map. Red is positive, blue negative."
+        "patterns belong to the chosen entry of the functional map. Red is positive, blue is negative."
     ),
     "plain": "The two bodies without colours.",
 }
@@ -64,17 +65,17 @@ _DISTANCES = (
 
 @dataclass(frozen=True, eq=False)
 class ShownMap:
-    """A map on a page, with everything the page says about it.
+    """A map on a page, with its errors, its functional map and its statistics.
 
     **Attributes:**
 
-    - `pointwise_map`: a vertex of Y for every vertex of X, (m,).
-    - `errors`: by name, the error of the match of every vertex of X (m,), as a fraction of sqrt(area of Y);
-      NaN where the error is unknown. Each entry adds a colouring.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `errors`: by name, the error of the match of each vertex of X (m,), as a fraction of sqrt(area of Y);
+      NaN where the error is unknown. Each entry adds a mode that shows these errors as colours.
     - `functional_map`: C, shown as a picture; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the
-      pushforward.
+      pushforward convention. None shows no functional map.
     - `convention`: the convention of C.
-    - `statistics`: labels and values for a table in which maps are compared.
+    - `statistics`: labels and values, shown in the table that compares all maps of the page.
     """
 
     pointwise_map: Int[np.ndarray | Array, " m"]
@@ -99,39 +100,41 @@ def write_page(
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
 ) -> None:
-    """Writes a page with both bodies in 3D, coloured by a map, and the match of the point under the pointer.
+    """Writes a web page that shows both bodies in 3D, coloured by a map, and the match under the pointer.
 
-    The page shows one of the maps at a time. With spectra the page also shows the wavelets of a refiner's
-    bank,
+    The page shows one of the maps at a time. If spectra are given, the page also shows the wavelets of a
+    refiner's bank,
 
         psi_{l,y}(x) = sum_i g_l(lambda_i) phi_i(y) phi_i(x),
 
-    on X around the vertex y under the pointer, and on Y around the match of y. A map that preserves wavelets
-    makes both look alike. Their similarity is the cosine of the angle between the wavelet on X and the
-    wavelet on Y, carried to X by the map.
+    on X around the vertex y under the pointer, and on Y around the match of y. If the map preserves wavelets,
+    both look similar. The page prints their similarity: the map carries the wavelet on Y to X, and the
+    similarity is the cosine of the angle between the result and the wavelet on X.
 
     **Arguments:**
 
-    - `path`: the HTML file. The file opens from disk in any browser with WebGL. Its size is about 0.6 MB for
-      the viewer, 50 bytes per vertex, a few bytes per vertex and map, and with spectra 133 bytes per vertex,
-      at most 8 MB.
+    - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB.
+      Meshes take 50 bytes per vertex, and maps a few bytes per vertex and map. Spectra take 133 bytes per
+      vertex, at most 8 MB in total.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
-    - `maps`: maps from X to Y by name; the page opens with the first.
+    - `maps`: maps from X to Y by name. The page opens with the first map.
     - `title`: the heading.
-    - `spectra`: the spectra of X and Y. The page holds up to `jaxsmw.report.page_data.eigenvectors_on_page`
-      eigenvectors, rounded to one byte per number, so that wavelets are right within about a hundredth.
+    - `spectra`: the spectra of X and Y. The page contains up to
+      `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors, rounded to one byte per number. Wavelets
+      are then accurate to about one hundredth.
     - `refiner`: the refiner whose wavelets are shown.
     - `statistics`: labels and values to show below the bodies.
-    - `error_meanings`: by name of an error, a sentence that explains it.
-    - `error_limit`: the end of the colour scale of errors. Pages can be compared if they share the limit.
-    - `figures`: captions and PNG files to show at the end.
+    - `error_meanings`: explanations of errors, one sentence by the name of each error.
+    - `error_limit`: the end of the colour scale of errors, in the unit of the errors. The colours of two
+      pages are comparable if their limits are equal.
+    - `figures`: captions and contents of PNG files, which are shown at the end of the page.
     - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
-    **Raises:** `InputError` if there is no map, the maps, errors or spectra do not fit the meshes, the limit
-    is not positive, or the file cannot be written.
+    **Raises:** `InputError` if there is no map, if the maps, errors or spectra do not fit the meshes, if the
+    limit is not positive, or if the file cannot be written.
     """
     if not maps:
-        raise InputError("there is no map to show; give at least one.")
+        raise InputError("there is no map to show; give at least one map.")
     check_error_limit(error_limit)
     encoded = [_encode_map(name, shown, mesh_x, mesh_y) for name, shown in maps.items()]
     error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
@@ -164,7 +167,7 @@ def write_page(
 
 
 def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """The data of two standing meshes, and of the camera."""
+    """The data of two upright meshes, and of the camera."""
     reach = np.max(
         [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
     )
@@ -195,7 +198,10 @@ def _add_wavelets(
     spectra: tuple[Spectrum, Spectrum] | None,
     refiner: WaveletPreservation,
 ) -> int:
-    """Adds eigenvectors and filters to the data of both shapes; returns the number of filters, 0 for none."""
+    """Adds eigenvectors and filters to the data of both shapes, and returns the number of filters.
+
+    The number is 0 if the page shows no wavelets.
+    """
     cut = None if spectra is None else spectra_on_page(mesh_x, mesh_y, *spectra)
     if cut is None:
         return 0
@@ -206,7 +212,7 @@ def _add_wavelets(
 
 
 def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
-    """The labels of everything that the colours of the bodies can show, by the viewer's names."""
+    """The labels of all modes in which the viewer colours the bodies, by the viewer's names of the modes."""
     modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
     if has_spectra:
         modes["wavelets"] = "Wavelets"
@@ -216,7 +222,7 @@ def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spec
 
 
 def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
-    """The page: the template with data, fragments of HTML, and the viewer's script."""
+    """The page: the template, filled with data, fragments of HTML and the viewer's script."""
     assets = files("jaxsmw.report") / "assets"
     script = (assets / "viewer.js").read_text("utf-8")
     parts = {
@@ -228,18 +234,18 @@ def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str
         "script": script,
         "script_hash": f"sha256-{encode_bytes(hashlib.sha256(script.encode()).digest())}",
     }
-    # All placeholders at once, so that no inserted part is searched for placeholders.
+    # All placeholders are replaced in one pass, so that inserted text is not searched for placeholders.
     return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / "page.html").read_text("utf-8"))
 
 
 def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """The colours of a CSS gradient: up to nine of a scale."""
+    """The colours of a CSS gradient: up to nine colours of a scale."""
     chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """Radio buttons for labels by value; the first is chosen."""
+    """Radio buttons with the given labels by value. The first button is selected."""
     inputs = "".join(
         f'<label><input type="radio" name="{name}" autocomplete="off" value="{value}"'
         f"{'' if position else ' checked'}><span>{html.escape(text)}</span></label>"
@@ -252,7 +258,7 @@ def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
 
 
 def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -> str:
-    """One paragraph per mode; the viewer shows the paragraph of the current mode."""
+    """One paragraph per mode. The viewer shows the paragraph of the current mode."""
     paragraphs = []
     for mode, label in modes.items():
         text = _EXPLANATIONS.get(mode)
@@ -263,7 +269,7 @@ def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -
 
 
 def _comparison(maps: Mapping[str, ShownMap]) -> str:
-    """A table with one row per map and one column per label of their statistics."""
+    """A table of the maps' statistics, with one row per map and one column per label."""
     labels = dict.fromkeys(label for shown in maps.values() for label in shown.statistics)
     if not labels:
         return ""
@@ -281,7 +287,7 @@ def _comparison(maps: Mapping[str, ShownMap]) -> str:
 
 
 def _statistics(statistics: Mapping[str, str]) -> str:
-    """Labels and values, one card each."""
+    """Labels and values, with one card per label."""
     if not statistics:
         return ""
     rows = "".join(

@@ -1,4 +1,4 @@
-"""The arrays of a page, encoded compactly: base64 of little-endian numbers."""
+"""The arrays of a page in a compact encoding: little-endian numbers in base64."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from jaxsmw.pair import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map
 
-# The largest number of eigenvector entries of both shapes together, at one byte each and a third more in
-# base64. Up to 60 000 vertices in all a page has room for the paper's 100 eigenvectors, beyond 300 000 for
-# none.
+# The largest and the smallest number of eigenvectors on a page, and the largest number of eigenvector entries
+# of both shapes together. An entry takes one byte, and a third more in base64. For up to 60 000 vertices in
+# total a page contains the paper's 100 eigenvectors. For more than 300 000 vertices it contains none.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 
 COLOR_SCALES = {
@@ -26,11 +26,18 @@ COLOR_SCALES = {
     "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
     "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
 }
-"""Colours at even steps between the ends of each scale. The middle colour of a signed scale means zero."""
+"""The colour scales by name: sRGB colours (n, 3) in [0, 1], at even steps between the ends of a scale.
+
+The middle colour of a signed scale means zero.
+"""
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
-    """The number of eigenvectors of two meshes for which a page has room: 100, or fewer for large meshes."""
+    """The number of eigenvectors that a page of two meshes contains.
+
+    The number is 100 for up to 60 000 vertices in total, smaller for more vertices, and 0 for more than 300
+    000.
+    """
     room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
     return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
 
@@ -38,9 +45,19 @@ def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
 def spectra_on_page(
     mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Spectrum, Spectrum] | None:
-    """The part of both spectra for which a page has room; None if it has no room.
+    """The spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    **Raises:** `InputError` if a spectrum does not fit its mesh.
+    If the spectra have different numbers of eigenvectors, as for a partial pair, they are also cut to their
+    common range.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: their spectra, without padding.
+
+    **Returns:** Both spectra; None if the meshes are so large that a page contains no eigenvectors.
+
+    **Raises:** `InputError` if a spectrum does not have one row per vertex of its mesh.
     """
     for mesh, spectrum in ((mesh_x, spectrum_x), (mesh_y, spectrum_y)):
         if len(spectrum.eigenvectors) != len(mesh.vertices):
@@ -51,32 +68,32 @@ def spectra_on_page(
     if not (room := eigenvectors_on_page(mesh_x, mesh_y)):
         return None
     cut = spectrum_x.truncate(room), spectrum_y.truncate(room)
-    # A partial shape has fewer eigenvectors in the same range of eigenvalues.
+    # A partial shape has fewer eigenvectors than the full shape in the same range of eigenvalues.
     return cut if len(spectrum_x.eigenvalues) == len(spectrum_y.eigenvalues) else common_range(*cut)
 
 
 def encode_bytes(data: bytes) -> str:
-    """Base64."""
+    """Bytes as base64 text."""
     return base64.b64encode(data).decode()
 
 
 def encode(array: Shaped[np.ndarray, " *shape"], dtype: str) -> str:
-    """The entries of an array, converted to a NumPy data type."""
+    """The entries of an array as base64 text, converted to a NumPy data type such as `"<f4"`."""
     return encode_bytes(array.astype(dtype).tobytes())
 
 
 def encode_mesh(mesh: Mesh) -> dict[str, Any]:
-    """The vertices and faces of a mesh."""
+    """The vertices and faces of a mesh, as float32 and uint32 in base64."""
     return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
 
 
 def encode_colors(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """Colours in [0, 1], three bytes each."""
+    """Colours (n, 3) in [0, 1] as base64 text, with three bytes per colour."""
     return encode(np.round(255 * colors), "u1")
 
 
 def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filters k"]) -> dict[str, Any]:
-    """The eigenvectors of a shape, and the responses of all filters at the eigenvalues."""
+    """The eigenvectors of a shape, and the responses of all filters at its eigenvalues (filters, k)."""
     return {
         "eigenvectors": encode_rounded(np.asarray(spectrum.eigenvectors).T),
         "responses": encode(np.asarray(responses), "<f4"),
@@ -84,11 +101,18 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 
 
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
-    """One byte per number and one unit per row; the code c stands for sign(c) c² units.
+    """The rows of a matrix, rounded to one byte per number, with one unit per row.
 
-    Small numbers get finer levels. The eigenvectors of limbs are large on the limbs and small elsewhere,
-    where even levels would give wavelets false spots. The rounding changes wavelets by half a hundredth of
-    the colour scale (root mean square, on people and animals), as even levels of 10 bits would.
+    The code c of a number means sign(c) c² units, so small numbers get finer levels. Eigenvectors that are
+    large on a limb are small on the rest of the body, and even levels would cause visible errors of wavelets
+    there. The rounding changes wavelets by half a hundredth of the colour scale (root mean square, on people
+    and animals). Even levels would need 10 bits for the same accuracy.
+
+    **Arguments:**
+
+    - `rows`: the matrix (k, n).
+
+    **Returns:** The codes (int8) and the units (float32) in base64.
     """
     units = np.maximum(np.abs(rows).max(axis=1), np.finfo(np.float32).tiny) / 127**2
     codes = np.sign(rows) * np.round(np.sqrt(np.abs(rows) / units[:, None]))
@@ -98,9 +122,9 @@ def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
 def encode_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"] | None, convention: Convention
 ) -> dict[str, Any] | None:
-    """The matrix C, row by row; None if there is none.
+    """The functional map C (k_out, k_in), row by row as float32 in base64; None if C is None.
 
-    **Raises:** `InputError` if C is not a finite matrix.
+    **Raises:** `InputError` if C is not a matrix of finite numbers.
     """
     if functional_map is None:
         return None

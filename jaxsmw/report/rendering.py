@@ -1,4 +1,4 @@
-"""Shaded pictures of meshes in plain NumPy: the camera, the visible surface and its light."""
+"""Shaded pictures of meshes, rendered with NumPy: camera, visible surface and light."""
 
 from __future__ import annotations
 
@@ -11,31 +11,33 @@ from scipy.ndimage import uniform_filter
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
 
-# The preferred place of the viewer: in front, a little to the side. In radians from +z towards +x.
+# The preferred azimuth of the viewer, in front of the body and a little to the side: the angle from +z
+# towards +x, in radians.
 _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
 """The angle at which the viewer looks down on the body, in radians."""
 
-# Directions to the lights in the camera's frame (right, up, towards the viewer) and their strengths.
+# The direction to each light in camera coordinates (right, up, towards the viewer), followed by its strength.
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# Samples per pixel in each direction, and the number of samples that are tested at a time.
+# The number of samples per pixel in each direction, and the number of samples that are tested at a time.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
 
 def choose_azimuth(meshes: Sequence[Mesh]) -> float:
-    """One direction of view that shows all meshes well.
+    """The azimuth of a view that shows all meshes well.
 
-    The best direction is the one in which the bodies are thin: people are seen from the front, animals from
-    the side. A view from the front and a little to the side is preferred. With M the sum over the meshes of
-    the horizontal covariance, scaled to trace 1, and r the preferred direction, the direction of view is the
-    least eigenvector of M - 0.8 n r r^T for n meshes.
+    The best direction of view is the horizontal direction in which the bodies are thin. People are then seen
+    from the front, and animals from the side. A view from the front and a little to the side is preferred.
+    Let M be the sum of the horizontal covariances of the n meshes, each scaled to trace 1, and r the
+    preferred direction. The direction of view is the eigenvector of M - 0.8 n r r^T with the smallest
+    eigenvalue.
 
     **Arguments:**
 
-    - `meshes`: standing (`jaxsmw.report.standing.stand`).
+    - `meshes`: upright meshes (`jaxsmw.report.standing.stand`).
 
     **Returns:** The viewer's azimuth in radians, from forward (+z) towards +x.
     """
@@ -52,7 +54,14 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
 
 
 def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
-    """The camera's axes (rows: right, up, towards the viewer) at an azimuth in radians."""
+    """The axes of the camera at an azimuth.
+
+    **Arguments:**
+
+    - `azimuth`: the viewer's azimuth in radians, from forward (+z) towards +x.
+
+    **Returns:** An orthogonal matrix (3, 3), whose rows point right, up and towards the viewer.
+    """
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
     towards = np.array([sine * np.cos(ELEVATION), np.sin(ELEVATION), cosine * np.cos(ELEVATION)])
     right = np.array([cosine, 0, -sine])
@@ -65,19 +74,19 @@ def render(
     """A picture of a mesh with coloured vertices, smoothly shaded, on a transparent background.
 
     The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
-    samples per pixel rules out cracks and wrongly sorted triangles. Light comes from the upper left and,
-    weaker, from the right, and lights both sides of a face alike. Surfaces behind a nearer part of the body
-    are slightly darker near its outline.
+    samples per pixel prevents cracks and wrongly sorted triangles. A strong light comes from the upper left,
+    and a weak light from the right. Both light the two sides of a face equally. Where one part of the body is
+    in front of another, the part behind is slightly darker near the outline of the front part.
 
     **Arguments:**
 
-    - `mesh`: standing (`jaxsmw.report.standing.stand`).
-    - `colors`: one sRGB colour in [0, 1] per vertex, interpolated over the faces.
+    - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices.
+    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3), interpolated over the faces.
     - `azimuth`: the viewer's azimuth in radians; see `choose_azimuth`.
-    - `scale`: pixels per unit of length.
+    - `scale`: the number of pixels per unit of length.
     - `width`, `height`: the size of the picture in pixels.
 
-    **Returns:** RGBA pixels with straight alpha, the top row first.
+    **Returns:** RGBA pixels (height, width, 4) with straight alpha, the top row first.
     """
     axes = camera_axes(azimuth)
     positions, normals = mesh.vertices @ axes.T, mesh.vertex_normals @ axes.T
@@ -94,8 +103,8 @@ def render(
     normal = np.einsum("pc,pcd->pd", weights, normals[corners])
     sides = positions[corners[:, 1:]] - positions[corners[:, :1]]
     flat = np.cross(sides[:, 0], sides[:, 1])
-    # Where neighbouring normals cancel out, use the face's own normal. A face seen from behind shows its
-    # back.
+    # Where the normals of the corners cancel out, the normal of the face is used. The normals of faces seen
+    # from behind are reversed, so that the back is lit like the front.
     normal = np.where(np.any(normal, axis=1, keepdims=True), normal, flat) * np.where(flat[:, 2:] < 0, -1, 1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -122,9 +131,9 @@ def _rasterize(
     columns: int,
     rows: int,
 ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """The frontmost face at each sample (-1 for none), the barycentric weights there, and the depth.
+    """The frontmost face at each sample (-1 if there is none), its barycentric weights, and its depth.
 
-    Each face is tested against all samples in its bounding box, a chunk of faces at a time.
+    Each face is tested against all samples in its bounding box. One chunk of faces is processed at a time.
     """
     front = np.full(rows * columns, -1)
     weights = np.zeros((rows * columns, 3))
@@ -137,7 +146,7 @@ def _rasterize(
         triangles[:, 2] - triangles[:, 0],
     )
     determinant = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # Samples lie at half-integer coordinates.
+    # Samples have half-integer coordinates.
     size = np.array([columns, rows])
     lowest = np.clip(np.ceil(triangles.min(axis=1) - 0.5), 0, size).astype(np.int64)
     highest = np.clip(np.floor(triangles.max(axis=1) - 0.5), -1, size - 1).astype(np.int64)
@@ -166,11 +175,11 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """The share of light that reaches points behind nearer surfaces.
+    """The share of the light that reaches each sample; the share is smaller behind a nearer surface.
 
-    The share follows from unsharp masking of the depth (Luft et al. 2006).
+    The share is computed by unsharp masking of the depth (Luft et al. 2006).
     """
-    # One sample per pixel is enough, because the depth gets blurred.
+    # One sample per pixel is enough, because the depth is blurred.
     image = depth[::_SUPERSAMPLING, ::_SUPERSAMPLING]
     share = np.isfinite(image).astype(float)
     blurred = np.where(share > 0, image, 0)

@@ -1,4 +1,4 @@
-"""Bodies upright in pictures: which axis of a file points up, and how large a body is shown."""
+"""Turns bodies upright and scales them for pictures, and guesses which axis of a file points up."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 
-# Proper rotations that turn the named axis up. Bodies in y-up and z-up files then face the same way: forward
-# is +z in y-up files and -y in z-up files, and x runs across the body in both.
+# Rotations that turn the given axis of a file up. Forward is +z in y-up files and -y in z-up files, and x
+# runs across the body in both. After the rotation, bodies of both kinds of files face the same way.
 _STAND = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -24,32 +24,35 @@ _STAND = {
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
 
-# The conventions in use: y up in computer graphics, z up in engineering, y down in computer vision.
+# The usual conventions: y up in computer graphics, z up in engineering, y down in computer vision.
 _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
-# A body is slender along y if its spread along z is at most this multiple of its spread along y. Standing
-# people in y-up files have at most 0.42. Animals in z-up files are long along y, but all except two that leap
-# or crouch have at least 0.47.
+# A body is slender along y if its spread along z is at most this multiple of its spread along y. The ratio of
+# standing people in y-up files is at most 0.42. Animals in z-up files are long along y, but their ratio is at
+# least 0.47, except for two animals that leap or crouch.
 _SLENDER = 0.45
-# How much better another axis must score than the usual axis. People who raise their arms and stand on one
-# foot score up to 0.18 more upside down. Bodies that sit or leap score up to 0.09 more on a wrong axis.
+# The amount by which the score of another axis must exceed the score of the usual axis. The scores of people
+# with raised arms on one foot are up to 0.18 higher upside down. The scores of sitting or leaping bodies are
+# up to 0.09 higher for a wrong axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
-# Beyond these values more stability says nothing. In square roots of the area.
+# Stability is clipped to this range, because larger or smaller values carry no information. The unit is the
+# square root of the area.
 _STABILITY_RANGE = (-0.2, 0.1)
-# The share of the height in which a body touches the ground.
+# Points in the lowest part of the body, with this share of the height, count as touching the ground.
 _CONTACT = 0.1
 _DIRECTIONS = 32
-# The side of the cells in which vertices are merged: about 1500 cells per body. Shorter limbs are noise.
+# The side of the cells in which vertices are merged, which gives about 1500 cells per body, and the length of
+# the shortest limb that counts. Shorter limbs are noise. Both are in square roots of the area.
 _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
-# An area between these multiples of the other shape's area is that of a partial shape.
+# A shape counts as partial if its area is between these multiples of the area of the other shape.
 _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
 
 
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
-    """The mesh as pictures show it: upright, its bounding box centred on the origin, its area 1.
+    """The upright form of a mesh, with its bounding box centred on the origin and with area 1.
 
-    Faces are reoriented so that neighbours agree on which side is out. Vertices keep their numbers.
+    Faces are reoriented such that adjacent faces have consistent orientations. Vertices keep their numbers.
 
     **Arguments:**
 
@@ -57,13 +60,13 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     - `up`: the axis of the file that points up; by default `guess_up`.
 
     **Returns:** A `Mesh` in which x runs across the body, y points up and z forward, provided that the file
-    follows a usual convention.
+    follows one of the usual conventions.
 
     **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
     """
     if not mesh.area > 0:
         raise InputError(
-            f"{mesh.name}: there is nothing to draw because its faces have no area; give a surface."
+            f"{mesh.name}: there is nothing to draw because the faces have no area; give a surface."
         )
     if up is None:
         up = guess_up(mesh)
@@ -80,11 +83,21 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
 
 
 def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
-    """Both meshes standing (`stand`): Y with area 1, and X with area 1 unless one shape is partial.
+    """The upright forms (`stand`) of both meshes: Y with area 1, and X with area 1 unless one shape is
+    partial.
 
-    If the area of one mesh is 1/16 to 0.6 times the area of the other, it counts as a partial shape, and X
-    keeps its size relative to Y. Closer to 1, the two are full shapes; below 1/16, the units of length
-    differ.
+    If the ratio of the smaller to the larger area is between 1/16 and 0.6, the smaller mesh counts as a
+    partial shape, and X keeps its size relative to Y. With a larger ratio both are full shapes. With a
+    smaller ratio the meshes have different units of length.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: surfaces of positive area.
+    - `up`: the axis of both files that points up; by default `guess_up` of each mesh.
+
+    **Returns:** The upright forms of X and of Y.
+
+    **Raises:** `InputError` if a mesh has no area, or if `up` is not an axis.
     """
     standing_x, standing_y = stand(mesh_x, up), stand(mesh_y, up)
     ratio = mesh_x.area / mesh_y.area
@@ -94,21 +107,24 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
 
 
 def guess_up(mesh: Mesh) -> Axis:
-    """The axis of the file that points up, guessed from the limbs on which the body stands: y, z or -y.
+    """Guesses which axis of the file points up, from the limbs on which the body stands.
 
-    An axis scores by the limbs that hang down along it (`_hanging_limbs`), because legs and arms hang and
-    little but a head rises, and by how firmly the body would stand (`_stability`). The usual axis wins unless
-    another one scores clearly better: y for a body that is slender along y, such as a person, and otherwise
-    z.
+    The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
+    axis (`_hanging_limbs`): legs and arms hang down, and hardly anything but a head rises. The second term
+    measures how stably the body would stand (`_stability`). The usual axis is y for a body that is slender
+    along y, such as a person, and z otherwise. The usual axis is returned unless the score of another axis is
+    clearly higher.
 
-    By eye the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies (z up; a leaping and a crouching
-    animal are not upright), 30 of 32 SMAL animals (y down), 17 of 19 people of SHREC'19 (both conventions)
-    and all 16 of SHREC'16 topology. Without limbs and stability the figures were 70, 41, 1, 16 and 16. A body
-    that lies down or is cut in half can fool it.
+    Visual inspection shows that the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies (z up; a
+    leaping and a crouching animal are not upright), 30 of 32 SMAL animals (y down), 17 of 19 people of
+    SHREC'19 (both conventions) and all 16 bodies of SHREC'16 topology. Without the two terms the guess was
+    right for 70, 41, 1, 16 and 16 bodies. The guess can be wrong for a body that lies down or is cut in half.
 
     **Arguments:**
 
     - `mesh`: a surface of positive area.
+
+    **Returns:** The axis: `"y"`, `"z"` or `"-y"`.
     """
     unit = np.sqrt(mesh.area)
     center = mesh.vertex_areas @ mesh.vertices / mesh.area
@@ -126,7 +142,7 @@ def guess_up(mesh: Mesh) -> Axis:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """A coarse copy of the mesh: the mean of the vertices in each cell of a grid, and edges between them."""
+    """A coarse copy of the mesh: the mean vertex of each cell of a grid, and the edges between cells."""
     used = mesh.vertices[mesh.referenced_vertices]
     keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
@@ -141,10 +157,11 @@ def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"]
 def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, "e 2"]) -> float:
     """The sum of the squared lengths of the limbs that hang down.
 
-    A limb reaches from its lowest point up to where it joins a part of the body that reaches lower: its
-    length is the persistence of its component among the points below a height (Edelsbrunner, Letscher and
-    Zomorodian, "Topological persistence and simplification", 2002). The part that reaches lowest does not
-    count. A quadruped has three such limbs if it stands, and none if it lies on its back.
+    A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
+    lower. Its length is the persistence of its component in the sublevel sets of the height (Edelsbrunner,
+    Letscher and Zomorodian, "Topological persistence and simplification", 2002). The component with the
+    lowest point of the body does not count. A standing quadruped has three such limbs. A quadruped on its
+    back has none.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 
@@ -166,9 +183,10 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
 
 
 def _stability(heights: Float64[np.ndarray, " c"], ground: Float64[np.ndarray, "c 2"]) -> float:
-    """How far inside the body's support its centre lies, negative outside; clipped to `_STABILITY_RANGE`.
+    """The distance of the body's centre from the boundary of its support, clipped to `_STABILITY_RANGE`.
 
-    The support is the convex hull of the lowest points, seen from above. The centre is the origin.
+    The distance is negative if the centre is outside of the support. The support is the convex hull of the
+    lowest points, seen from above. The centre is the origin.
     """
     low = ground[heights <= heights.min() + _CONTACT * np.ptp(heights)]
     angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS

@@ -1,4 +1,4 @@
-"""All pictures and numbers about a match or about several maps of a pair."""
+"""Reports: pictures, numbers and interactive pages about one match, or about several maps of a pair."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence
 from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -56,15 +55,17 @@ REPORT_FILES = (
 )
 """The files that `write_report` may write."""
 
-_QUALITY_CAPTION = "The share of matches whose geodesic error is at most a threshold: the higher, the better."
+_QUALITY_CAPTION = (
+    "The share of matches whose geodesic error is at most a threshold. Higher curves are better."
+)
 _FILTERS_CAPTION = (
-    "The filters that make wavelets of each scale, over the eigenvalues of the source (area 1)."
+    "The filters of the wavelets of each scale, over the eigenvalues of the source (scaled to area 1)."
 )
 _ERROR_MEANINGS = {
-    "Error": "The distance along the surface between every match and the right place on the target.",
+    "Error": "The distance along the surface between each match and the true point on the target.",
     "Expected error": (
-        "An estimate of the distance between every match and the right place on the target, made without "
-        "knowing the right place."
+        "An estimate of the distance between each match and the true point on the target. The estimate does "
+        "not use the true points."
     ),
 }
 
@@ -78,9 +79,9 @@ def write_report(
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
 ) -> list[Path]:
-    """Writes the pictures of a match, an interactive page and a summary to a directory.
+    """Writes pictures of a match, an interactive page and a summary to a directory.
 
-    The report includes the expected error (`Correspondence.expected_error`) and, if given, measured errors.
+    The report contains the expected error (`Correspondence.expected_error`) and, if given, measured errors.
 
     **Arguments:**
 
@@ -88,16 +89,17 @@ def write_report(
       and the initial map), `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has
       filters), `quality.png` (if there are errors) and `summary.json`.
     - `correspondence`: the match.
-    - `errors`: geodesic errors by the name of a map. `initial` belongs to `correspondence.initial_map`, the
-      last entry to `correspondence.pointwise_map`.
-    - `settings`: further entries for the summary.
-    - `seconds`: the wall time of every step of the run so far, in seconds, by name; by default the steps of
-      `match`. The report adds its own steps and states the sum as the total, so steps must not overlap.
+    - `errors`: geodesic errors by the name of a map. The entry `initial` is the error of
+      `correspondence.initial_map`. The last entry is the error of `correspondence.pointwise_map`.
+    - `settings`: settings to include in the summary, which must be serialisable as JSON.
+    - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
+      `match`. The report adds its own steps and prints the sum as the total, so steps must not overlap.
     - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
     **Returns:** The files that were written.
 
-    **Raises:** `InputError` if the directory cannot be written to, or matplotlib is missing.
+    **Raises:** `InputError` if the directory cannot be written to, if `up` is not an axis, or if matplotlib
+    is missing.
     """
     directory = make_directory(directory)
     errors = errors or {}
@@ -145,7 +147,7 @@ def _shown_maps(
     """The refined and the initial map, as the page shows them."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
-    convention = correspondence.stages[-1].refiner.convention
+    convention = correspondence.preset.stages[-1].refiner.convention
     final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
     refined = ShownMap(
         correspondence.pointwise_map,
@@ -171,9 +173,9 @@ def _save_figures(
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
 ) -> tuple[list[Path], dict[Path, str]]:
-    """Writes all figures; returns their files, and the captions of the files that the page shows as well."""
+    """Writes all figures. Returns their files, and the captions of the files that the page also shows."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
-    convention = correspondence.stages[-1].refiner.convention
+    convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
         "correspondence": draw_correspondence(
             mesh_x, mesh_y, correspondence.pointwise_map, errors=per_vertex, up=up
@@ -196,7 +198,7 @@ def _save_figures(
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
     """The last refiner that preserves wavelets, and its number of eigenvectors; None without such a stage."""
-    for stage in reversed(correspondence.stages):
+    for stage in reversed(correspondence.preset.stages):
         if isinstance(stage.refiner, WaveletPreservation):
             return stage.refiner, stage.number_of_eigenvectors
     return None
@@ -212,23 +214,24 @@ def write_comparison(
     partial: bool = False,
     up: Axis | None = None,
 ) -> None:
-    """Writes an interactive page with several maps of one pair, one shown at a time.
+    """Writes an interactive page with several maps of one pair. The page shows one map at a time.
 
-    The page also shows the functional maps and the wavelets of the paper's bank, unless the eigenvectors of
-    the meshes cannot be computed; then there is a warning.
+    The page also shows the functional maps and the wavelets of the paper's bank. If the eigenvectors of the
+    meshes cannot be computed, a warning says so, and the page shows neither.
 
     **Arguments:**
 
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_maps`: T: X -> Y (m,) by name, in the order in which the page lists them.
-    - `errors`: geodesic errors by the same names. The page shows them in colours, compares the main figures
-      of all maps in a table, and shows their correspondence quality curves.
+    - `pointwise_maps`: maps T: X -> Y (m,) by name, in the order in which the page lists them; 0-based
+      vertices of Y.
+    - `errors`: geodesic errors by the same names. The page shows these errors as colours, a table of the main
+      figures of all maps, and the correspondence quality curves.
     - `partial`: whether one shape is a partial view of the other; see `jaxsmw.match`.
     - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
 
-    **Raises:** `InputError` if the maps do not fit the meshes, the file cannot be written, or, with errors,
-    matplotlib is missing.
+    **Raises:** `InputError` if the maps do not fit the meshes, if the file cannot be written, if `up` is not
+    an axis, or if errors are given and matplotlib is missing.
     """
     errors = errors or {}
     maps = {name: check_map(mesh_x, mesh_y, pointwise_map) for name, pointwise_map in pointwise_maps.items()}
@@ -261,14 +264,16 @@ def write_comparison(
 
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
-    """The spectra that a page of these meshes shows; None, with a warning, if they cannot be computed."""
-    fewest = min(int(mesh.referenced_vertices.sum()) for mesh in (mesh_x, mesh_y))
-    number = min(eigenvectors_on_page(mesh_x, mesh_y), fewest // 2)
-    if not number:
+    """The spectra for a page of two meshes; None if the meshes are too large.
+
+    If the spectra cannot be computed, the result is also None, and a warning says why.
+    """
+    pair, room = Pair(mesh_x, mesh_y, partial), eigenvectors_on_page(mesh_x, mesh_y)
+    if not room:
         return None
     logging.getLogger("jaxsmw").info("eigenbases ...")
     try:
-        return paired_spectra(Pair(mesh_x, mesh_y, partial), number)
+        return paired_spectra(pair, min(room, pair.fewest_vertices() // 2))
     except InputError as error:
         warnings.warn(f"the page has no wavelets: {error}", stacklevel=3)
         return None
@@ -293,7 +298,7 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _main_figures(error: GeodesicError | None) -> dict[str, str]:
-    """The labels and values of a map in the table of maps."""
+    """The labels and values of a map in the table of maps; empty without errors."""
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -303,14 +308,33 @@ def _main_figures(error: GeodesicError | None) -> dict[str, str]:
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
-    """The filters of a bank over the eigenvalues of a shape, with their frame function."""
+    """A figure of the filters of a bank and their frame function, over the eigenvalues of a shape.
+
+    **Arguments:**
+
+    - `bank`: the filter bank.
+    - `eigenvalues`: the eigenvalues of the shape (k,), ascending.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if matplotlib is missing.
+    """
     spectrum = jnp.asarray(eigenvalues)
     grid = jnp.linspace(0, spectrum[-1], 1000)
     return draw_filters(np.asarray(grid), np.asarray(bank(grid, spectrum)), eigenvalues)
 
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
-    """The correspondence quality curves of some maps, with their mean errors."""
+    """A figure of the correspondence quality curves of maps, with their mean errors in the legend.
+
+    **Arguments:**
+
+    - `errors`: geodesic errors by the name of a map; at least one.
+
+    **Returns:** A `matplotlib.figure.Figure`.
+
+    **Raises:** `InputError` if there are no errors, or if matplotlib is missing.
+    """
     thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
     return draw_quality_curves(
         {
@@ -327,14 +351,17 @@ def summarize(
     expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """The facts about a match by label, ready to print.
+    """The main facts about a match, as printable text by label.
 
     **Arguments:**
 
     - `correspondence`: the match.
     - `errors`: geodesic errors by the name of a map.
-    - `expected_error`: the expected error of every match (m,).
-    - `seconds`: the wall time of every step of the run so far, by name; by default the steps of `match`.
+    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
+    - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
+      `match`.
+
+    **Returns:** Text values by label, in the order in which they are printed.
     """
     facts = {
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
@@ -345,9 +372,9 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
-        suspicion = (
-            f"; above {RepairSettings().suspicious} limbs may be swapped" if correspondence.suspicious else ""
-        )
+        repair, suspicion = correspondence.preset.repair, ""
+        if correspondence.suspicious and repair is not None:
+            suspicion = f"; above {repair.suspicious} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     steps = correspondence.seconds if seconds is None else seconds
@@ -356,7 +383,7 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """The versions, the machine and the device on which results depend besides their input."""
+    """The versions of packages, the machine and the device. Results depend on these and on the input."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
@@ -366,7 +393,7 @@ def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.n
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """The error of each of the m source vertices: NaN if unknown, and the mean if there are several."""
+    """The error of each of the m source vertices: NaN if unknown, and the mean if a vertex has several."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

@@ -1,4 +1,4 @@
-"""The results of a benchmark in publishable form: tables, curves, and a columnar file."""
+"""The results of a benchmark for publication: tables, curves and a columnar file."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
 
 REFERENCE = "mwp"
-"""The method that the differences of all other methods refer to."""
+"""The name of the reference method. Tables show the difference of each other method from this method."""
 
 
 class MethodSummary(NamedTuple):
-    """The figures of one method over all pairs on which the method did not fail.
+    """The figures of one method, over all pairs on which the method did not fail.
 
     **Attributes:**
 
-    - `mean`, `median`: the mean and the median of the pairs' mean errors, x 10^-3 of the square root of the
-      target's area.
-    - `difference`: the mean difference of the pairs' mean errors from those of `REFERENCE`, x 10^-3; NaN for
-      `REFERENCE` itself.
+    - `mean`, `median`: the mean and the median over the pairs of the mean geodesic error of a pair, x 10^-3,
+      in square roots of the target's area.
+    - `difference`: the mean over the pairs of the error of a pair minus the error of `REFERENCE` on the same
+      pair, x 10^-3; NaN for `REFERENCE` itself.
     - `within`: the mean share of points with an error of at most 0.05.
-    - `area_under_curve`: the mean area under the correspondence quality curve.
-    - `coverage`: the mean coverage of the target.
-    - `seconds`: the median time from the initial map to the result; NaN for published maps.
-    - `pipeline_seconds`: the median time including the precomputation of both shapes.
+    - `area_under_curve`: the mean area under the correspondence quality curve, at most 1.
+    - `coverage`: the mean coverage of the target, in [0, 1].
+    - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
+    - `pipeline_seconds`: the median time in seconds, including the precomputation of both shapes.
     - `failures`: the number of pairs on which the method failed.
-    - `curve`: the mean correspondence quality curve at the thresholds `CURVE` (t,).
+    - `curve`: the mean correspondence quality curve (t,) at the thresholds
+      `jaxsmw.evaluation.measurement.CURVE`.
     """
 
     mean: float
@@ -53,12 +54,15 @@ class MethodSummary(NamedTuple):
 
 
 def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
-    """Summarises the results of `jaxsmw.evaluation.benchmark.run_benchmark`, by method.
+    """Summarises the results of a benchmark for each method.
 
     **Arguments:**
 
-    - `results`: the results.
+    - `results`: the result of `jaxsmw.evaluation.benchmark.run_benchmark`.
     - `seed`: the seed of the bootstrap intervals.
+
+    **Returns:** A summary for each method, by name. Means and medians are NaN if the method failed on all
+    pairs.
     """
     found = {}
     reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
@@ -89,7 +93,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Returns the mean errors of successful rows by pair, x 10^-3."""
+    """Returns the mean errors of the successful rows, x 10^-3, by pair."""
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -110,7 +114,7 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
-    """Returns the seconds of precomputation of both shapes of a pair."""
+    """Returns the time that the precomputation of both shapes of a pair takes, in seconds."""
     sides = {row["source"], row["target"]}
     return sum(
         float(shapes[side][column])
@@ -137,7 +141,7 @@ _COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
 
 
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a Markdown table with one row for each method."""
+    """Returns a Markdown table of summaries by method, with one row for each method."""
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
     return markdown([header, *rows])
@@ -154,7 +158,10 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns the same table for LaTeX with booktabs rules, and the smallest mean error in bold."""
+    """Returns a LaTeX table of summaries by method, with one row for each method.
+
+    The rules need the LaTeX package booktabs. The smallest mean error is in bold.
+    """
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
     lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
@@ -169,7 +176,20 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
 def write_tables(
     directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
 ) -> dict[str, MethodSummary]:
-    """Writes `summary.md`, `table.tex`, `curves.png` and `results.parquet`; returns the summaries."""
+    """Writes `summary.md`, `table.tex`, `curves.png` and `results.parquet` to a directory.
+
+    **Arguments:**
+
+    - `directory`: an existing directory. Existing files with these names are replaced.
+    - `data_set`: the data set on which the methods were measured.
+    - `results`: the results of the benchmark.
+    - `settings`: the settings of the benchmark.
+    - `methods`: the methods by name, at least those that `results` contains.
+
+    **Returns:** The summaries of the methods, by name.
+
+    **Raises:** `InputError` if a file cannot be written, or if matplotlib is missing.
+    """
     summaries = summarize_methods(results, seed=settings.seed)
     parts = [
         f"# {data_set.name}",
@@ -213,7 +233,15 @@ def _write(path: Path, text: str) -> None:
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """Writes all rows with their types, for pandas and polars; `curve` is a list of shares."""
+    """Writes rows of results to a Parquet file with typed columns, for pandas and polars.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace.
+    - `rows`: rows with `RESULT_COLUMNS` as text. The column `curve` becomes a list of shares.
+
+    **Raises:** `InputError` if the file cannot be written.
+    """
     import pyarrow
     import pyarrow.parquet
 

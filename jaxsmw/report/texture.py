@@ -1,4 +1,4 @@
-"""Two meshes with one texture, for any viewer of OBJ files."""
+"""Two meshes with a common texture as OBJ files, for any viewer of such files."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
 """The files that `write_textured_pair` writes."""
 
 _MATERIAL = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.png\n"
-# The side of the picture in pixels, and the number of squares along it.
+# The side of the picture in pixels, and the number of squares along a side.
 _PIXELS, _SQUARES = 1024, 32
 
 
 def write_textured_pair(
     directory: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints
 ) -> None:
-    """Writes `source.obj` and `target.obj` with the same checkered picture as texture (`TEXTURE_FILES`).
+    """Writes `source.obj` and `target.obj` with the same checkered picture as texture.
 
-    The picture is projected onto the target along the shortest of its principal axes, without seams, so that
-    front and back look alike. The texture coordinates of a source vertex are those of its match.
+    The picture is projected onto the target along the shortest principal axis of the target. The projection
+    has no seams, and front and back look the same. The texture coordinates of a source vertex are those of
+    its match.
 
     **Arguments:**
 
-    - `directory`: an existing directory. Files with these names are replaced, each completely or not at all.
+    - `directory`: an existing directory, to which `TEXTURE_FILES` are written. Existing files with these
+      names are replaced, each completely or not at all.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: a point of Y for every vertex of X, for example `Correspondence.surface_points()`.
+    - `points`: a point on Y for every vertex of X (m points), for example `Correspondence.surface_points()`.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -50,17 +52,20 @@ def write_textured_pair(
 
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
-    """Coordinates along the two longest principal axes; those of the surface are from 0 to at most 1."""
+    """Coordinates (n, 2) along the two longest principal axes.
+
+    The coordinates of referenced vertices are in [0, 1].
+    """
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # The signs of singular vectors are arbitrary; make the largest coordinate of each axis positive.
+    # The signs of singular vectors are arbitrary, so the largest component of each axis is made positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)
     return (flat - low) / np.ptp(used @ longest.T, axis=0).max()
 
 
 def _checkered() -> Float64[np.ndarray, "h w 3"]:
-    """A checkerboard of light and dark squares, whose hue shows the position in the picture."""
+    """A checkerboard of light and dark squares, whose hues show their position in the picture."""
     row, column = np.mgrid[:_PIXELS, :_PIXELS] * _SQUARES // _PIXELS
     across, up = column / (_SQUARES - 1), row / (_SQUARES - 1)
     colors = np.stack([0.25 + 0.75 * across, 0.25 + 0.75 * up, 1 - 0.75 * across], axis=2)

@@ -1,4 +1,4 @@
-"""Refinement of many pairs: shapes are padded to a few common sizes and refined together, on all devices."""
+"""Refinement of many pairs: shapes are padded to a few common sizes and refined in batches on all devices."""
 
 from __future__ import annotations
 
@@ -32,12 +32,14 @@ Tree = TypeVar("Tree")
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
-    """Returns several shapes as one pytree with a leading axis, for `jax.vmap`, padded to the largest shape.
+    """Returns several shapes as one `Spectrum` for `jax.vmap`, whose arrays have a leading axis.
+
+    All shapes are padded to the number of vertices of the largest shape.
 
     **Raises:** `ValueError` if the shapes differ in their number of eigenvectors, or if there are no shapes.
     """
     if not spectra:
-        raise ValueError("there are no shapes to stack")
+        raise ValueError("there are no shapes to stack: give at least one spectrum")
     sizes = {spectrum.eigenvalues.shape[0] for spectrum in spectra}
     if len(sizes) > 1:
         raise ValueError(f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them first")
@@ -64,31 +66,36 @@ def refine_pairs(
 
     Shapes are padded to a few common sizes (`jaxsmw.runtime.padding.padded_size`). One compiled program
     serves all pairs with the same combination of sizes. All devices share each batch. With several processes
-    (`jax.distributed`), call this function with the same arguments in each process. The devices of all
-    processes take part, and every process gets all results.
+    (`jax.distributed`), call this function with the same arguments in each process. The function uses the
+    devices of all processes, and every process gets all results.
 
-    The result of a pair agrees with that of `refine` up to the rounding of sums over padded arrays and of
-    batched products. Functional maps agree to the precision of the float type. Matches can differ only if two
-    vertices of Y are equally near to that precision.
+    The result of a pair agrees with the result of `refine` up to the rounding of sums over padded arrays and
+    of batched products. Functional maps agree to the precision of the float type. Matches can differ only if
+    the distances to two vertices of Y are equal to that precision.
 
     **Arguments:**
 
     - `spectra`: the shapes.
     - `pairs`: the positions of source X and target Y among the shapes, for each pair. A pair may occur
       several times with different initial maps.
-    - `pointwise_maps`: the initial map T: X -> Y (m,) of each pair.
+    - `pointwise_maps`: the initial map T: X -> Y (m,) of each pair, one vertex of Y per vertex of X.
     - `refiner`, `iterations`, `partial`, `stop_when_unchanged`, `history`: see `refine`.
-    - `samples`: the vertices of each shape on which the refiner iterates, the same number for all shapes; see
-      `refine`.
-    - `batch_size`: the number of pairs that each device refines at once. The default is 1 on CPUs, where
-      larger batches only take more memory. On other devices it is as many as fit into `memory`, up to 64.
-    - `memory`: the bytes that a batch may use on each device; by default half of the device's memory.
+    - `samples`: the vertices (s,) of each shape on which the refiner iterates, the same number for all
+      shapes; see `refine`.
+    - `batch_size`: the number of pairs that each device refines at once. The default on CPUs is 1, because
+      larger batches save no time there and need more memory. The default on other devices is as many pairs as
+      fit into `memory`, up to 64.
+    - `memory`: the memory in bytes that a batch may use on each device; by default half of the device's
+      memory.
     - `devices`: the devices to use; by default all devices of the default backend.
 
-    **Returns:** An iterator over (position among the pairs, its `Refinement`), batch by batch, in which pairs
-    of equal size follow each other. Bad numbers raise no error: check each `result`.
+    **Returns:** An iterator over tuples of the position of a pair among the pairs and the `Refinement` of
+    this pair. Pairs of equal size follow each other. Numerical failures raise no error: check the `result` of
+    each refinement.
 
-    **Raises:** `ValueError` if the arguments do not fit together.
+    **Raises:** `ValueError` if the numbers of pairs, initial maps and samples do not fit together, a pair
+    refers to a shape that does not exist, an initial map is not one integer per vertex of X, a shape is not a
+    `Spectrum`, or `batch_size` is below 1.
     """
     _check_pairs(spectra, pairs, pointwise_maps, samples)
     if batch_size is not None and batch_size < 1:
@@ -110,7 +117,7 @@ def refine_pairs(
             )
             for begin in range(0, len(positions), per_call):
                 chosen = positions[begin : begin + per_call]
-                # The last batch is filled up with copies of a pair, because another size needs another
+                # The last batch is filled with copies of a pair, because a smaller batch would need another
                 # program.
                 filled = chosen + chosen[-1:] * (per_call - len(chosen))
                 maps = np.stack([pad_rows(np.asarray(pointwise_maps[p]), sizes.m) for p in filled])
@@ -131,11 +138,18 @@ def _check_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     samples: Sequence[Int[Array, " _"]] | None,
 ) -> None:
-    """**Raises:** `ValueError` if shapes, pairs, initial maps and samples do not fit together."""
+    """Checks the arguments of `refine_pairs`.
+
+    **Raises:** `ValueError` if shapes, pairs, initial maps and samples do not fit together.
+    """
     if len(pairs) != len(pointwise_maps):
-        raise ValueError(f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps")
+        raise ValueError(
+            f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
+        )
     if samples is not None and len(samples) != len(spectra):
-        raise ValueError(f"there are {len(spectra)} shapes, but samples of {len(samples)}")
+        raise ValueError(
+            f"there are {len(spectra)} shapes, but samples of {len(samples)}: give samples of every shape"
+        )
     for position, spectrum in enumerate(spectra):
         if not isinstance(spectrum, Spectrum):
             raise ValueError(
@@ -148,7 +162,9 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but two positions among {len(spectra)} shapes are needed"
             )
         if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise ValueError(f"the initial map of pair {position} is of {pointwise_map.dtype}, not integers")
+            raise ValueError(
+                f"the initial map of pair {position} is of {pointwise_map.dtype}: give integer vertex indices"
+            )
         vertices = spectra[pair[0]].mask.shape
         if pointwise_map.shape != vertices:
             raise ValueError(
@@ -182,7 +198,7 @@ class _Sizes(NamedTuple):
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Returns the positions of all pairs of each combination of sizes."""
+    """Returns the positions of all pairs, grouped by the sizes of the pairs."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
@@ -205,7 +221,7 @@ class _Batch(NamedTuple):
 
 
 class _Stack:
-    """The shapes on one side of some pairs, padded to one size, on all devices."""
+    """The shapes on one side of some pairs, padded to one size and copied to all devices."""
 
     def __init__(
         self,
@@ -258,7 +274,7 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 
 
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
-    """Returns 1 on CPUs, and as many pairs as fit into the memory on other devices."""
+    """Returns 1 on CPUs. On other devices, returns the number of pairs that fit into the memory, up to 64."""
     if _one_at_a_time(device):
         return 1
     if memory is None:
@@ -268,14 +284,20 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    """Returns whether to refine one pair at a time: on CPUs a batch takes a third longer than its pairs."""
+    """Returns whether to refine pairs one by one: on CPUs a batch takes a third longer than single pairs."""
     return device.platform == "cpu"
 
 
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
-    """Returns the approximate memory of `refine` on a device for one pair, with the pair, in bytes.
+    """Returns the approximate memory of `refine` on a device for one pair, in bytes.
 
-    The memory is linear in m and n.
+    The memory includes the arrays of the pair. It is linear in m and n.
+
+    **Arguments:**
+
+    - `m`, `n`: the numbers of vertices of X and Y.
+    - `k`: the number of eigenvectors.
+    - `itemsize`: the size of a number in bytes.
     """
     eigenvectors, embeddings, scores = (m + n) * k, 2 * (m + n) * k, 3 * n * BLOCK
     return itemsize * (eigenvectors + embeddings + scores)

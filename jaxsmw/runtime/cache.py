@@ -2,7 +2,7 @@
 
 The name of an entry is a hash of everything that the result depends on, so entries never go stale. Entries
 are written atomically, so any number of processes share the directory without locks. Checksums are verified
-when an entry is read. Deleting the directory costs only time.
+when an entry is read. If the directory is deleted, only time is lost.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def cached(
     inputs: Sequence[np.ndarray | str | int | float],
     compute: Callable[[], dict[str, np.ndarray]],
 ) -> dict[str, np.ndarray]:
-    """Return the result of `compute`, from the disk if it was computed before.
+    """Return the result of `compute`, read from the disk if the result was computed before.
 
     The environment variable `JAXSMW_CACHE` names the directory; the default is the user's cache directory,
     and an empty name or `off` disables the cache. `JAXSMW_CACHE_LIMIT` is the size of the cache in GiB, by
@@ -45,12 +45,12 @@ def cached(
     **Arguments:**
 
     - `kind`: the first part of the entry's name, in lower-case words joined by hyphens.
-    - `inputs`: everything that the result depends on.
+    - `inputs`: all values on which the result depends, in a fixed order.
     - `compute`: computes the arrays and returns them by name.
 
-    **Returns:** The arrays, bit for bit as computed.
+    **Returns:** The arrays by name, bit for bit as computed.
 
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a number, or negative.
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
     place, limit = _place(), _limit()
     if place is None:
@@ -67,7 +67,7 @@ def cached(
                 np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
             _remove_oldest(path.parent, limit)
         except (OSError, InputError):
-            # The text and the line are the same for every entry, so Python shows the warning only once.
+            # Text and line are the same for all entries, so Python shows this warning only once.
             warnings.warn(
                 f"results cannot be cached in {place} and will be computed again next time: make room there, "
                 "or name another directory in JAXSMW_CACHE ('off' for no cache).",
@@ -82,7 +82,7 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Compute everything in the block anew, to measure the time; results are still written to the cache."""
+    """Recompute all results in the block, to measure the time. Results are still written to the cache."""
     token = _recomputing.set(True)
     try:
         yield
@@ -91,11 +91,13 @@ def recomputing() -> Iterator[None]:
 
 
 def cache_compiled_programs() -> None:
-    """Let JAX cache compiled programs beside our results, up to 0.25 GiB, for the next process.
+    """Make JAX cache compiled programs for later processes, next to our results, up to 0.25 GiB.
 
     This function sets JAX's environment variables, unless the user has set one of them. It must run before
-    JAX is imported. Each kind of processor gets a directory of its own: JAX does not distinguish processors,
-    and the cache may be on a disk that different machines share.
+    JAX is imported. Each type of processor gets its own directory, because JAX does not distinguish
+    processors, and machines with different processors may share the disk.
+
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
     place = _place()
     if place is None:
@@ -125,13 +127,13 @@ def cache_compiled_programs() -> None:
 
 
 def _place() -> Path | None:
-    """The directory, or None if the cache is disabled."""
+    """Return the directory, or None if the cache is disabled."""
     place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
     return None if place in ("", "off") else Path(place)
 
 
 def _limit() -> float:
-    """The size limit in bytes."""
+    """Return the size limit in bytes."""
     text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
     try:
         limit = float(text)
@@ -146,14 +148,15 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
-        # The header tells how many bytes follow, so that different lists of inputs give different bytes.
+        # The header contains the number of bytes that follow, so different lists of inputs give different
+        # bytes.
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
 
 
 def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
-    """The arrays of an entry, or None if the entry is missing, damaged, or does not match its name."""
+    """Return the arrays of an entry, or None if the entry is missing, damaged, or does not match its name."""
     # Damaged bytes can raise any exception, and the remedy is always to compute again.
     with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
@@ -166,10 +169,10 @@ def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:
-    """Remove our least recently used files until the rest fits the limit (in bytes)."""
+    """Remove our least recently used files until the remaining files fit the limit (in bytes)."""
     files = []
     for entry in os.scandir(directory):
-        with suppress(FileNotFoundError):  # another process may remove files, too
+        with suppress(FileNotFoundError):  # another process may also remove files
             if _OWN_FILES.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
                 files.append((entry.stat().st_mtime, entry.stat().st_size, entry.path))
     excess = sum(size for _, size, _ in files) - limit

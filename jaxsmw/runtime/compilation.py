@@ -19,23 +19,25 @@ _OPTIONS: dict[str, str | bool] = {
     "xla_cpu_experimental_ynn_fusion_type": "",
     "xla_disable_hlo_passes": "tree_reduction_rewriter",
 }
-# The share of a process's memory maps from which programs are released. A pair of new sizes takes up to three
-# hundredths of the maps, and 250 MB.
+# Programs are released when the process uses more than this share of its memory maps. A pair of new sizes
+# takes up to 3 % of the maps, and 250 MB.
 _LARGEST_SHARE = 0.25
 
 
 def compiler_options() -> dict[str, str | bool]:
     """Returns the `compiler_options` for `jax.jit` that make searches fast on CPUs.
 
-    By default XLA gives products and sums on CPUs to a library (YNNPACK), which takes longer to wake its
-    threads than a small operation lasts. Without the library, a search in patches takes half the time. XLA
-    also splits each long sum into several loops to reduce rounding. With one loop programs compile in two
-    thirds of the time (docs/speed.md), and sums of a million numbers are still right within 5e-6.
+    By default XLA delegates products and sums on CPUs to a library (YNNPACK). Waking the threads of this
+    library takes longer than a small operation. Without the library, a search in patches takes half the time.
+    XLA also splits each long sum into several loops to reduce rounding. With one loop, programs compile in
+    two thirds of the time (docs/speed.md), and sums of a million numbers are still accurate within 5e-6.
 
     JAX accepts options in the outermost `jax.jit` only. Therefore `jaxsmw.refine`, which other compiled
-    functions may call, does not set them itself. The options are for the default backend of JAX, whatever
-    `jax.default_device` says. They are empty for other devices than CPUs, and without options that the
-    installed XLA does not know.
+    functions may call, does not set these options itself. The options depend on the default backend of JAX,
+    not on `jax.default_device`.
+
+    **Returns:** The values of the options by name, without options that the installed XLA does not support.
+    The dictionary is empty if the default backend is not the CPU.
     """
     return dict(_options_for(jax.default_backend()))
 
@@ -46,7 +48,7 @@ def _options_for(backend: str) -> dict[str, str | bool]:
 
 
 def _known(option: str, value: str | bool) -> bool:
-    """Returns whether the installed XLA knows an option."""
+    """Returns whether the installed XLA supports an option."""
     try:
         jax.jit(lambda: 0).lower().compile({option: value})
     except (jax.errors.JaxRuntimeError, ValueError):
@@ -64,7 +66,7 @@ def compiled(function: Function) -> Function:
 
 @cache
 def _compiled(function: Function, backend: str) -> Function:
-    # The types of Equinox do not say that it passes unknown options on to JAX.
+    # The type annotations of Equinox do not declare that unknown options are passed on to JAX.
     return eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
 
 
@@ -75,15 +77,20 @@ def compile_ahead(
 ) -> Future[object]:
     """Starts to compile `compiled(function)` for arguments of given sizes, in the background.
 
-    Wait for the future before the call, or the call compiles the program again. Errors in the arguments stay
-    in the future; the call raises them.
+    Wait for the returned future before you call `compiled(function)`. Otherwise the call compiles the program
+    again.
 
     **Arguments:**
 
-    - `arguments`: a function that returns arrays of these sizes, by position and by name. It is only traced.
-    - `settings`: the other arguments of the function.
+    - `function`: the function to compile.
+    - `arguments`: a function that returns arrays of these sizes: a tuple of arguments by position, and a
+      mapping of arguments by name. This function is only traced.
+    - `settings`: the other arguments of the function, by name.
+
+    **Returns:** A future that is done when the program is compiled. Errors in the arguments stay in this
+    future; the call of `compiled(function)` raises them.
     """
-    program: Any = compiled(function)  # the types of Equinox do not declare `lower`
+    program: Any = compiled(function)  # the annotations of Equinox do not declare `lower`
     x64 = jax.config.read("jax_enable_x64")
 
     def compile_now() -> object:
@@ -102,12 +109,13 @@ def compile_ahead(
 
 
 def release_programs() -> None:
-    """Releases all compiled programs of the process if they use a large share of its memory maps.
+    """Releases all compiled programs of the process if it uses a large share of its memory maps.
 
-    Commands call this function between pairs. Library functions must not call it: `jax.clear_caches` also
-    clears the programs of the caller. On Linux, programs for a few dozen pairs of different sizes would use
-    up all memory maps of the process, and LLVM then ends the process. Released programs are compiled again
-    when they are needed, or loaded if programs are kept on disk.
+    Commands call this function between pairs. Library functions must not call it, because `jax.clear_caches`
+    also clears the programs of the caller. On Linux, programs for a few dozen pairs of different sizes would
+    use up all memory maps of the process. LLVM would then end the process. Released programs are compiled
+    again when they are needed, or loaded if programs are stored on disk. On other systems the function does
+    nothing.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

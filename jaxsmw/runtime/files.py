@@ -1,4 +1,4 @@
-"""Reading and writing files: every failure is one sentence, and no reader ever sees half a file."""
+"""Reading and atomic writing of files. Every failure is reported in one sentence."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ ten million vertices.
 
 
 def largest_contents(size_of_file: int) -> int:
-    """The size up to which the contents of a compressed file are plausible, in bytes.
+    """Return the largest plausible size of the contents of a compressed file, in bytes.
 
-    Contents may always take 1 GiB, as a mesh of ten million vertices does. Larger contents are eigenvectors,
-    which hardly compress: four times the size of their file is generous. A hostile file unpacks to a thousand
-    times its size.
+    1 GiB is always plausible, because a mesh of ten million vertices has this size. Larger contents are
+    eigenvectors, which compress little, so four times the size of their file is a generous limit. A malicious
+    file can unpack to a thousand times its size.
+
+    **Arguments:**
+
+    - `size_of_file`: the size of the compressed file, in bytes.
     """
     return max(2**30, 4 * size_of_file)
 
@@ -34,7 +38,7 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
 
     **Arguments:**
 
-    - `path`: a regular file. Pipes and devices are refused, since they may never end.
+    - `path`: a regular file. Pipes and devices are refused, because they may never end.
     - `largest`: the largest size in bytes; None for no limit.
 
     **Returns:** The contents.
@@ -53,9 +57,9 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
 
 
 def size_of_file(path: str | os.PathLike[str]) -> int:
-    """The size of a regular file in bytes.
+    """Return the size of a regular file in bytes.
 
-    **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be looked at.
+    **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be accessed.
     """
     try:
         status = os.stat(path)
@@ -74,12 +78,12 @@ def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> In
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to, and move the file to `path` when the block succeeds.
+    """Provide a temporary path to write to, and move the file to `path` when the block succeeds.
 
-    After an exception the temporary file is removed, and `path` is as it was. The temporary file lies in the
-    directory of `path`, so that the move is atomic. It has the suffix of `path`, because writers such as
-    `numpy.savez` and `savefig` look at the suffix. If `path` is a symbolic link, the file behind the link is
-    replaced.
+    After an exception the temporary file is removed, and `path` is unchanged. The temporary file is in the
+    directory of `path`, so the move is atomic. The temporary file has the suffix of `path`, because writers
+    such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link, the target of the
+    link is replaced.
 
     **Arguments:**
 
@@ -91,8 +95,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     **Raises:**
 
-    `InputError` if the place or the name makes writing impossible (before the block starts), or after an
-    `OSError` inside the block, such as a full disk.
+    `InputError` before the block starts, if the directory or the name makes writing impossible. `InputError`
+    after an `OSError` inside the block, for example because the disk is full.
     """
     target = _target(path)
     temporary = _temporary(target)
@@ -126,7 +130,7 @@ def remove_unfinished() -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check before long work that `atomic_write` will be able to write a file; leave nothing behind.
+    """Check, before a long computation, that `atomic_write` can write a file; leave nothing behind.
 
     **Raises:**
 
@@ -136,7 +140,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     temporary = _temporary(target)
     try:
         _check_target(path, target)
-        # Permissions alone do not tell: some file systems refuse all new files.
+        # Permissions alone are not conclusive, because some file systems refuse all new files.
         temporary.touch(exist_ok=False)
         temporary.unlink()
     except OSError as error:
@@ -144,7 +148,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """The file that a path means, with symbolic links resolved."""
+    """Return the file of a path, with symbolic links resolved."""
     try:
         return Path(os.path.realpath(path))
     except ValueError as error:  # a null character in the name
@@ -152,7 +156,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _temporary(target: Path) -> Path:
-    """A new hidden name beside a file, with the same suffix."""
+    """Return a new hidden path in the directory of a file, with the same suffix."""
     return target.parent / f".{uuid.uuid4().hex}{target.suffix}"
 
 
@@ -184,16 +188,16 @@ def _unwritable(path: str | os.PathLike[str], error: OSError | ValueError) -> In
 
 
 def _reason(error: OSError | ValueError) -> str:
-    """The system's own words for an error."""
+    """Return the operating system's description of an error."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def check_directory(path: str | os.PathLike[str]) -> None:
-    """Check before long work that `make_directory` will succeed; leave nothing behind.
+    """Check, before a long computation, that `make_directory` can succeed; leave nothing behind.
 
     **Raises:**
 
-    `InputError` if the directory cannot be made, or nothing can be written to it.
+    `InputError` if the directory cannot be made, or no file can be written to the directory.
     """
     missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
     try:
@@ -207,16 +211,16 @@ def check_directory(path: str | os.PathLike[str]) -> None:
 def make_directory(path: str | os.PathLike[str]) -> Path:
     """Make a directory and its parents, unless they exist.
 
-    **Returns:** The path.
+    **Returns:** The path of the directory.
 
-    **Raises:** `InputError` if the directory cannot be made, or nothing can be written to it.
+    **Raises:** `InputError` if the directory cannot be made, or no file can be written to the directory.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         raise InputError(
-            f"{path}: cannot be made a directory ({_reason(error)}); choose another place."
+            f"{path}: cannot be made a directory ({_reason(error)}): choose another place."
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"{path}: cannot be written to; choose another place or change its permissions.")
+        raise InputError(f"{path}: cannot be written to: choose another place or change its permissions.")
     return Path(path)

@@ -13,15 +13,18 @@ _SUBDIVISION = 8
 
 
 def padded_size(number_of_vertices: int) -> int:
-    """Returns the common size for a number of vertices. One program serves all shapes of this size."""
+    """Returns the common size for a number of vertices: the number of vertices after padding.
+
+    One program serves all shapes of this size.
+    """
     power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
     step = max(power // _SUBDIVISION, BLOCK)
     return -(-number_of_vertices // step) * step
 
 
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
-    """Returns an array with rows of zeros appended, up to a number of rows.
+    """Returns an array (n, ...) with rows of zeros appended, up to a given number of rows.
 
-    The rows of a host array then match those of a padded `Spectrum`.
+    The rows of a host array then match the rows of a padded `Spectrum`. `number_of_rows` must be at least n.
     """
     return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))

@@ -16,7 +16,7 @@ _LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
-    """The versions of Python and of all packages that results depend on."""
+    """Return the versions, by name, of Python and of all packages on which results depend."""
     return {
         **{package: metadata.version(package) for package in _PACKAGES},
         "python": platform.python_version(),
@@ -24,10 +24,10 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> str:
-    """The operating system, the processor and the number of cores."""
+    """Return the operating system, the processor and the number of cores in one phrase."""
     processor = platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():  # on Linux the platform module knows only the architecture
+    if cpuinfo.is_file():  # on Linux the platform module returns only the architecture
         lines = cpuinfo.read_text("utf-8", "replace").splitlines()
         models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
         processor = models[0] if models else processor
@@ -35,7 +35,10 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """The commit of a checkout, with `-dirty` if files have changed; otherwise the installed version."""
+    """Return the commit of the library's checkout, with `-dirty` if files have changed.
+
+    If the library is not in a checkout, or git is missing, return the installed version.
+    """
     call = ["git", "-C", str(_LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:
         return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
@@ -44,18 +47,21 @@ def commit() -> str:
 
 
 def made_with() -> str:
-    """Commit, machine and versions in one line."""
+    """Return the commit, the machine and the versions in one line."""
     return f"Commit {commit()}, {machine()}, " + ", ".join(f"{k} {v}" for k, v in versions().items()) + "."
 
 
 def measured_code() -> list[Path]:
-    """The modules of the library on which results depend: all except the command line and the report."""
+    """Return the files of the modules on which results depend: all except the command line and the report."""
     left_out = ("report", "cli", "__main__.py")
     return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]
 
 
 def code_digest(paths: Iterable[Path]) -> str:
-    """A hash of the code in Python files, without comments, docstrings and layout."""
+    """Return a hash of the code in Python files, 16 hexadecimal digits.
+
+    Comments, docstrings and layout do not affect the hash. The names and the order of the files do.
+    """
     digest = hashlib.sha256()
     for path in paths:
         tree = ast.parse(path.read_text("utf-8"))

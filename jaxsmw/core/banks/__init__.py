@@ -1,11 +1,11 @@
 """Filter banks: a scaling function and wavelets, sampled over the spectrum of a shape.
 
-All banks depend on ratios of eigenvalues only, so that the scale of a shape cancels. The first filter passes
-the lowest eigenvalues.
+All banks depend only on ratios of eigenvalues, so the scale of a shape cancels. The first filter passes the
+lowest eigenvalues.
 
 - Parseval frames (the squares sum to one): `Meyer`, `SimpleTight`, `Itersine`, `HalfCosine`, `Held`,
   `Simoncelli`, `Papadakis`, `Regular`, `SoftmaxFrame` (with parameters to be learned) and `Identity`. Each of
-  them stays Parseval if `Warped`.
+  these frames remains Parseval in `Warped`.
 - Not tight: `CubicSpline`, `MexicanHat`, `Heat`, `Gabor`, `ExponentialWindow` and `LowPass`. `tighten` turns
   any bank into a tight frame.
 """

@@ -24,18 +24,22 @@ class FilterBank(eqx.Module):
 
         **Arguments:**
 
-        - `points`: points in [0, lambda_max], in any order.
-        - `eigenvalues`: the eigenvalues of the shape, ascending. The last eigenvalue is lambda_max. Banks may
-          also adapt to the others.
+        - `points`: (p,), points in [0, lambda_max], in any order.
+        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
+          last eigenvalue is lambda_max. A bank may also adapt to the other eigenvalues.
+
+        **Returns:** The responses (filters, p), without unit, scaling function first.
         """
 
 
 def sample_bank(
     bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
 ) -> Float[Array, "filters p"]:
-    """Returns the responses of a bank and checks their shape, since users write banks of their own.
+    """Returns the responses of a bank after a check of their shape, because users write banks of their own.
 
-    **Raises:** `ValueError` if the responses are not of shape (filters, points).
+    The arguments and the result (filters, p) are those of `FilterBank.__call__`.
+
+    **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """
     responses = bank(points, eigenvalues)
     if responses.ndim != 2 or responses.shape[1] != points.shape[0]:
@@ -47,9 +51,9 @@ def sample_bank(
 
 
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
-    """Checks the size of a bank.
+    """Checks the number of filters of a bank.
 
-    **Raises:** `TypeError` if the number of filters is not an integer; `ValueError` if it is below the least.
+    **Raises:** `TypeError` if the number is not an integer; `ValueError` if the number is below `least`.
     """
     if not isinstance(filters, int | np.integer):
         raise TypeError(f"{type(bank).__name__} needs a whole number of filters, not {filters!r}")

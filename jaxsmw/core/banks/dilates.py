@@ -36,8 +36,8 @@ class _LogSpacedDilates(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
-        # The scales are in units of 1 / lambda_max. The coarsest is 2 / lambda_min, the finest 1 /
-        # lambda_max.
+        # The scales are in units of 1 / lambda_max. The coarsest scale is 2 / lambda_min, with lambda_min =
+        # lambda_max / ratio. The finest scale is 1 / lambda_max.
         scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
         wavelets = self.wavelet(scales[:, None] * relative[None, :])
         if self.normalize:
@@ -49,8 +49,8 @@ class CubicSpline(_LogSpacedDilates):
     """Dilates of a wavelet that rises like y², falls like 4 / y² and is a cubic spline in between.
 
     This is the wavelet of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
-    theory", 2011 ("abspline"), and the general wavelet of the MWP paper. Not tight: the frame bounds are 1.28
-    and 2.12 with the default parameters.
+    theory", 2011 ("abspline"), and the general wavelet of the MWP paper. The bank is not tight: its frame
+    bounds are 1.28 and 2.12 with the default parameters.
 
     **Arguments:**
 
@@ -58,6 +58,8 @@ class CubicSpline(_LogSpacedDilates):
     - `ratio`: lambda_max over the smallest eigenvalue that the wavelets cover, above 1.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale (in units of
       1 / lambda_max).
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -67,7 +69,7 @@ class CubicSpline(_LogSpacedDilates):
         return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        # The value at zero is the maximum of the wavelet, which lies at 2 - 1 / sqrt(3).
+        # The value at zero is the maximum of the wavelet, at 2 - 1 / sqrt(3).
         return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
 
 
@@ -75,8 +77,8 @@ class MexicanHat(_LogSpacedDilates):
     """Dilates of the Mexican hat `y exp(-y)`, the second derivative of a Gaussian.
 
     This is the wavelet of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014, at the
-    scales of Hammond, Vandergheynst and Gribonval 2011. Not tight: the frame bounds are 0.177 and 0.270 with
-    the default parameters.
+    scales of Hammond, Vandergheynst and Gribonval 2011. The bank is not tight: its frame bounds are 0.177 and
+    0.270 with the default parameters.
 
     **Arguments:**
 
@@ -84,6 +86,8 @@ class MexicanHat(_LogSpacedDilates):
     - `ratio`: lambda_max over the smallest eigenvalue that the wavelets cover, above 1.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale (in units of
       1 / lambda_max).
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -97,11 +101,13 @@ class Heat(FilterBank):
     """Heat kernels `exp(-t lambda / lambda_max)`. All of them are low-pass filters.
 
     Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale signature based on heat
-    diffusion", 2009. Not tight.
+    diffusion", 2009. The bank is not tight.
 
     **Arguments:**
 
-    - `times`: (filters,), the diffusion times t, positive.
+    - `times`: (filters,), the diffusion times t in units of 1 / lambda_max, positive.
+
+    **Raises:** `ValueError` if the times are not a list of one or more positive, finite numbers.
     """
 
     times: Float[Array, " filters"] = eqx.field(converter=as_parameter)

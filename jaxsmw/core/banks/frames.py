@@ -13,7 +13,7 @@ from jaxsmw.core.checks import check_choice
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
-    """Returns the frame function G(lambda) = sum_l g_l(lambda)² (eq. 7) from the responses of a bank.
+    """Returns the frame function G(lambda) = sum_l g_l(lambda)² (eq. 7), (k,), from responses (filters, k).
 
     G is constant for a tight frame and 1 for a Parseval frame.
     """
@@ -23,8 +23,8 @@ def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
 class FrameBounds(NamedTuple):
     """The minimum and the maximum of the frame function.
 
-    Every function f satisfies `lower |f|² <= sum of squared coefficients <= upper |f|²`. Both bounds are
-    equal for a tight frame, and 1 for a Parseval frame. A bank with `lower = 0` is not a frame.
+    Every function f satisfies `lower |f|² <= sum of squared coefficients <= upper |f|²`. The bounds are
+    equal for a tight frame, and both are 1 for a Parseval frame. A bank with `lower = 0` is not a frame.
     """
 
     lower: Float[Array, ""]
@@ -46,13 +46,15 @@ def frame_bounds(
     - `eigenvalues`: (k,), the eigenvalues of the shape, ascending.
     - `over`: `"eigenvalues"` gives the bounds for functions in the span of these eigenfunctions.
       `"interval"` gives the bounds over [0, lambda_max], which hold for every shape with that lambda_max.
-    - `resolution`: the number of evenly spaced points that sample the interval. If h is their spacing, the
-      lower bound is too large and the upper bound too small by up to `h² max|G''| / 8`, and by up to
-      `h max|G'| / 2` at a kink of G. With the default resolution this error is below 1e-5 of G for the banks
-      of this package with up to 8 filters.
+    - `resolution`: the number of evenly spaced points that sample the interval. With the spacing h of these
+      points, the lower bound is too large, and the upper bound too small, by at most `h² max|G''| / 8`. At a
+      kink of G this error is at most `h max|G'| / 2`. With the default resolution this error is below 1e-5 of
+      G for the banks of this package with up to 8 filters.
 
-    **Raises:** `ValueError` for another value of `over`, a resolution below 2, or responses that are not of
-    shape (filters, points).
+    **Returns:** The smallest and the largest value of the frame function, as numbers without unit.
+
+    **Raises:** `ValueError` for an unknown value of `over`, a resolution below 2, or responses that are not
+    of shape (filters, points).
     """
     check_choice("over", over, ("eigenvalues", "interval"))
     points = eigenvalues
@@ -73,7 +75,7 @@ class Tightened(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         responses = self.bank(points, eigenvalues)
-        # The largest response cancels in the ratio. Division by it keeps the squares from underflow.
+        # The largest response cancels in the ratio. Division by this response prevents underflow of squares.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
         # The negated comparison keeps NaN as NaN; `>=` would hide it.
         covered = ~(largest < jnp.finfo(points.dtype).tiny)
@@ -85,11 +87,14 @@ class Tightened(FilterBank):
 def tighten(bank: FilterBank) -> FilterBank:
     """Returns the canonical tight frame `g_l / sqrt(G)`, the Parseval frame that is closest to a bank.
 
-    Where G vanishes (no response is above the smallest normal number), the responses and their gradients are
-    zero, and the frame is tight on the rest of the spectrum only. A Parseval bank stays unchanged.
+    If no response at an eigenvalue is above the smallest normal number, G vanishes there. The responses and
+    their gradients are then zero, and the frame is tight on the rest of the spectrum only. A Parseval bank
+    has the same responses as before.
 
     **Arguments:**
 
-    - `bank`: any bank. The result is a bank with the same leaves, and differentiable in the leaves.
+    - `bank`: any bank.
+
+    **Returns:** A bank with the same leaves. Its responses are differentiable with respect to the leaves.
     """
     return Tightened(bank)

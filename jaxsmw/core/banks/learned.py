@@ -12,17 +12,20 @@ from jaxsmw.core.checks import as_parameter
 
 
 class SoftmaxFrame(FilterBank):
-    """Filters whose squares are a softmax, so that the squares sum to one for all finite parameters.
+    """Filters whose squares are a softmax, so the squares sum to one for all finite parameters.
 
     `g_l(lambda)² = exp(z_l) / sum_j exp(z_j)`. Each z_l is linear in lambda between evenly spaced knots.
     Every Parseval frame of positive filters has this form, up to the resolution of the knots. To learn a
-    frame, start from `SoftmaxFrame.like(bank)` for a known bank and follow the gradient. If the smallest
-    eigenvalues matter most, `Warped(SoftmaxFrame(…), Power())` spaces the knots evenly in frequency.
+    frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by gradient descent.
+    If the smallest eigenvalues matter most, `Warped(SoftmaxFrame(…), Power())` spaces the knots evenly in
+    frequency.
 
     **Arguments:**
 
     - `logits`: (filters, knots), the values of z at the knots, which run from 0 to lambda_max; at least 2
       knots. A constant added to a column changes nothing.
+
+    **Raises:** `ValueError` if the logits do not have this shape.
     """
 
     logits: Float[Array, "filters knots"] = eqx.field(converter=as_parameter)
@@ -44,10 +47,12 @@ class SoftmaxFrame(FilterBank):
 
         - `bank`: any bank. The signs of its filters do not matter.
         - `knots`: the number of knots, at least 2.
-        - `floor`: the smallest value of a filter, from 1e-12 to 1. Smaller values are raised to the floor,
-          because a filter that is zero cannot be learned.
+        - `floor`: the smallest value of a filter, at least 1e-12 and below 1. Smaller values are raised to
+          the floor, because a filter that is zero cannot be learned.
 
-        **Raises:** `ValueError` for fewer than 2 knots, or a floor outside 1e-12 to 1.
+        **Returns:** A frame with logits (filters, knots).
+
+        **Raises:** `ValueError` for fewer than 2 knots, or a floor below 1e-12 or not below 1.
         """
         if knots < 2 or not 1e-12 <= floor < 1:
             raise ValueError(

@@ -49,14 +49,17 @@ class _DyadicBands(_Transitions):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        # No eigenvalue but 0 lies 100 octaves below the largest, and 2^octaves must not overflow.
+        # Only the eigenvalue 0 is 100 octaves below the largest eigenvalue, and 2^octaves must not overflow.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
         return self.profile(jnp.clip(ratios - 1, 0, 1))
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The polynomial nu of least degree with nu(u) + nu(1 - u) = 1 and 3 vanishing derivatives at 0 and 1."""
+    """Returns nu(u), elementwise, for an array of any shape with numbers u from 0 to 1.
+
+    nu is the polynomial of least degree with nu(u) + nu(1 - u) = 1 and 3 vanishing derivatives at 0 and 1.
+    """
     return ramp**4 * (35 - 84 * ramp + 70 * ramp**2 - 20 * ramp**3)
 
 
@@ -65,11 +68,13 @@ class Meyer(_DyadicBands):
 
     Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section 4.2 of the MWP paper
     uses this frame. The scaling function passes the lowest band, which is the *largest* spatial scale. The
-    bank would not be tight if the scaling function and the finest wavelet changed places.
+    bank would not be tight if the scaling function and the finest wavelet were exchanged.
 
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2.
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` for fewer than 2 filters.
     """
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -85,6 +90,8 @@ class SimpleTight(_DyadicBands):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2.
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` for fewer than 2 filters.
     """
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -121,6 +128,8 @@ class Held(_TwoBands):
 
     - `edge`: the start of the octave relative to lambda_max, in (0, 1). Above 1/2 the high-pass filter does
       not reach one.
+
+    **Raises:** `ValueError` if the edge is not one number in (0, 1).
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -138,6 +147,8 @@ class Simoncelli(_TwoBands):
 
     - `edge`: the start of the octave relative to lambda_max, in (0, 1). Above 1/2 the high-pass filter does
       not reach one.
+
+    **Raises:** `ValueError` if the edge is not one number in (0, 1).
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -154,6 +165,8 @@ class Papadakis(_TwoBands):
 
     - `edge`: the start of the transition relative to lambda_max, in (0, 1). Above 3/5 the high-pass filter
       does not reach one.
+
+    **Raises:** `ValueError` if the edge is not one number in (0, 1).
     """
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=3 / 8)
@@ -165,12 +178,15 @@ class Papadakis(_TwoBands):
 class Regular(_Transitions):
     """A low-pass and a high-pass filter with a transition over the whole interval.
 
-    The angle is `pi/4 (1 + s)`. Here s is `2 lambda / lambda_max - 1` after `degree` applications of
-    `sin(pi/2 ·)` (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
+    The angle is `pi/4 (1 + s)`. The number s results from `2 lambda / lambda_max - 1` by `degree`
+    applications of `sin(pi/2 ·)` (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
+    2014).
 
     **Arguments:**
 
     - `degree`: how often the sine is applied, 0 or more. Higher degrees make the transition steeper.
+
+    **Raises:** `ValueError` if the degree is negative.
     """
 
     degree: int = eqx.field(static=True, default=3)

@@ -16,8 +16,8 @@ from jaxsmw.core.checks import as_parameter, check_between
 class _UniformTranslates(FilterBank):
     """One window that moves along the spectrum in even steps.
 
-    `overlap` windows cover each point of [0, lambda_max]. Their squares sum to a constant if the squares of
-    all integer translates of the window do.
+    `overlap` windows cover each point of [0, lambda_max]. If the squares of all integer translates of the
+    window sum to a constant, the squares of the filters also sum to a constant.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -48,7 +48,9 @@ class Itersine(_UniformTranslates):
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`.
-    - `overlap`: the number of windows that cover each point, an even number.
+    - `overlap`: the number of windows that cover each point, an even number, at least 2.
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
     """
 
     def __check_init__(self) -> None:
@@ -63,12 +65,14 @@ class HalfCosine(_UniformTranslates):
     """Evenly spaced translates of the Hann window `cos²(pi u)`. Their squares sum to one.
 
     These are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight
-    graph wavelet and vertex-frequency frames", 2015. The squares there sum to `3/8 overlap`.
+    graph wavelet and vertex-frequency frames", 2015. In that paper the squares sum to `3/8 overlap`.
 
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`.
     - `overlap`: the number of windows that cover each point, at least 3.
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
     """
 
     overlap: int = eqx.field(static=True, default=3)
@@ -85,12 +89,14 @@ class Gabor(FilterBank):
     """Gaussians with evenly spaced centres from 0 to lambda_max: short-time Fourier analysis of a shape.
 
     The bank follows Shuman, Ricaud and Vandergheynst, "Vertex-frequency analysis on graphs", 2016, but with
-    few centres instead of one centre at every eigenvalue. Not tight.
+    few centres instead of one centre at every eigenvalue. The bank is not tight.
 
     **Arguments:**
 
     - `filters`: the number of filters, at least 2.
     - `width`: the standard deviation of the Gaussians relative to the spacing of the centres, positive.
+
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
     """
 
     filters: int = eqx.field(static=True, default=6)

@@ -1,4 +1,4 @@
-"""Banks on a warped spectrum."""
+"""Warps, and banks on a warped spectrum."""
 
 from __future__ import annotations
 
@@ -13,15 +13,22 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class Warp(eqx.Module):
-    """A monotone map of the spectrum. A constant factor in the map changes no bank."""
+    """A monotone map of the spectrum. A constant factor in the map has no effect on any bank."""
 
     @abc.abstractmethod
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Returns the warped points. The arguments are those of `FilterBank.__call__`."""
+        """Returns the warped points (p,).
+
+        **Arguments:**
+
+        - `points`: (p,), points in [0, lambda_max], in any order.
+        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit. The last eigenvalue
+          is lambda_max.
+        """
 
 
 class Warped(FilterBank):
-    """A bank laid out on a warped spectrum: `g_l(warp(lambda))`. A Parseval bank stays Parseval.
+    """A bank evaluated on a warped spectrum: `g_l(warp(lambda))`. A Parseval bank stays Parseval.
 
     Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency
     frames", 2015.
@@ -45,11 +52,13 @@ class Warped(FilterBank):
 class Logarithm(Warp):
     """The warp `log(1 + strength lambda / lambda_max)`.
 
-    The warp is about linear below `lambda_max / strength` and about logarithmic above.
+    The warp is nearly linear below `lambda_max / strength` and nearly logarithmic above.
 
     **Arguments:**
 
     - `strength`: a positive number.
+
+    **Raises:** `ValueError` if the strength is not one positive, finite number.
     """
 
     strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
@@ -67,6 +76,8 @@ class Power(Warp):
     **Arguments:**
 
     - `exponent`: a positive number.
+
+    **Raises:** `ValueError` if the exponent is not one positive, finite number.
     """
 
     exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
@@ -76,7 +87,7 @@ class Power(Warp):
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
         relative = points / eigenvalues[-1]
-        # Zero is an eigenvalue and the slope there is infinite. Gradients use the slope 0 instead.
+        # For exponents below 1 the slope at the eigenvalue 0 is infinite. Gradients use the slope 0 there.
         positive = jnp.where(relative > 0, relative, 1)
         return jnp.where(relative > 0, positive ** jnp.asarray(self.exponent, points.dtype), 0)
 
@@ -87,10 +98,10 @@ class SpectralDistribution(Warp):
     This is the warp of Shuman, Wiesmeyr, Holighaus and Vandergheynst 2015. Under this warp, uniform
     translates pass equal numbers of eigenvalues; the first and the last translate pass half as many.
 
-    The warp maps a simple eigenvalue to its index, and a repeated eigenvalue to the mean of its indices, so
-    that a bank filters all of an eigenspace alike. If all eigenvalues are simple, the responses at the
-    eigenvalues depend on the indices only. By Weyl's law the eigenvalues of a surface grow nearly evenly, so
-    that this warp is close to the identity.
+    The warp maps a simple eigenvalue to its index, and a repeated eigenvalue to the mean of its indices. So a
+    bank treats all functions of an eigenspace equally. If all eigenvalues are simple, the responses at the
+    eigenvalues depend only on the indices. By Weyl's law the eigenvalues of a surface grow nearly evenly, so
+    this warp is nearly linear, and its effect is small.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:

@@ -25,7 +25,12 @@ def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
 
 
 class CoarseToFineState(State):
-    """A state that knows its iteration, counted from 0."""
+    """The state of a coarse-to-fine refiner.
+
+    **Attributes:**
+
+    - `iteration`: the number of the iteration, counted from 0.
+    """
 
     iteration: Int32[Array, ""]
 
@@ -37,9 +42,9 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors in each iteration, for the shape with more of them; the other
+    - `levels`: the number of eigenvectors in each iteration, for the shape with more eigenvectors. The other
       shape uses a proportional number. Iterations beyond the last level use all eigenvectors.
-    - `search`: how matches among all vertices are found: `"exhaustive"`, `"patches"` or `"auto"`.
+    - `search`: the search for matches among all vertices: `"exhaustive"`, `"patches"` or `"auto"`.
 
     **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
     unknown search.
@@ -56,7 +61,13 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """True for the eigenvectors of X and of Y that an iteration uses."""
+        """Returns True for the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses.
+
+        **Arguments:**
+
+        - `prepared`: the result of `prepare`.
+        - `iteration`: the number of the iteration, counted from 0.
+        """
         sizes = prepared.spectrum_x.eigenvalues.shape[0], prepared.spectrum_y.eigenvalues.shape[0]
         largest = max(sizes)
 
@@ -68,13 +79,16 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
         return active(sizes[0]), active(sizes[1])
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Whether all levels are done."""
+        """Returns whether this iteration and all later iterations use all eigenvectors."""
         assert isinstance(state, CoarseToFineState)
         return state.iteration >= len(self.levels)
 
 
 def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """**Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ."""
+    """Checks that two shapes have the same number of descriptors, which may be zero.
+
+    **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
+    """
     numbers = [0 if s.descriptors is None else s.descriptors.shape[1] for s in (spectrum_x, spectrum_y)]
     if numbers[0] != numbers[1]:
         raise ValueError(f"X has {numbers[0]} descriptors and Y has {numbers[1]}; both need the same number")
@@ -86,16 +100,19 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Weights that ignore the vertices of the full shape that are missing on the partial shape.
+    """Returns weights that nearly ignore the vertices of the full shape that the partial shape lacks.
 
-    The shape with the larger mean residual is taken for the full shape. Its weights become
-    `w / (1 + (r / mean)²)`, where `mean` is the mean residual of the other shape, and are scaled to sum 1.
-    The weights of the other shape stay as they are.
+    The shape with the larger mean residual is treated as the full shape. Its weights become
+    `w / (1 + (r / mean)²)`, where `mean` is the mean residual of the other shape. Then its weights are scaled
+    to sum 1. The weights of the other shape are unchanged.
 
     **Arguments:**
 
-    - `weights_x`, `weights_y`: of each vertex, of sum 1.
-    - `residuals_x`, `residuals_y`: squared distance of each vertex to its match.
+    - `weights_x`, `weights_y`: the weights of the vertices of X (m,) and of Y (n,), each with sum 1.
+    - `residuals_x`, `residuals_y`: the squared distance of each vertex to its match (m,) and (n,), in the
+      same unit.
+
+    **Returns:** The new weights of the vertices of X (m,) and of Y (n,), each with sum 1.
     """
     mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
 

@@ -22,8 +22,8 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
-# Ridge of the regression and smallest residual variance, relative to features of variance about 1. Values
-# from a third to three times of either hardly change the results.
+# The ridge of the regression and the smallest residual variance, relative to features of variance about 1.
+# Values from a third of these numbers to three times these numbers hardly change the results.
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
@@ -32,24 +32,29 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
     The features of a vertex are the values of the eigenvectors and the descriptors, if the spectra have
     descriptors. Each iteration regresses the features of X on those of Y along the matches of both
-    directions. Eigenvectors are regressed on eigenvectors, which is the functional map by least squares
-    (Ovsjanikov et al. 2012), and descriptors on descriptors. The covariance of the residuals tells how far
-    each combination of features can be trusted. The next matches are the nearest vertices in the Mahalanobis
-    distance of this covariance. The same is done from Y to X. The number of eigenvectors grows, as in ZoomOut
-    (Melzi et al. 2019).
+    directions. Eigenvectors are regressed on eigenvectors, which gives the functional map by least squares
+    (Ovsjanikov et al. 2012). Descriptors are regressed on descriptors. The covariance of the residuals
+    measures how reliable each combination of features is. The next matches are the nearest vertices in the
+    Mahalanobis distance of this covariance. In the same way, the features of Y are regressed on those of X
+    for the reverse map. The number of eigenvectors grows with the iterations, as in ZoomOut (Melzi et al.
+    2019).
 
-    The method does not assume isometry. From a map as good as the outcome of `WaveletPreservation` it ends
-    nearer to the truth: docs/accuracy.md measures both.
+    The method does not assume isometry. If the initial map is as good as the outcome of
+    `WaveletPreservation`, the result is closer to the ground truth than this initial map. docs/accuracy.md
+    has the measurements.
 
-    For partial shapes, vertices of the full shape whose matches fit badly count less
+    For partial shapes, vertices of the full shape whose matches fit badly get smaller weights
     (`partial_matching_weights`).
 
     **Arguments:**
 
     - `levels`: see `CoarseToFine`.
-    - `search`: how the last matches, among all vertices, are found. `"exhaustive"` compares all vertices with
+    - `search`: the search for the last matches, among all vertices. `"exhaustive"` compares all vertices with
       all vertices. `"patches"` compares eigenvectors alone, without descriptors, and skips patches of the
       target that are too far away. `"auto"` uses patches on CPUs from 15 000 vertices.
+
+    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
+    unknown search.
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
@@ -70,7 +75,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Regresses along the matches, and along those of the reverse map if there is a previous state."""
+        """Returns the regressions along the matches, and `RESULTS.successful`.
+
+        If there is a previous state, the regressions also use the matches of the reverse map.
+        """
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         iteration = jnp.asarray(0, jnp.int32)
         if previous is None:
@@ -95,14 +103,14 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
-        """The nearest vertices in the Mahalanobis distance."""
+        """Returns the vertex of Y nearest to each vertex of X in the Mahalanobis distance."""
         if prepared.patches is None:
             return state.forward.search(prepared.x, prepared.all_y)
         queries, database = self._eigenvector_embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
-        """The nearest vertices of X in the same space."""
+        """Returns the vertex of X nearest to each vertex of Y in the `embeddings` of `recover`, (n,)."""
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         embed = self.embeddings if patches is None else self._eigenvector_embeddings
         database, queries = embed(prepared, state)
@@ -111,21 +119,24 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def energy(
         self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """The uncertainty of the predictions; see `Regression.uncertainty`."""
+        """Returns the uncertainty of the predictions; see `Regression.uncertainty`."""
         return state.uncertainty
 
     def embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
-        """Points whose distance is the Mahalanobis distance between features of X and predictions from Y."""
+        """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
+
+        Their distance is the Mahalanobis distance between the features of X and the predictions from Y.
+        """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """The coordinates that depend on eigenvectors alone, in which patches are compact.
+        """Returns the coordinates that depend on eigenvectors alone, in which patches are compact.
 
-        These are the first ones, because the whitening is triangular.
+        These coordinates are the first k_x coordinates, because the whitening is triangular.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
@@ -149,7 +160,15 @@ class _Features(NamedTuple):
 
 
 class PreparedFeatures(Prepared):
-    """The features of the vertices to be matched (`x`, `y`) and of all vertices (`all_x`, `all_y`)."""
+    """The values that `FeatureRegression` computes once per problem.
+
+    **Attributes:**
+
+    - `x`, `y`: the features of the vertices to be matched: of the samples, or of all vertices.
+    - `all_x`, `all_y`: the features of all vertices.
+    - `patches`: the patches of X and Y, or None if the search uses no patches.
+    - `partial`: see `Problem`.
+    """
 
     x: _Features
     y: _Features
@@ -160,7 +179,14 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """Linear maps from the features of both shapes to points that are close together where features agree."""
+    """Linear maps from the features of both shapes to points that are close together where features agree.
+
+    **Attributes:**
+
+    - `queries`: the map (d_out, d_out) of the predicted features.
+    - `database`: the map (d_in, d_out) of the features from which the prediction is made.
+    - `uncertainty`: half the logarithm of the determinant of the residual covariance of the active features.
+    """
 
     queries: Float[Array, "d_out d_out"]
     database: Float[Array, "d_in d_out"]
@@ -169,17 +195,17 @@ class Prediction(NamedTuple):
     def embeddings(
         self, queries: _Features, targets: _Features
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
-        """The points of the query vertices and of the target vertices."""
+        """Returns the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
-        """The nearest target vertex of every query vertex."""
+        """Returns the nearest target vertex of every query vertex, (m,)."""
         return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """The squared distance of every query vertex to its match."""
+        """Returns the squared distance of every query vertex to its match, (m,), without unit."""
         points, database = self.embeddings(queries, targets)
         return jnp.sum((points - database[matches]) ** 2, axis=1)
 
@@ -192,9 +218,10 @@ class Regression(CoarseToFineState):
 
     @property
     def uncertainty(self) -> Float[Array, ""]:
-        """The mean logarithm of the residual standard deviation, over the features of both shapes.
+        """The mean logarithm of the standard deviations of the residuals, over the features of both shapes.
 
-        (Over their principal components: half the logarithm of the determinants of the residual covariances.)
+        The standard deviations are those of the principal components of the residuals. So the mean is half
+        the logarithm of the determinants of both residual covariances, divided by the number of features.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features
@@ -222,7 +249,7 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """The functional map, and the prediction of x from y, with the active eigenvectors of both shapes."""
+    """Returns the functional map, and the prediction of x from y, both with the active eigenvectors only."""
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
     keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
@@ -239,8 +266,8 @@ def _regress(
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
     factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
-    # The whitening is triangular: each coordinate depends on the features up to its own. Inactive features
-    # are left out, because they would add the same amount, with its rounding error, to all distances.
+    # The whitening is triangular: each coordinate depends only on the features up to its own index. Inactive
+    # features are left out, because they would add an equal amount, with a rounding error, to all distances.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

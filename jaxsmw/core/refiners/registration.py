@@ -26,41 +26,45 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
-# Weights beside positions in units of the square root of the area: unit normals, and the first
-# eigenfunctions divided by the square root of their eigenvalue plus one.
+# Weights relative to positions in units of the square root of the area: of unit normals, and of the first
+# eigenfunctions, each divided by the square root of its eigenvalue plus one. The last number is the number of
+# these eigenfunctions.
 _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
 # The weight of descriptors (of mean square 1) is _DESCRIPTORS / level**_FALLING: descriptors outweigh
-# positions at coarse levels and hardly count at the last level.
+# positions at coarse levels and have little effect at the last level.
 _DESCRIPTORS, _FALLING = 2.8, 1.5
-# Heat flows for this time to average over the neighbourhood of a vertex: over a disk of radius 0.1. The time
-# is longer if the eigenvectors end too early: the last eigenvector decays by at least exp(-_DECAY).
+# Heat flow of this duration averages over the neighbourhood of a vertex, a disk of radius 0.1. With few
+# eigenvectors the duration is longer, so that the last eigenvector decays to exp(-_DECAY) or less.
 _HEAT_TIME, _DECAY = 3e-3, 4.0
-# Ridge relative to the mean square of the eigenvectors, for fits in which some vertices hardly count.
+# The ridge relative to the mean square of the eigenvectors, for fits with small weights of some vertices.
 _RIDGE = 1e-3
-# Squaring a matrix this often leaves the projection on its first eigenvector.
+# After this number of squarings, a matrix is nearly the projection onto its first eigenvector.
 _SQUARINGS = 12
 
 
 class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     """Finds matches by deforming X onto Y, and Y onto X, from low to high frequencies.
 
-    The low frequencies of a deformed surface are those of its matches: their positions projected on the first
-    eigenvectors, with more eigenvectors in every iteration, as in smooth shells (Eisenberger, Lähner,
-    Cremers 2020). The remaining details of the surface are rotated with their neighbourhood, as in
-    as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best rotation follows from averages by heat
-    flow. With all vertices of full shapes each step is a filter, without a linear solve. On samples and on
-    partial shapes, where eigenvectors are not orthonormal, coefficients follow by least squares.
+    The low frequencies of a deformed surface are the positions of the matches, projected onto the first
+    eigenvectors. Every iteration uses more eigenvectors, as in smooth shells (Eisenberger, Lähner, Cremers
+    2020). The remaining details of the surface are rotated with their neighbourhood, as in
+    as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best rotation around each vertex is computed
+    from averages by heat flow. With all vertices of full shapes, each step is a filter, without a linear
+    solve. On samples and on partial shapes, eigenvectors are not orthonormal, and coefficients are computed
+    by least squares.
 
-    The next matches are nearest in position, normal and the first eigenfunctions, on both surfaces at once,
-    and in descriptors (`Spectrum.descriptors`) if the spectra have them. Descriptors count less with every
-    level. A mirrored shape is matched by rotations with a reflection.
+    The next matches are the nearest vertices in a joint space of both surfaces. Its coordinates are
+    positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra have
+    descriptors. The weight of descriptors decreases with every level. A mirrored shape is matched by
+    rotations that include a reflection.
 
-    The initial map must be nearly right. The result is nearer to the truth than that of methods that only
-    use eigenfunctions: docs/accuracy.md measures both. The spectra need positions and normals, which
-    `jaxsmw.compute_spectrum` provides.
+    The initial map must be nearly right. The result is then closer to the ground truth than the results of
+    methods that use only eigenfunctions (docs/accuracy.md has the measurements). The spectra need positions
+    and normals, which `jaxsmw.compute_spectrum` provides.
 
-    Full shapes are compared at area 1, partial shapes in their own unit of length. For partial shapes,
-    vertices of the full shape whose matches fit badly count less (`partial_matching_weights`).
+    Full shapes are both scaled to area 1. Partial shapes are both scaled by the same factor. For partial
+    shapes, vertices of the full shape whose matches fit badly get smaller weights
+    (`partial_matching_weights`).
 
     **Arguments:**
 
@@ -68,12 +72,15 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     - `search`: how the last matches, among all vertices, are found. `"exhaustive"` compares all vertices with
       all vertices. `"patches"` finds the same matches but skips patches of the target that are too far away.
       `"auto"` uses patches on CPUs from 15 000 vertices.
+
+    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
+    unknown search.
     """
 
     def prepare(self, problem: Problem) -> PreparedSurfaces:
-        """Brings both surfaces to one scale.
+        """Scales both surfaces and prepares the search.
 
-        **Raises:** `ValueError` if a spectrum has no positions and normals, or the numbers of descriptors
+        **Raises:** `ValueError` if a spectrum has no positions or normals, or the numbers of descriptors
         differ.
         """
         spectrum_x, spectrum_y = problem.spectrum_x, problem.spectrum_y
@@ -97,7 +104,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def update(
         self, prepared: PreparedSurfaces, pointwise_map: Int[Array, " m"], previous: Registered | None
     ) -> tuple[Registered, RESULTS]:
-        """Deforms X by the matches, and Y by the matches of the reverse map."""
+        """Returns the deformations of both surfaces by their matches, and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         patches = prepared.reverse_patches
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
@@ -119,27 +126,29 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " m"]:
-        """The nearest vertices of Y."""
+        """Returns the vertex of Y nearest to each vertex of X in the `embeddings`."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
-        """The nearest vertices of X in the same space."""
+        """Returns the vertex of X nearest to each vertex of Y in the `embeddings`, (n,)."""
         database, queries = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.x.mask, prepared.reverse_patches)
 
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """The `objective` of the matches by which X was deformed."""
+        """Returns the `objective` of the matches by which X was deformed."""
         return self.objective(prepared, state, pointwise_map)
 
     def embeddings(
         self, prepared: PreparedSurfaces, state: Registered
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Weighted positions, normals, eigenfunctions and descriptors, on both surfaces at once.
+        """Returns weighted positions, normals, eigenfunctions and descriptors, on both surfaces at once.
 
-        Rows of X hold X deformed onto Y, then X itself; rows of Y hold Y itself, then Y deformed onto X.
+        Each row of the first array has coordinates of a vertex of X deformed onto Y, and then of the vertex
+        of X itself. Each row of the second array has coordinates of a vertex of Y itself, and then of this
+        vertex deformed onto X. Positions are in units of the square root of the area.
         """
         return _product_space(prepared.x, prepared.all_y, state, state.descriptor_weight)
 
@@ -163,7 +172,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, spectrum: Spectrum, area: Float[Array, ""]) -> _Surface:
-        """All vertices of a spectrum."""
+        """Returns all vertices of a spectrum, scaled from the given area to area 1."""
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
                 "Registration needs positions and normals, which a spectrum lacks: compute_spectrum gives "
@@ -193,7 +202,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Some of the vertices, with their sampled spectrum."""
+        """Returns some of the vertices, with their sampled spectrum."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -202,7 +211,7 @@ class _Surface(NamedTuple):
         )
 
     def reweighted(self, weights: Float[Array, " s"]) -> _Surface:
-        """The same vertices with other weights in the least-squares fit of coefficients."""
+        """Returns the same vertices with other weights in the least-squares fit of coefficients."""
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
         ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
@@ -210,7 +219,16 @@ class _Surface(NamedTuple):
 
 
 class PreparedSurfaces(Prepared):
-    """The vertices to be matched (`x`, `y`), all vertices (`all_x`, `all_y`), and patches."""
+    """The values that `Registration` computes once per problem.
+
+    **Attributes:**
+
+    - `x`, `y`: the vertices to be matched: the samples, or all vertices.
+    - `all_x`, `all_y`: all vertices.
+    - `patches`, `reverse_patches`: the patches for the search on Y and for the search on X; None for
+      exhaustive searches.
+    - `partial`: see `Problem`.
+    """
 
     x: _Surface
     y: _Surface
@@ -224,10 +242,10 @@ class PreparedSurfaces(Prepared):
 class Deformation(NamedTuple):
     """A deformation of one surface onto another: coefficients of the surface's eigenvectors.
 
-    - `own`, `matched`: coefficients of the surface's positions, and of the `points` of their matches, for the
-      active eigenvectors.
-    - `moments`: coefficients of the averages of positions, of matched positions, of the products of both, and
-      of the products of normals.
+    - `own`, `matched`: coefficients of the surface's positions (k_x, 3), and of the positions, normals and
+      eigenfunctions of their matches (k_x, d), for the active eigenvectors.
+    - `moments`: coefficients (k_x, 24) of the averages of positions, of matched positions, of the products of
+      both, and of the products of normals.
     """
 
     own: Float[Array, "k_x 3"]
@@ -242,7 +260,15 @@ class Deformation(NamedTuple):
         matches: Int[Array, " s"],
         active: Bool[Array, " k_x"],
     ) -> Deformation:
-        """The deformation that follows from matches of a surface's vertices among all vertices of another."""
+        """Returns the deformation that follows from the matches of a surface's vertices on another surface.
+
+        **Arguments:**
+
+        - `surface`: the vertices to be matched.
+        - `other`: all vertices of the other surface.
+        - `matches`: one vertex of `other` for each vertex of `surface` (s,).
+        - `active`: True for the eigenvectors of this iteration (k_x,).
+        """
 
         def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
             return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
@@ -261,7 +287,7 @@ class Deformation(NamedTuple):
         )
 
     def points(self, surface: _Surface) -> Float[Array, "s d"]:
-        """The deformed vertices of the surface, comparable with the `points` of the other surface."""
+        """Returns the deformed vertices of the surface, (s, d): positions, normals and eigenfunctions."""
         low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
         own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
         rotations = _rotations(moments, surface)
@@ -278,7 +304,7 @@ class Registered(CoarseToFineState):
     **Attributes:**
 
     - `forward`, `backward`: the deformations of X onto Y and of Y onto X.
-    - `descriptor_weight`: the weight of descriptors beside positions.
+    - `descriptor_weight`: the weight of descriptors relative to positions.
     """
 
     forward: Deformation
@@ -289,7 +315,7 @@ class Registered(CoarseToFineState):
 def _product_space(
     x: _Surface, y: _Surface, state: Registered, weight: Float[Array, ""]
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Points of both surfaces that are close where each deformed surface is close to the other surface."""
+    """Returns points of both surfaces that are close where each deformed surface is close to the other."""
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
         jnp.concatenate([y.points, state.backward.points(y), weight * y.descriptors], axis=1),
@@ -302,7 +328,10 @@ def _without_missing_parts(
     pointwise_map: Int[Array, " s"],
     reverse_map: Int[Array, " t"],
 ) -> tuple[_Surface, _Surface]:
-    """Both surfaces with `partial_matching_weights`, by distances of matches without descriptors."""
+    """Returns both surfaces with `partial_matching_weights`.
+
+    The residuals are the squared distances between matched points without descriptors.
+    """
     x, y = prepared.x, prepared.y
     no_descriptors = jnp.zeros_like(state.descriptor_weight)
     targets, queries = _product_space(prepared.all_x, y, state, no_descriptors)
@@ -314,7 +343,7 @@ def _without_missing_parts(
 
 
 def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-    """The rotations that take the neighbourhoods of vertices best to the neighbourhoods of their matches.
+    """Returns the rotations that best align the neighbourhoods of vertices with those of their matches.
 
     All rotations include a reflection if the surface as a whole is mirrored.
     """
@@ -328,14 +357,14 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
-    """The rotations R that maximise the trace of R S, by unit quaternions (Horn 1987).
+    """Returns the rotations R that maximise the trace of R S, by unit quaternions (Horn 1987).
 
     R and the trace are quadratic in the quaternion, so the best quaternion is an eigenvector.
     """
     table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
     quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
     sizes = jnp.sqrt(jnp.sum(quadratic**2, axis=(1, 2), keepdims=True))
-    # Without negative eigenvalues the largest eigenvalue dominates the powers.
+    # The identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers.
     powers = quadratic / jnp.where(sizes > 0, sizes, 1) + jnp.eye(4, dtype=covariances.dtype)[None]
 
     def squared(_: Any, powers: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
@@ -351,10 +380,10 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 @cache
 def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
-    """The matrix that takes products of a quaternion's components to the entries of its rotation."""
+    """Returns the matrix from products of a quaternion's components to the entries of its rotation."""
     signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
     units = np.arange(4)
-    multiplication = np.zeros((4, 4, 4))  # one unit times another is plus or minus a third
+    multiplication = np.zeros((4, 4, 4))  # the product of two units is plus or minus a unit
     multiplication[units[:, None], units, units[:, None] ^ units] = signs
     rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])  # q v q*
     return rotations[1:, 1:].reshape(9, 16)

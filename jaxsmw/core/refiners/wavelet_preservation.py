@@ -23,13 +23,13 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class PreparedWavelets(Prepared):
-    """What `WaveletPreservation` computes once per problem.
+    """The values that `WaveletPreservation` computes once per problem.
 
     **Attributes:**
 
-    - `wavelets`: both shapes with the filter bank sampled at their eigenvalues.
-    - `solution`: whatever the solution prepares.
-    - `patches`: patches of X and Y if the search uses them.
+    - `wavelets`: both shapes, with the responses of the filter bank at their eigenvalues.
+    - `solution`: the result of `Solution.prepare`.
+    - `patches`: the patches of X and Y, or None if the search uses no patches.
     """
 
     wavelets: WaveletProblem
@@ -40,22 +40,23 @@ class PreparedWavelets(Prepared):
 class WaveletPreservation(Refiner[PreparedWavelets, State]):
     """Multiscale spectral manifold wavelets preservation: Algorithm 1 of the MWP paper, with any frame.
 
-    The functional map preserves the wavelets of all scales. The pointwise map is its nearest neighbours.
+    The functional map preserves the wavelets of all scales. The pointwise map follows by nearest neighbours
+    in `spectral_embeddings`.
 
     **Arguments:**
 
     - `bank`: the filters.
-    - `solution`: how the functional map is found. `Filtering()` (eq. 8) is meant for Parseval frames, whose
-      squared filters sum to one; `LeastSquares()` is exact for every frame; `RegularizedLeastSquares()`
+    - `solution`: the computation of the functional map. `Filtering()` (eq. 8) is meant for Parseval frames,
+      whose squared filters sum to one; `LeastSquares()` is exact for every frame; `RegularizedLeastSquares()`
       adds further energy terms.
     - `convention`: the direction of C; see `jaxsmw.core.functional_map`. `"pushforward"` is the paper's
-      notation and serves for study only: it fails on real pairs (`spectral_embeddings` says why).
-    - `lambda_max`: where the bank ends. `"own"` is each shape's largest eigenvalue, which cancels a
-      difference in size. `"common"` is the largest eigenvalue of both shapes together.
-    - `search`: how nearest neighbours are found. `"exhaustive"` compares all vertices with all vertices.
-      `"patches"` finds the same neighbours but skips patches of the target that are too far away: several
-      times as fast on a CPU, but seconds longer to compile. `"auto"` uses patches on CPUs from 15 000
-      vertices.
+      notation. It is meant for study only, because it fails on real pairs (`spectral_embeddings` says why).
+    - `lambda_max`: the eigenvalue at which the bank ends. `"own"` is each shape's largest eigenvalue, which
+      cancels a difference in size. `"common"` is the largest eigenvalue of both shapes together.
+    - `search`: the search for nearest neighbours. `"exhaustive"` compares all vertices with all vertices.
+      `"patches"` finds the same neighbours but skips patches of the target that are too far away. It is
+      several times as fast on a CPU, but its compilation takes seconds longer. `"auto"` uses patches on CPUs
+      from 15 000 vertices.
 
     **Raises:** `TypeError` if the bank is not a `FilterBank` or the solution not a `Solution`; `ValueError`
     for an unknown choice.
@@ -75,7 +76,15 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Both shapes with the bank sampled at their eigenvalues."""
+        """Returns both shapes with the responses of the bank at their eigenvalues.
+
+        **Arguments:**
+
+        - `spectrum_x`, `spectrum_y`: source X and target Y.
+        - `sampled`: whether the spectra contain samples only.
+
+        **Raises:** `ValueError` if the responses of the bank are not of shape (filters, points).
+        """
         eigenvalues_x, eigenvalues_y = spectrum_x.eigenvalues, spectrum_y.eigenvalues
         layout_x, layout_y = eigenvalues_x, eigenvalues_y
         if self.lambda_max == "common":
@@ -90,7 +99,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         )
 
     def prepare(self, problem: Problem) -> PreparedWavelets:
-        """Samples the bank, and prepares the solution and the search."""
+        """Evaluates the bank, and prepares the solution and the search."""
         spectrum_x, spectrum_y = problem.query_spectra()
         wavelets = self.problem(spectrum_x, spectrum_y, sampled=problem.samples is not None)
         patches = chosen_patches(self.search, spectrum_x, spectrum_y)
@@ -99,18 +108,18 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """See `Solution.solve`."""
+        """Returns the state with the functional map of `Solution.solve`, and the result of this solution."""
         before = None if previous is None else previous.functional_map
         found, result = self.solution.solve(prepared.wavelets, prepared.solution, pointwise_map, before)
         return State(found), result
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Nearest neighbours of the vertices of X among those of Y; see `decode`."""
+        """Returns the vertex of Y nearest to each vertex of X in the `embeddings`; see `decode`."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " n"]:
-        """Nearest neighbours of the vertices of Y among those of X."""
+        """Returns the vertex of X nearest to each vertex of Y in the `embeddings`, (n,)."""
         queries, database = self.embeddings(prepared, state)[::-1]
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
@@ -118,13 +127,13 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Eq. (5), area-weighted; see `WaveletProblem.energy`."""
+        """Returns the energy of eq. (5) in the area norm; see `WaveletProblem.energy`."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(
         self, prepared: PreparedWavelets, state: State
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """See `spectral_embeddings`."""
+        """Returns the `spectral_embeddings` of the functional map."""
         return spectral_embeddings(
             state.functional_map, prepared.spectrum_x, prepared.spectrum_y, convention=self.convention
         )

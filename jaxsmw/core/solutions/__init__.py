@@ -1,4 +1,4 @@
-"""How a functional map follows from a pointwise map: filtering, the exact solution, and further energy terms.
+"""Solutions compute functional maps from pointwise maps: by filtering, exactly, or with further energy terms.
 
 A `Solution` is one way to minimise the wavelet-preservation energy. `WaveletPreservation` uses a solution.
 """

@@ -22,7 +22,14 @@ class Solution(eqx.Module, Generic[PreparedT]):
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
-        """Returns everything in `solve` that is the same for all pointwise maps; by default None."""
+        """Returns the values that `solve` needs and that do not depend on the pointwise map.
+
+        The default is None.
+
+        **Arguments:**
+
+        - `problem`: both shapes and the responses of the filter bank.
+        """
         return None  # type: ignore[return-value]
 
     @abc.abstractmethod
@@ -33,10 +40,13 @@ class Solution(eqx.Module, Generic[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the functional map that follows from a pointwise map, and how the computation ended.
+        """Returns the functional map (k_out, k_in) of a pointwise map, and a member of `RESULTS`.
 
         **Arguments:**
 
-        - `prepared`: the result of `prepare`.
-        - `previous`: the functional map of the previous iteration, from which iterative solvers start.
+        - `problem`: both shapes and the responses of the filter bank.
+        - `prepared`: the result of `prepare` for this problem.
+        - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `previous`: the functional map of the previous iteration, from which iterative solvers start; None
+          in the first iteration.
         """

@@ -37,16 +37,18 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """Filtering of the unfiltered map: `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (eq. 8).
+    """Filtering of the unfiltered functional map C_0: `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (eq. 8).
 
-    The sum is one elementwise product; no system is solved. For a Parseval frame with orthonormal inputs this
-    is the minimiser of the energy (see `jaxsmw.core.functional_map`). If the inputs are not orthonormal, this
-    is close to the minimiser. For other banks the result is only a smoothed map.
+    The sum is one elementwise product; no system is solved. For a Parseval frame with orthonormal inputs, C
+    is the minimiser of the energy (see `jaxsmw.core.functional_map`). If the inputs are not orthonormal, C is
+    close to the minimiser. For banks that are not Parseval frames, C is only a smoothed map.
 
     **Arguments:**
 
     - `pseudo_inverse`: the pseudo-inverse of the eigenvectors of the shape that C maps to; see
       `dual_eigenvectors`. Samples always use least squares.
+
+    **Raises:** `ValueError` for an unknown `pseudo_inverse`.
     """
 
     pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
@@ -69,7 +71,7 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Computes eq. (8)."""
+        """Returns the functional map of eq. (8), (k_out, k_in), and `RESULTS.successful`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
@@ -77,11 +79,12 @@ class Filtering(Solution[PreparedFiltering]):
 class NearestOrthogonal(Solution[PreparedT]):
     """The matrix with orthonormal rows or columns that is nearest to the map of another solution.
 
-    With `Filtering` and the bank `Identity` this is the update of spectral ICP (Ovsjanikov et al. 2012).
+    With `Filtering` and the bank `Identity`, this solution is the update of spectral ICP (Ovsjanikov et al.
+    2012).
 
     **Arguments:**
 
-    - `solution`: the other solution.
+    - `solution`: the solution whose map is replaced by the nearest orthogonal matrix.
     """
 
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
@@ -97,7 +100,7 @@ class NearestOrthogonal(Solution[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Computes the polar factor of the other solution's map by a singular value decomposition."""
+        """Returns the polar factor of the map of `solution`, (k_out, k_in), and the result of `solution`."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
         return product(left, right), result
@@ -106,11 +109,15 @@ class NearestOrthogonal(Solution[PreparedT]):
 class LeastSquares(Solution[None]):
     """The exact minimiser of the wavelet-preservation energy for any frame, by one Cholesky factorisation.
 
-    The result is `RESULTS.undetermined_functional_map` if no filter passes one of the eigenvalues.
+    `solve` reports `RESULTS.undetermined_functional_map` if some eigenvalue of the shape that C maps from is
+    passed by no filter. It reports `RESULTS.singular_system` if the gram matrix is singular to working
+    precision.
 
     **Arguments:**
 
-    - `norm`: how the energy weighs vertices; see `WaveletProblem.energy`.
+    - `norm`: how the energy weights vertices, `"area"` or `"frobenius"`; see `WaveletProblem.energy`.
+
+    **Raises:** `ValueError` for an unknown norm.
     """
 
     norm: Norm = eqx.field(static=True, default="area")
@@ -125,7 +132,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Computes the closed form."""
+        """Returns the minimiser of the energy, (k_out, k_in), and a member of `RESULTS`."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

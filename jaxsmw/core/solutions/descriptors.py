@@ -28,13 +28,18 @@ class ProjectedDescriptors(eqx.Module):
     def project(
         cls, descriptors: Float[Array, "n d"], spectrum: Spectrum, *, operators: bool
     ) -> ProjectedDescriptors:
-        """Projects vertex values on the eigenbasis; see `DescriptorPair.project`."""
+        """Projects the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
+
+        With `operators` True, the multiplication operators are computed as well. The shapes of the arrays are
+        not checked; `DescriptorPair.project` checks them.
+        """
         dual = dual_eigenvectors(spectrum, "area")
 
         def multiply(f: Float[Array, " n"]) -> Float[Array, "k k"]:
             return product((dual * f[:, None]).T, spectrum.eigenvectors)
 
-        # The functions are processed one after another: all at once would need d copies of the eigenvectors.
+        # The functions are processed one by one, because all functions at once would need d copies of the
+        # eigenvectors.
         made = jax.lax.map(multiply, descriptors.T) if operators else None
         return cls(product(dual.T, descriptors), made)
 
@@ -44,7 +49,9 @@ class DescriptorPair(eqx.Module):
 
     **Attributes:**
 
-    - `x`, `y`: the functions on X and the same functions on Y.
+    - `x`, `y`: the functions on X and the corresponding functions on Y.
+
+    **Raises:** `ValueError` if X and Y have different numbers of functions.
     """
 
     x: ProjectedDescriptors
@@ -68,19 +75,21 @@ class DescriptorPair(eqx.Module):
         *,
         operators: bool = False,
     ) -> DescriptorPair:
-        """Projects vertex values on the eigenbases.
+        """Projects values at vertices onto the eigenbases.
 
         **Arguments:**
 
-        - `descriptors_x`, `descriptors_y`: the values of the same d functions on X and on Y.
-        - `operators`: whether to compute the operators, too: d matrices of size k x k per shape.
+        - `descriptors_x`, `descriptors_y`: the values of d functions on X (m, d) and of the corresponding
+          functions on Y (n, d), in any unit.
+        - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+        - `operators`: whether to compute the `operators` as well: d matrices of size k x k per shape.
 
         **Raises:** `ValueError` if the values do not have one row per vertex and one column per function.
         """
         for name, values, spectrum in (("X", descriptors_x, spectrum_x), ("Y", descriptors_y, spectrum_y)):
             n = spectrum.mask.shape[0]
             if values.ndim != 2 or values.shape[0] != n:
-                raise ValueError(f"descriptors of {name} have shape {values.shape}, where ({n}, d) is needed")
+                raise ValueError(f"descriptors of {name} have shape {values.shape}, but ({n}, d) is needed")
         return cls(
             ProjectedDescriptors.project(descriptors_x, spectrum_x, operators=operators),
             ProjectedDescriptors.project(descriptors_y, spectrum_y, operators=operators),

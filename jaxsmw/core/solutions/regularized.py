@@ -1,4 +1,4 @@
-"""The wavelet-preservation energy with further terms, minimised iteratively."""
+"""Iterative minimisation of the wavelet-preservation energy with further terms."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class RegularizedLeastSquares(Solution[None]):
 
     The functional map minimises the weighted sum of
 
-    - the wavelet-preservation energy (5);
+    - the wavelet-preservation energy of eq. (5);
     - Laplacian commutativity, `||Lambda_out C - C Lambda_in||²`, with eigenvalues as fractions of the
       largest;
     - orthogonality, `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This term is not
@@ -51,26 +51,30 @@ class RegularizedLeastSquares(Solution[None]):
     - descriptor preservation, `||C F_in - F_out||²` (Ovsjanikov et al. 2012);
     - descriptor commutativity, `sum_d ||C D_in - D_out C||²` (Nogneng and Ovsjanikov 2017).
 
-    The terms are scaled so that weights near one are comparable, whatever the height of a bank or the units
-    of descriptors: C = 0, or either side of a difference alone, costs about k_out. To this end the wavelet
-    term is divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled to
-    the squared norm k_out, and so are all `D_out` together.
+    The terms are scaled so that weights near one are comparable for all banks and all units of descriptors:
+    C = 0, or one side of a difference alone, costs about k_out. The wavelet term is divided by the mean of
+    the frame function, which is one for a Parseval frame. `F_out` is scaled to the squared norm k_out. All
+    `D_out` together are also scaled to the squared norm k_out.
 
-    The wavelet term and the descriptor term have many thousand columns. They are first reduced to k_in
-    columns, exactly. Then `optimistix.least_squares` takes Gauss–Newton steps, and conjugate gradients solve
-    each step, so that no matrix of size k² x k² is formed. The solver starts from the previous functional map
-    if there is one. The result can be differentiated, implicitly at the minimum.
+    The wavelet term and the descriptor term have many thousand columns. Both are first reduced to k_in
+    columns without approximation. Then `optimistix.least_squares` takes Gauss–Newton steps. Conjugate
+    gradients solve each step without a matrix of size k² x k². The solver starts from the previous functional
+    map if there is one. The result is differentiable, by implicit differentiation at the minimum.
 
     **Arguments:**
 
     - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
       `descriptor_commutativity`: positive weights. None omits a term.
-    - `descriptors`: the descriptors for the last two terms.
-    - `norm`: the norm of the wavelet term; see `WaveletProblem.energy`.
-    - `tolerance`: the tolerance of the solver, relative to C and to the residuals.
-    - `max_steps`: the largest number of steps. After that the result is `RESULTS.solver_not_converged`.
+    - `descriptors`: the descriptors for the last two terms. Descriptor commutativity needs their `operators`.
+    - `norm`: the norm of the wavelet term, `"area"` or `"frobenius"`; see `WaveletProblem.energy`.
+    - `tolerance`: the tolerance of the solver, relative to C and to the residuals; positive.
+    - `max_steps`: the largest number of steps, at least 1. If this number does not suffice, the result is
+      `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` if a weight is not positive, or if weights and descriptors do not fit together.
+    **Raises:** `ValueError` if a weight or the tolerance is not positive, `max_steps` is below 1, or the norm
+    is unknown. Also `ValueError` if neither `wavelet_preservation` nor `descriptor_preservation` has a
+    weight, if descriptors are given without a weight or a weight without descriptors, or if operators are
+    missing.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -115,7 +119,12 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the objective, starting from the previous functional map."""
+        """Returns the minimiser of the objective, (k_out, k_in), and a member of `RESULTS`.
+
+        The solver starts from the previous functional map, or from an estimate if that is None.
+
+        **Raises:** `ValueError` if the descriptors are in bases of another size than the functional map.
+        """
         energy = None
         if self.wavelet_preservation is not None:
             responses_out, _ = problem.responses
@@ -142,12 +151,15 @@ class RegularizedLeastSquares(Solution[None]):
 
         - `energy`: any quadratic energy, with the weight `wavelet_preservation`; None if and only if that
           weight is None.
-        - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to, and of the shape
-          that C maps from. `descriptors.x` belong to the first of these shapes, as in the pullback
-          convention.
-        - `initial`: the functional map from which the solver starts; by default an estimate.
+        - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
+          the shape that C maps from (k_in,). `descriptors.x` belongs to the shape that C maps to, as in the
+          pullback convention.
+        - `initial`: the functional map (k_out, k_in) from which the solver starts; by default an estimate.
 
-        **Raises:** `ValueError` for an energy without a weight, or a weight without an energy.
+        **Returns:** The minimiser C (k_out, k_in), and a member of `RESULTS`.
+
+        **Raises:** `ValueError` for an energy without a weight, a weight without an energy, or descriptors in
+        bases of another size than C.
         """
         descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
         return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
@@ -160,7 +172,7 @@ class RegularizedLeastSquares(Solution[None]):
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
         initial: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Does the work of `solve` and `minimize`. The descriptors are in the order (out, in)."""
+        """Implements `solve` and `minimize`. The descriptors are in the order (out, in)."""
         quadratic = self._quadratic_energy(
             energy, descriptors, (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
         )
@@ -177,7 +189,7 @@ class RegularizedLeastSquares(Solution[None]):
         functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
         if len(terms) == 1:
             result = where(quadratic.is_regular(), result, RESULTS.singular_system)
-        # A NaN outside of the quadratic terms shows in the residuals, for example of a negative weight.
+        # A NaN outside the quadratic terms appears in the residuals, for example if a weight is negative.
         residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
         finite &= jnp.all(jnp.isfinite(residuals))
         result = where(solvable, result, RESULTS.undetermined_functional_map)
@@ -192,7 +204,10 @@ class RegularizedLeastSquares(Solution[None]):
     ) -> QuadraticEnergy:
         """Returns the weighted sum of the given energy and descriptor preservation."""
         if (energy is None) != (self.wavelet_preservation is None):
-            raise ValueError("an energy needs the weight wavelet_preservation, the weight needs an energy")
+            raise ValueError(
+                "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
+                "give both or neither"
+            )
         quadratic = QuadraticEnergy.zero(*shape, dtype)
         if energy is not None and self.wavelet_preservation is not None:
             quadratic += self.wavelet_preservation.astype(dtype) * energy
@@ -216,7 +231,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_in: Float[Array, " k_in"],
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Returns all terms of the objective: the quadratic energy first, then those with a weight."""
+        """Returns the quadratic energy and all further terms of the objective that have a weight."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -239,9 +254,9 @@ class RegularizedLeastSquares(Solution[None]):
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Minimises the sum of the squared residuals in the given units, and reports convergence.
 
-        A problem that is not solvable ends at once: its residuals are taken to be zero.
+        If the problem is not solvable, its residuals are replaced by zeros, so the solver stops at once.
         """
-        import lineax as lx  # imported here because the import takes as long as an eigenbasis
+        import lineax as lx  # imported here because the import takes as long as computing an eigenbasis
         import optimistix as optx
 
         precision = 0.1 * self.tolerance
@@ -278,8 +293,9 @@ class _Term(NamedTuple):
 def _energy_term(energy: QuadraticEnergy) -> _Term:
     """The given energy, up to a constant.
 
-    The Cholesky factor has the same inner products as all the columns in the energy, so the factor can
-    replace the columns. A ridge below rounding lets the factor exist where only the other terms determine C.
+    The Cholesky factor has the same inner products as the columns in the energy, so the factor can replace
+    these columns. A ridge of the size of the rounding error ensures that the factor exists even if the energy
+    alone does not determine C.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))

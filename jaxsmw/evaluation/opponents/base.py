@@ -1,6 +1,6 @@
-"""What every compared method is given, and what it returns.
+"""The interface of the compared methods: their input and their result.
 
-All methods work on the same prepared pair: the same spectra, the same initial map and the same samples.
+All methods get the same prepared pair: the same spectra, the same initial map and the same samples.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000
-"""The number of samples of each shape in a prepared pair; no method uses more."""
+"""The number of samples of each shape in a prepared pair. Smaller shapes have fewer; no method uses more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,15 @@ class MethodInput:
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra, with at least as many eigenvectors as any method asks for.
-    - `initial_map`: the initial map X -> Y (m,).
+    - `spectrum_x`, `spectrum_y`: the spectra, with at least as many eigenvectors as any method uses.
+    - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `samples`: vertices of X and of Y in farthest-point order, for methods that iterate on samples.
-    - `reverse_initial_map`: the initial map Y -> X (n,), for methods that need `both_directions`.
+    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, for methods that need
+      `both_directions`.
     - `meshes`: X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether one shape is a partial shape of the other. The two spectra then agree only below the
-      smaller of their largest eigenvalues.
+    - `partial`: whether one shape is a partial shape of the other. The two spectra are then comparable only
+      up to the smaller of their largest eigenvalues.
     - `prepared`: the pair as `jaxsmw.match` prepares it, for methods that run a preset.
     """
 
@@ -60,7 +61,14 @@ class MethodInput:
         names: tuple[str, str],
         reverse_initial_map: Int64[np.ndarray, " n"] | None = None,
     ) -> MethodInput:
-        """The input of all methods for a pair that `jaxsmw.preparation.prepare` prepared, with samples."""
+        """Returns the input of all methods for a pair.
+
+        **Arguments:**
+
+        - `prepared`: the result of `jaxsmw.preparation.prepare`, with samples.
+        - `names`: the names of X and Y.
+        - `reverse_initial_map`: the initial map Y -> X (n,), or None.
+        """
         assert prepared.samples is not None
         spectrum_x, spectrum_y = prepared.padded
         reverse = None
@@ -80,11 +88,14 @@ class MethodInput:
         )
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra cut to the sizes of a stage; for a partial pair, to their common range."""
+        """Returns both spectra with the eigenvectors and descriptors of a stage.
+
+        The spectra of a partial pair are also cut to their common range.
+        """
         return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
 
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra with k eigenvectors; for a partial pair, those in the common range."""
+        """Returns both spectra with k eigenvectors; for a partial pair, with those in the common range."""
         return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
@@ -94,11 +105,11 @@ class MethodInput:
 
 
 class Method(abc.ABC):
-    """A method that computes a pointwise map from a prepared pair.
+    """A method that computes a pointwise map from a prepared pair; the interface of all compared methods.
 
     **Attributes:**
 
-    - `reference`: the publication and the settings, as published with the results.
+    - `reference`: the publication and the settings, as text that is printed with the results.
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
     - `both_directions`: whether the method needs `MethodInput.reverse_initial_map`.
@@ -115,7 +126,10 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y (m,), 0-based vertices of Y, and a code that says how the method ended."""
+        """Returns the map X -> Y (m,), 0-based vertices of Y, and a member of `RESULTS`.
+
+        If the result is not successful, the map is invalid; most methods then return -1 everywhere.
+        """
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Checks, before any pair is matched, that the method is defined on all pairs.
@@ -123,12 +137,12 @@ class Method(abc.ABC):
         **Raises:** `InputError` if the method is undefined on a pair.
         """
         if self.full_only and any(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: cannot match partial shapes: leave it out of --methods.")
+            raise InputError(f"{self.reference}: cannot match partial shapes: remove it from --methods.")
         if self.partial_only and not all(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: matches partial shapes only: leave it out of --methods.")
+            raise InputError(f"{self.reference}: matches partial shapes only: remove it from --methods.")
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
-        """Whether the method is defined on all pairs; does not look for files."""
+        """Returns whether the method is defined on all pairs. Unlike `check`, `suits` checks no files."""
         partial = [pair.partial for pair in pairs]
         return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))
 
@@ -141,5 +155,5 @@ def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
     rows, n = spectrum.mask.shape[0], len(mesh.vertices)
     if rows < n:
         raise InputError(
-            f"{mesh.name}: has {n} vertices, but its spectrum {rows}: give the spectrum of this mesh."
+            f"{mesh.name}: has {n} vertices, but its spectrum has {rows}: give the spectrum of this mesh."
         )

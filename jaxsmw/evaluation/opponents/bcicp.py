@@ -1,27 +1,27 @@
-"""BCICP: refines maps in both directions so that they become bijective and continuous.
+"""BCICP: refines the maps of both directions together, towards bijective and continuous maps.
 
 J. Ren, A. Poulenard, P. Wonka, M. Ovsjanikov, *Continuous and orientation-preserving correspondences via
-functional maps*, ACM Transactions on Graphics 37(6), 2018, section 5. Neither the program of the authors nor
-the text was available for this reconstruction. The ingredients are those of the paper. The docstring of each
-step names the choices that are ours. One iteration:
+functional maps*, ACM Transactions on Graphics 37(6), 2018, section 5. Neither the authors' program nor the
+text of the paper was available for this reconstruction. Its steps are those of the paper. The docstring of
+each step names the choices that are ours. One iteration consists of four steps:
 
-1. `_bijective_step`: spectral ICP of both directions at once;
-2. `_improve_coverage`: vertices without a preimage get one from the other direction; steps 1 and 2 run twice;
-3. `_smooth`: the images of neighbouring vertices are averaged in space;
-4. `_repair`: small regions that discontinuous edges separate from the rest are mapped again, from their
-   surroundings.
+1. `_bijective_step`: spectral ICP of both directions at once.
+2. `_improve_coverage`: a vertex without a preimage gets one from the reverse map. Steps 1 and 2 run twice.
+3. `_smooth`: the images of neighbouring vertices are averaged in space.
+4. `_repair`: small regions that discontinuous edges separate from the rest are mapped again, from the images
+   of their surroundings.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
-The reconstruction is worse than the program of the authors. On the 45 non-isometric TOSCA pairs, from their
-initial maps (mean geodesic error 0.373), the mean error is 0.169, and 0.110 for their published maps; on 5
-pairs the reconstruction is better. The numbers of iterations and of smoothing rounds and the order of the
-steps were chosen on 8 of these pairs.
+The reconstruction has larger errors than the authors' program. On the 45 non-isometric TOSCA pairs, from the
+authors' initial maps (mean geodesic error 0.373), the reconstruction has a mean error of 0.169. The authors'
+published maps have 0.110. On 5 pairs the reconstruction is better. The numbers of iterations and of smoothing
+rounds and the order of the steps were chosen on 8 of these pairs.
 
 `BCICP` has the settings in use: 50 eigenvectors, 10 iterations.
 
-All steps work on referenced vertices only, renumbered, on shapes of area 1. Functional maps are in the
-pullback convention of `jaxsmw.core.functional_map`.
+All steps work on referenced vertices only, which are renumbered, and on shapes of area 1. Functional maps are
+in the pullback convention of `jaxsmw.core.functional_map`.
 """
 
 from __future__ import annotations
@@ -43,15 +43,16 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge is discontinuous if the images of its ends are farther apart than 0.1 square roots of the area: a
-# few edges of a mesh with thousands of vertices, and little compared to a limb. On coarse meshes: farther
-# than two edges.
+# An edge is discontinuous if the images of its ends are farther apart than 0.1 square roots of the area, and
+# farther apart than two edges. The first length is a few edges of a mesh with thousands of vertices, and
+# short compared to a limb. On coarse meshes the second length is larger.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
-# Regions that discontinuous edges separate and that have less than this share of the area are outliers.
+# A region that discontinuous edges separate from the rest is an outlier if it has less than this share of the
+# area.
 _SMALL_REGION = 0.05
-# Spectral steps in one iteration, each followed by a step that improves coverage.
+# The number of spectral steps in one iteration. A step that improves coverage follows each of them.
 _SPECTRAL_STEPS = 2
-# Distances are computed from this many vertices at once.
+# The number of vertices from which distances are computed at once.
 _SOURCES_AT_ONCE = 256
 
 
@@ -65,8 +66,8 @@ class _Surface:
     - `positions`: the positions (n, 3), scaled to area 1.
     - `edges`: the ends of each edge (e, 2).
     - `component`: the number of the connected component of each vertex (n,).
-    - `near`: (n, n), True between vertices whose distance along edges is at most the limit for the images of
-      neighbours.
+    - `near`: a sparse matrix (n, n), True between vertices whose distance along edges is at most the largest
+      distance between the images of the ends of a continuous edge.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -92,7 +93,7 @@ class _Surface:
         positions = mesh.vertices[vertices] / np.sqrt(mesh.area)
         edges = number[mesh.edges[on_surface[mesh.edges].all(axis=1)]]
         lengths = np.linalg.norm(positions[edges[:, 0]] - positions[edges[:, 1]], axis=1)
-        # SciPy takes a stored zero for no edge.
+        # SciPy treats a stored zero as a missing edge.
         lengths = np.maximum(lengths, np.finfo(float).tiny)
         graph = csr_array((lengths, edges.T), shape=(len(vertices), len(vertices)))
         return cls(
@@ -125,8 +126,8 @@ def bcicp(
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
     """Refines the maps of both directions together (Ren et al. 2018, section 5).
 
-    The result is deterministic and does not depend on the signs of eigenvectors. Nearest neighbours are
-    searched by JAX in the float type of the spectra; everything else runs in NumPy.
+    The result is deterministic and does not depend on the signs of eigenvectors. JAX searches nearest
+    neighbours in the float type of the spectra. All other steps run in NumPy.
 
     **Arguments:**
 
@@ -136,18 +137,18 @@ def bcicp(
       padded or not.
     - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based; longer if padded.
     - `iterations`: the number of iterations, at least 1.
-    - `smoothing`: the rounds of averaging over neighbours in the first iteration, at least 0. The number
-      falls to one in the last iteration; with 0 no map is smoothed.
+    - `smoothing`: the number of rounds of averaging over neighbours in the first iteration, at least 0. The
+      number decreases to one in the last iteration. With 0 no map is smoothed.
 
     **Returns:** The maps X -> Y and Y -> X, as long as the initial maps. Unreferenced and masked vertices
-    keep their images; no other vertex is mapped to such a vertex.
+    keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
 
     **Raises:** `InputError` if a number is too small, if the arguments do not fit each other, or if an
     initial map contains unreferenced, masked or missing vertices.
     """
     if iterations < 1 or smoothing < 0:
         raise InputError(
-            f"BCICP was given {iterations} iterations and {smoothing} rounds of smoothing: give at least 1 "
+            f"BCICP got {iterations} iterations and {smoothing} rounds of smoothing: give at least 1 "
             "iteration and at least 0 rounds."
         )
     if spectrum_x.eigenvalues.shape != spectrum_y.eigenvalues.shape:
@@ -172,8 +173,8 @@ def bcicp(
 def _schedule(iterations: int, smoothing: int) -> list[int]:
     """Returns the number of smoothing rounds of each iteration.
 
-    The numbers fall geometrically to one (our choice): many rounds unfold the folds of a poor initial map,
-    but shrink limbs if they are repeated until the end.
+    The numbers decrease geometrically to one (our choice). Many rounds remove the folds of a poor initial
+    map, but they shrink limbs if every iteration has many.
     """
     if smoothing == 0:
         return [0] * iterations
@@ -183,7 +184,11 @@ def _schedule(iterations: int, smoothing: int) -> list[int]:
 def _restrict(
     pointwise_map: Int64[np.ndarray, " m"], x: _Surface, y: _Surface, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, " n"]:
-    """Translates a map between mesh vertices into a map between the vertices of two surfaces."""
+    """Converts a map between the vertices of two meshes to a map between the vertices of two surfaces.
+
+    **Raises:** `InputError` if the map has the wrong type or length, or maps a vertex of `x` to a vertex that
+    `y` does not contain.
+    """
     given = np.asarray(pointwise_map)
     if given.ndim != 1 or given.dtype.kind not in "iu" or len(given) < len(mesh_x.vertices):
         raise InputError(
@@ -201,7 +206,7 @@ def _restrict(
 
 
 def _within(graph: csr_array, radius: float) -> csr_array:
-    """Returns a matrix (n, n), True where the distance of two nodes is at most a radius."""
+    """Returns a matrix (n, n), True where the distance between two nodes is at most a radius."""
     n, rows, columns = graph.shape[0], [], []
     for first in range(0, n, _SOURCES_AT_ONCE):
         sources = np.arange(first, min(first + _SOURCES_AT_ONCE, n))
@@ -230,18 +235,18 @@ def _bijective_step(
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
     """Spectral ICP of both directions and of both cycles, in one search (bijective ICP).
 
-    The functional maps of both directions and of the cycles X -> Y -> X and Y -> X -> Y are each replaced by
-    the nearest orthogonal matrix. For y = T(x),
+    There are four functional maps: one for each direction, and one for each of the cycles X -> Y -> X and
+    Y -> X -> Y. Each is replaced by the nearest orthogonal matrix. For y = T(x),
 
         Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
-    The second matrix in each line is the first, rotated so that its cycle closes: `C_XX = C_XY C_YX` should
-    be the identity.
+    The second matrix in each line is the first matrix, rotated such that its cycle closes: `C_XX = C_XY C_YX`
+    should be the identity.
 
-    One search over the four embeddings side by side gives the new map X -> Y. The same point sets with
-    exchanged roles give the new map Y -> X. The equal weights and the form of the cycle conditions are our
-    choice; the condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps on six pairs.
+    The four embeddings are concatenated, and one search gives the new map X -> Y. The same search with
+    queries and targets exchanged gives the new map Y -> X. The equal weights and the form of the cycle
+    conditions are our choice. The condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps on six pairs.
     """
     phi_x, phi_y = x.eigenvectors, y.eigenvectors
     dual_x, dual_y = phi_x * x.areas[:, None], phi_y * y.areas[:, None]
@@ -256,10 +261,11 @@ def _bijective_step(
 def _improve_coverage(
     y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
-    """Gives vertices of Y without a preimage the source that the reverse map names.
+    """Gives vertices of Y without a preimage the preimage that the reverse map assigns.
 
-    An uncovered vertex y becomes the image of x = T_YX(y), provided that the present image of x keeps another
-    preimage. Covered vertices therefore stay covered. Vertices are visited in their order (our choice).
+    An uncovered vertex y becomes the image of x = T_YX(y), provided that the current image of x keeps another
+    preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their numbers (our
+    choice).
     """
     improved, preimages = t_xy.copy(), np.bincount(t_xy, minlength=len(y.areas))
     for uncovered in np.flatnonzero(preimages == 0):
@@ -274,9 +280,9 @@ def _improve_coverage(
 def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int) -> Int64[np.ndarray, " m"]:
     """Averages the images of neighbouring vertices in space, then takes the nearest vertices of Y.
 
-    In each round every vertex takes the mean of its own point and the points of its neighbours. The points
-    return to the surface after the last round only, so that displacements shorter than an edge add up. The
-    uniform weights are our choice.
+    In each round every vertex takes the mean of its own point and the points of its neighbours. Points are
+    moved back to the surface only after the last round, so that displacements shorter than an edge
+    accumulate. The uniform weights are our choice.
     """
     if rounds == 0:
         return t_xy
@@ -291,9 +297,9 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
     """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
-    Far means farther along edges than a tenth of the square root of the area and than two edges of average
-    length. The thresholds and the distance are our choice. Vertices without a path between them are far
-    apart.
+    Two vertices are far apart if their distance along edges exceeds both a tenth of the square root of the
+    area and two edges of average length, or if no path connects them. The thresholds and the distance along
+    edges are our choice.
     """
     tail, head = t_xy[x.edges].T
     return ~np.asarray(y.near[tail, head], dtype=bool).ravel()
@@ -302,9 +308,9 @@ def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]
 def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
     """Returns a mask (m,) of the vertices in small regions that discontinuous edges separate from the rest.
 
-    A region is a connected component of the continuous edges. Small means less than 5 % of the area (our
-    choice), so that `_bijective_step` handles whole limbs. The largest region of a connected component of X
-    is never an outlier.
+    A region is a connected component of the graph of continuous edges. It is small if it has less than 5 % of
+    the area (our choice). Whole limbs are larger and are left to `_bijective_step`. The largest region of a
+    connected component of X is never an outlier.
     """
     _, region = connected_components(x.adjacency(~_discontinuous_edges(x, y, t_xy)), directed=False)
     area = np.bincount(region, weights=x.areas)
@@ -318,8 +324,9 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
 def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Maps outliers again, from the images of the vertices around them.
 
-    The images are interpolated harmonically in the spectral embedding of Y (our choice): every outlier takes
-    the mean of its neighbours, then the nearest vertex.
+    The images are interpolated harmonically in the spectral embedding of Y (our choice). The point of every
+    outlier is the mean of the points of its neighbours, and its new image is the vertex nearest to that
+    point.
     """
     outlier = _outliers(x, y, t_xy)
     if not outlier.any():
@@ -335,7 +342,10 @@ def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np
 
 @dataclass(frozen=True)
 class BijectiveContinuousICP(Method):
-    """Refines both initial maps with `bcicp` and returns the map X -> Y."""
+    """Refines both initial maps with `bcicp` and returns the map X -> Y.
+
+    **Attributes:** those of `Method`; `number_of_eigenvectors` is k of both spectra.
+    """
 
     reference: str
     number_of_eigenvectors: int = 50

@@ -1,16 +1,17 @@
 r"""Pointwise maps by Coherent Point Drift: the recovery of Rodolà, Moeller and Cremers (2015).
 
-Written from two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement from
+Implemented from two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement from
 functional correspondence*, VMV 2015, arXiv 1506.05603; and A. Myronenko, X. Song, *Point set registration:
 Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
 Nearest neighbours recover a good pointwise map if the functional map is nearly a rotation of one spectral
-embedding onto the other. For non-isometric shapes the functional map is no rotation. What remains is a
-non-rigid registration of two point sets in k dimensions: the embedding that C maps (`Phi_Y C^T`, the
-"centroids") moves smoothly, and the other embedding (`Phi_X`, the "data") stays. Each data point is drawn
-from a mixture of isotropic Gaussians around the centroids with a common variance s, and a share w of uniform
-noise. All vertices have equal weight, whatever their areas. The displacement is a combination of Gaussian
-kernels `G` (n, n) at the centroids `Y`. For moved centroids T, expectation maximisation (EM) alternates
+embedding onto the other. For non-isometric shapes the functional map is not a rotation. The recovery is then
+a non-rigid registration of two point sets in k dimensions. The embedding that C maps (`Phi_Y C^T`, the
+"centroids") moves smoothly, and the other embedding (`Phi_X`, the "data") stays fixed. Each data point is
+drawn from a mixture of isotropic Gaussians around the centroids with a common variance s, and a share w of
+uniform noise. All vertices have equal weight; their areas are ignored. The displacement is a combination of
+Gaussian kernels `G` (n, n) at the centroids `Y`. For moved centroids T, expectation maximisation (EM)
+alternates
 
     P_ji proportional to exp(-||x_i - t_j||^2 / 2 s), the noise to (2 pi s)^(d/2) w n / ((1 - w) m)
     (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y,    T = Y + G W
@@ -25,8 +26,8 @@ regression of the displacements on the columns of L,
 
     (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
 
-This is Woodbury's identity in a form that never divides by small numbers. With L of full rank the result is
-exact.
+This is Woodbury's identity in a form that never divides by small numbers. The result is exact if L has full
+rank.
 
 `CPD` has the settings in use: 30 eigenvectors, and 3 iterations of the functional map and its recovery.
 """
@@ -54,7 +55,8 @@ from jaxsmw.evaluation.opponents.presets import Refined
 
 # The number of data points whose probabilities are in memory at once.
 _BLOCK = 128
-# As in Myronenko's program: for point sets of unit variance, a smaller variance is a rounding error.
+# The threshold of Myronenko's program. For point sets of unit variance, a smaller variance is a rounding
+# error.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -63,9 +65,11 @@ class Drift(eqx.Module):
 
     **Attributes:**
 
-    - `centroids`: the moved centroids (n, d), in the frame and unit of the data. Masked rows are meaningless.
-    - `variance`: the last variance s, where the root mean square distance of the data from their mean is 1.
-    - `iterations`: the number of iterations.
+    - `centroids`: the moved centroids (n, d), in the coordinate system and unit of the data. Masked rows are
+      meaningless.
+    - `variance`: the final variance s, in the unit in which the root mean square distance of the data from
+      their mean is 1.
+    - `iterations`: the number of iterations that were run.
     """
 
     centroids: Float[Array, "n d"]
@@ -86,28 +90,31 @@ def coherent_point_drift(
     iterations: int = 150,
     tolerance: float = 1e-5,
 ) -> Drift:
-    """Moves centroids smoothly until they explain the data; see the docstring of this module.
+    """Moves centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
 
     Each point set is first scaled to zero mean and unit variance. The defaults are those of Myronenko's
-    program, except for the rank: his program uses the exact kernel, or on request the rank sqrt(n). On a real
-    pair with 5000 vertices the map had errors of 22.4, 20.8 and 20.8 (x 10^-3) with rank 70, 300 and 1200 at
-    k = 30, and of 17.2, 11.4 and 11.3 with rank 150, 600 and 1200 at k = 100.
+    program, except for the rank. His program uses the exact kernel, or on request the rank sqrt(n). On a real
+    pair with 5000 vertices the map had mean geodesic errors (x 10^-3) of 22.4, 20.8 and 20.8 with rank 70,
+    300 and 1200 at k = 30. At k = 100 the errors were 17.2, 11.4 and 11.3 with rank 150, 600 and 1200. The
+    docstring of this module has the equations.
 
     **Arguments:**
 
-    - `data`, `centroids`: points in d dimensions, (m, d) and (n, d); at least two different points each.
-    - `data_mask`, `centroids_mask`: False for rows that are ignored.
-    - `width`: beta of the papers, the standard deviation of the kernel; a wider kernel moves more points
-      together.
+    - `data`, `centroids`: points in d dimensions, (m, d) and (n, d). Each set needs at least two different
+      points.
+    - `data_mask`, `centroids_mask`: masks (m,) and (n,), False for rows that are ignored; by default all rows
+      are used.
+    - `width`: beta of the papers, the standard deviation of the kernel for point sets of unit variance. A
+      wider kernel moves more points together.
     - `stiffness`: lambda of the papers, the weight of smoothness.
     - `outliers`: w of the papers, the share of the data that no centroid explains; at least 0 and below 1.
     - `rank`: the number of columns of the kernel factor; see `kernel_factor`.
-    - `iterations`: the largest number of iterations.
-    - `tolerance`: iteration stops when the relative change of the objective is below this number.
+    - `iterations`: the largest number of iterations, at least 1.
+    - `tolerance`: the iteration stops when the relative change of the objective is below this number.
 
     **Returns:** A `Drift`.
 
-    **Raises:** `ValueError` for a number out of range.
+    **Raises:** `ValueError` if `width`, `stiffness`, `outliers`, `rank` or `iterations` is out of range.
     """
     if not (width > 0 and stiffness > 0 and 0 <= outliers < 1 and rank >= 1 and iterations >= 1):
         raise ValueError(
@@ -125,10 +132,19 @@ def kernel_factor(
 ) -> Float[Array, "n rank"]:
     """Returns a factor L of the Gaussian kernel: `exp(-||p_i - p_j||^2 / 2 width^2)` is nearly `L L^T`.
 
-    A Cholesky factorisation with pivoting, stopped at the rank: each step eliminates the point that the
-    earlier points explain worst. The result is a Nyström approximation on points spread over the set; no
-    point is drawn at random. The factorisation computes `rank` rows of the kernel matrix and takes about `n
-    rank^2` operations. Columns beyond the numerical rank and rows of masked points are zero.
+    The factor is a pivoted Cholesky factorisation that stops at the given rank. Each step eliminates the
+    point with the largest residual on the diagonal. The result is a Nyström approximation on points spread
+    over the set. No point is drawn at random. The factorisation computes `rank` rows of the kernel matrix and
+    takes about `n rank^2` operations.
+
+    **Arguments:**
+
+    - `points`: points in d dimensions, (n, d).
+    - `mask`: False for points that are ignored, (n,).
+    - `width`: the standard deviation of the kernel, in the unit of the points.
+    - `rank`: the number of columns of L.
+
+    **Returns:** L (n, rank). Columns beyond the numerical rank and rows of masked points are zero.
     """
     n = points.shape[0]
     rounding = 32 * jnp.finfo(points.dtype).eps
@@ -159,14 +175,24 @@ def recover_by_drift(
     rank: int = 300,
     iterations: int = 50,
 ) -> Int32[Array, " m"]:
-    """Returns the pointwise map X -> Y (m,) of a functional map, by Coherent Point Drift instead of `decode`.
+    """Recovers a pointwise map from a functional map by Coherent Point Drift, in place of `decode`.
 
-    C is in the pullback convention, `Phi_X^+ P Phi_Y`, and need not be orthogonal. The embedding of Y drifts;
-    then each vertex of X is matched with the nearest unmasked vertex of Y.
+    Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
+    with the nearest unmasked vertex of Y.
 
     The settings are those of a published run of the method on FAUST (k = 30, C from spectral ICP;
-    `exp_teaser` of github.com/daviddao/GPU-Programming-TUM): the defaults of `coherent_point_drift` and 50
-    iterations, after which the centroids hardly move.
+    `exp_teaser` of github.com/daviddao/GPU-Programming-TUM). They are the defaults of `coherent_point_drift`
+    and 50 iterations, after which the centroids hardly move.
+
+    **Arguments:**
+
+    - `functional_map`: C (k_X, k_Y) in the pullback convention, `Phi_X^+ P Phi_Y`; C need not be orthogonal.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not.
+    - `rank`, `iterations`: see `coherent_point_drift`.
+
+    **Returns:** The pointwise map X -> Y (m,), 0-based vertices of Y.
+
+    **Raises:** `ValueError` if `rank` or `iterations` is less than 1.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
     drift = coherent_point_drift(
@@ -183,9 +209,10 @@ def recover_by_drift(
 class DriftRecovery(WaveletPreservation):
     """A refiner for `jaxsmw.refine` that recovers pointwise maps by Coherent Point Drift.
 
-    Without a filter (the default) the functional maps are `Phi_X^+ P Phi_Y`: least squares, not orthogonal.
-    One iteration is the recovery of the paper. More iterations are its refinement, which updates C and T
-    alternately. (The exact update of C in the paper was not available; least squares is our choice.)
+    By default there is no filter, and the functional map is the least-squares solution `Phi_X^+ P Phi_Y`,
+    which is not orthogonal. A single iteration is the recovery of the paper. Several iterations are the
+    refinement of the paper, which updates C and T alternately. (The exact update of C in the paper was not
+    available. Least squares is our choice.)
 
     **Arguments:** those of `WaveletPreservation`, and
 
@@ -201,11 +228,11 @@ class DriftRecovery(WaveletPreservation):
     def __check_init__(self) -> None:
         if self.convention != "pullback":
             raise ValueError(
-                f"DriftRecovery moves Phi_Y C^T, so its convention must be pullback, not {self.convention}"
+                f"the convention of DriftRecovery is {self.convention}, but it moves Phi_Y C^T: use pullback"
             )
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """See `recover_by_drift`."""
+        """Returns the pointwise map X -> Y (m,) of the state's functional map; see `recover_by_drift`."""
         return recover_by_drift(
             state.functional_map,
             prepared.spectrum_x,
@@ -271,7 +298,10 @@ def _drift(
 
 
 class _State(NamedTuple):
-    """The state of EM between two iterations; `objective` is the value before the last M-step."""
+    """The state of EM between two iterations.
+
+    `objective` is the value before the last M-step, and `change` is its relative change.
+    """
 
     coefficients: Float[Array, "rank d"]
     variance: Float[Array, ""]
@@ -292,7 +322,7 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Scales points to zero mean and a mean squared norm of 1; returns points, mean and scale.
+    """Scales points to zero mean and mean squared norm 1, and returns the points, the mean and the scale.
 
     Masked points become zero.
     """
@@ -311,7 +341,7 @@ def _expectation(
     variance: Float[Array, ""],
     outliers: Float[Array, ""],
 ) -> _Expected:
-    """The E-step, one block of data points at a time; shifted logarithms prevent underflow."""
+    """The E-step, for one block of data points at a time. Shifted logarithms prevent underflow."""
     (m, d), n = data.shape, centroids.shape[0]
     dtype, blocks = data.dtype, -(-m // _BLOCK)
     density = jnp.sum(centroids_mask).astype(dtype) / jnp.sum(data_mask).astype(dtype)
@@ -348,7 +378,7 @@ def _maximization(
     factor: Float[Array, "n rank"],
     ridge: Float[Array, ""],
 ) -> Float[Array, "rank d"]:
-    """The M-step: returns the displacement, as coefficients of the kernel factor."""
+    """The M-step: returns the displacement as coefficients (rank, d) of the columns of the kernel factor."""
     weights = expected.per_centroid[:, None]
     gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
     wanted = product(factor.T, expected.weighted_data - weights * centroids)
@@ -356,7 +386,7 @@ def _maximization(
 
 
 def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array, "n d"]) -> Float[Array, ""]:
-    """Returns the mean squared distance, per dimension, of the data from the centroids that explain them."""
+    """Returns the mean squared distance of data from centroids, weighted by probability, per dimension."""
     squares = (
         jnp.sum(expected.per_point[:, None] * data**2)
         + jnp.sum(expected.per_centroid[:, None] * moved**2)

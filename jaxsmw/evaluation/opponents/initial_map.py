@@ -1,4 +1,4 @@
-"""The initial map without any refinement; all other methods start from the same map."""
+"""The initial map without refinement. All other methods start from the same map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput
 
 @dataclass(frozen=True)
 class Unrefined(Method):
-    """Returns the initial map as it is."""
+    """Returns the initial map unchanged."""
 
     reference: str = "nearest neighbours of the descriptors: the initial map of all other methods"
     number_of_eigenvectors: int = 1

@@ -1,12 +1,12 @@
-r"""Partial functional maps: alternately finds a functional map and the region of Y that X covers.
+r"""Partial functional maps: finds a functional map and the region of Y that X covers, in alternation.
 
 E. Rodolà, L. Cosmo, M. M. Bronstein, A. Torsello, D. Cremers, *Partial functional correspondence*, Computer
-Graphics Forum 36(1), 2017. Neither the program of the authors nor the text was available for this
-reconstruction, so no equation numbers are given, and W and its decay are from memory.
+Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper was available for this
+reconstruction. So no equation numbers are given, and W and its decay are from memory.
 
 X is the partial shape, Y the full shape. Functions F on X correspond to functions G on Y, but only inside the
 region of Y that X covers. A membership function v on Y describes the region: eta(v) is 1 inside and 0
-outside, with
+outside the region. The definitions are
 
     eta(t) = (tanh(6 (t - 1/2)) + 1) / 2,    A = Phi_X^+ F,    B(v) = Phi_Y^+ (eta(v) G).
 
@@ -17,39 +17,40 @@ takes functions on Y to functions on X) and over v
         + mu_1 ||C * W||^2 + mu_2 sum_{i != j} (C^T C)_ij^2 + mu_3 sum_i ((C^T C)_ii - d_i)^2
         + mu_4 (area(X) - integral of eta(v))^2 + mu_5 integral of xi(v) ||grad v||
 
-The first line is the fidelity term; the second line regularises the map, the third the region. W grows with
-the distance from a slanted diagonal: the r-th eigenvalue of X is about as large as the k-th eigenvalue of Y,
-with r / k near the ratio of the areas. d_i is 1 up to r and 0 above.
+The first line is the fidelity term. The second line regularises the map, and the third line regularises the
+region. W grows with the distance from a slanted diagonal: the r-th eigenvalue of X is about as large as the
+k-th eigenvalue of Y, with r / k near the ratio of the areas. d_i is 1 for i <= r and 0 for larger i.
 
-Departures from the paper. Each gave better results, or replaces a detail that was not available:
+The reconstruction departs from the paper in the following points. Each departure gave better results, or
+replaces a detail that was not available.
 
 - **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. Here C starts from
-  the functional map of the initial map, as for all methods.
+  the functional map of the initial map, because all methods start from the initial map.
 - **Iterations.** A few steps of spectral ICP follow each minimisation over C. They use the rank-r
-  orthogonality of the refinement at the end of the paper. Without these steps the region is wrong: on three
-  real pairs the intersection with the true region is 39, 21 and 21 % of the union, and 83, 81 and 43 % with
-  them.
+  orthogonality of the refinement at the end of the paper. Without these steps the region is wrong. On three
+  real pairs the intersection with the true region is 39, 21 and 21 % of the union without these steps, and
+  83, 81 and 43 % with them.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
-  [0, 1]. Starting from 1 or from the last v keeps wrong regions, because the derivative of eta nearly
-  vanishes there.
-- **Descriptors.** F and G are the first principal components of SHOT on both shapes, of mean square 1, and
-  the constant function. The paper uses all 352 numbers of SHOT. These are nonnegative, so a constant is a
-  large part of them; here the constant has as much weight as all components together. Between 10 and 30
-  components made little difference. With a hundred, the true map of the true region had a higher energy than
-  C = 0.
-- **Rank.** Only the r nonzero columns of C are stored.
-- **Length.** xi = 1, plain total variation, which worked in an earlier attempt. The narrow xi of the paper
-  vanishes wherever v is not near 1/2; it was not tried again.
-- **Weights.** Y has area 1, and column norms are averaged instead of summed, so the weights have other units
-  than the published weights. mu_1 = mu_3 = 1 and mu_2 = 100 are as published, with a fidelity term multiplied
-  by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs; mu_4 was not varied.
+  [0, 1]. A start from v = 1 or from the last v keeps wrong regions, because the derivative of eta nearly
+  vanishes at these values.
+- **Descriptors.** F and G are the constant function and the first principal components of SHOT on both
+  shapes, scaled to mean square 1. The paper uses all 352 numbers of SHOT. These numbers are nonnegative, so
+  their constant part is large. Here the constant has as much weight as all components together. Any number of
+  components from 10 to 30 made little difference. With a hundred components, the true map of the true region
+  had a higher energy than C = 0.
+- **Rank.** Only the r nonzero columns of the paper's C are stored.
+- **Length.** xi = 1, so the length term is the total variation, which worked in an earlier attempt. The
+  narrow xi of the paper vanishes wherever v is not near 1/2. This xi was not tried again.
+- **Weights.** Y has area 1, and column norms are averaged instead of summed. The weights therefore have other
+  units than the published weights. mu_1 = mu_3 = 1 and mu_2 = 100 are the published values, and the fidelity
+  term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs; mu_4 was not varied.
 - **Recovery.** Nearest neighbours are searched among all vertices of Y. A search among the vertices of the
-  region gave the same maps, or worse maps where the region is wrong.
-- **Solver.** Limited-memory BFGS by optimistix with a bounded number of steps, with v in the metric of the
-  vertex areas. All norms are smoothed at zero.
+  region gave the same maps, or worse maps if the region was wrong.
+- **Solver.** Limited-memory BFGS of optimistix minimises the energies, with a bounded number of steps and
+  with v in the metric of the vertex areas. All norms are smoothed at zero.
 
-On 12 other pairs of SHREC'16 the mean geodesic error is 0.015 on 6 cuts and 0.018 on 6 holes, from initial
-maps with 0.135 and 0.160. MWP from the same initial maps reaches 0.011 and 0.017.
+On 12 other pairs of SHREC'16 the mean geodesic error is 0.015 on 6 cuts and 0.018 on 6 holes. The initial
+maps have 0.135 and 0.160. MWP from the same initial maps has 0.011 and 0.017.
 
 `PARTIAL_FUNCTIONAL_MAPS` has the settings in use: 100 eigenvectors, 15 descriptors, 5 iterations. Functional
 maps are in the pullback convention of `jaxsmw.core.functional_map`.
@@ -81,18 +82,19 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""The weight of the fidelity term beside mu_1 to mu_3; column norms are averaged."""
+"""The weight of the fidelity term relative to the terms of mu_1 to mu_3, for averaged column norms."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
 """mu_1, mu_2 and mu_3, as published."""
 REGION_WEIGHTS = (10.0, 0.01)
-"""mu_4 and mu_5, for areas and lengths on a Y of area 1."""
+"""mu_4 and mu_5, for areas and lengths in the unit in which Y has area 1."""
 
-# The decay of the slanted weights towards high frequencies (sigma of W in the paper).
+# The rate at which the slanted weights decay towards high frequencies (sigma of W in the paper).
 _DECAY = 0.03
-# Norms of columns and of gradients are smoothed below this number: a thousandth of the norm of a descriptor,
-# and of the gradient of a function that changes by 1 over Y.
+# Norms of columns and of gradients are smoothed below this number. It is a thousandth of the norm of a
+# descriptor, and a thousandth of the gradient of a function that changes by 1 over Y.
 _SMOOTHING = 1e-3
-# The largest numbers of L-BFGS steps in a minimisation over C and over v; most of the steps are taken.
+# The largest numbers of L-BFGS steps in a minimisation over C and over v. Most minimisations use most of the
+# steps.
 _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
@@ -102,8 +104,9 @@ class SurfaceGradient(eqx.Module):
 
     **Attributes:**
 
-    - `faces`: the corners of each face (f, 3); padded with faces of area zero.
-    - `hats`: the gradient of each corner's hat function on its face (f, 3, 3), zero on faces of area zero.
+    - `faces`: the corners of each face (f, 3), 0-based. The array is padded with faces of area zero.
+    - `hats`: the gradient on each face of the hat function of each corner (f, 3, 3), zero on faces of area
+      zero.
     - `areas`: the area of each face (f,).
     """
 
@@ -113,7 +116,12 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Returns the gradient on a mesh, in the unit of its spectrum, which may be padded.
+        """Returns the gradient on a mesh, in the unit of length of its spectrum.
+
+        **Arguments:**
+
+        - `mesh`: the mesh, with n vertices and f faces.
+        - `spectrum`: its spectrum, padded or not.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -123,7 +131,8 @@ class SurfaceGradient(eqx.Module):
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         doubled = np.linalg.norm(normals, axis=1)
         opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-        # The gradient is `n x e / (2 area)` for the unit normal n; the normal here has length 2 area.
+        # The gradient is `n x e / (2 area)` for the unit normal n and the opposite edge e. The normals here
+        # have length 2 area.
         squared = np.where(doubled > 0, doubled, np.inf)[:, None, None] ** 2
         hats = np.cross(normals[:, None], opposite) / squared
         size = padded_size(len(mesh.faces))
@@ -135,7 +144,14 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Returns the integral of the gradient's length, smoothed at zero (Mumford-Shah term, xi = 1)."""
+        """Returns the integral of the gradient's length over the surface (the Mumford-Shah term with xi = 1).
+
+        The length of the gradient is smoothed at zero.
+
+        **Arguments:**
+
+        - `function`: the values at the vertices (n,).
+        """
         gradient = jnp.einsum("fc,fcd->fd", function[self.faces], self.hats)
         return jnp.sum(self.areas * _smoothed_norm(gradient, axis=1))
 
@@ -145,7 +161,7 @@ class PartialMap(eqx.Module):
 
     **Attributes:**
 
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y; -1 everywhere on failure.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y; -1 everywhere if the method failed.
     - `functional_map`: C (r, k_Y) with orthonormal rows, where r is the smaller of k_X and k_Y.
     - `region`: eta(v) (n,), 1 inside the region that X covers and 0 outside; zero on masked vertices of Y.
     - `result`: a member of `RESULTS`.
@@ -166,26 +182,26 @@ def partial_functional_map(
     iterations: int = 5,
     icp_steps: int = 5,
 ) -> PartialMap:
-    """Matches a partial shape X with a full shape Y; see the docstring of this module.
+    """Matches a partial shape X with a full shape Y by partial functional maps (Rodolà et al. 2017).
 
-    The function is pure and meant to be compiled. The result does not depend on the signs of eigenvectors or
-    on padding.
+    The function is pure and can be compiled. The result does not depend on the signs of eigenvectors or on
+    padding. The docstring of this module has the equations.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and of Y in one unit of length, in which Y has area 1, cut
-      to their common range (`jaxsmw.presets.common_range`). k_X is then the rank r of the paper; if k_X is
+      to their common range (`jaxsmw.pair.common_range`). k_X is then the rank r of the paper. If k_X is
       larger than k_Y, only the first k_Y eigenvectors of X are used. Both spectra need the same number of
-      comparable descriptors, of mean square 1.
+      comparable descriptors, scaled to mean square 1.
     - `gradient_y`: the gradient on Y.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `iterations`: the number of minimisations over C and over v; at least 1.
     - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
 
-    **Returns:** A `PartialMap`. Bad numbers raise no error: check `result`.
+    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check its `result`.
 
-    **Raises:** `ValueError` for fewer than 1 iteration, or for spectra without the same number of
-    descriptors.
+    **Raises:** `ValueError` if `iterations` is less than 1, or if the spectra do not have the same number of
+    descriptors, at least 1.
     """
     if iterations < 1:
         raise ValueError(f"partial functional maps need at least 1 iteration, not {iterations}")
@@ -217,7 +233,7 @@ class _Energies(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra, X with at most k_Y eigenvectors.
+    - `spectrum_x`, `spectrum_y`: the spectra. X has r eigenvectors, at most k_Y.
     - `gradient_y`: the gradient on Y.
     - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
     - `coefficients_x`: A, the coefficients of the descriptors and of the constant function on X (r,
@@ -243,8 +259,8 @@ class _Energies(eqx.Module):
                 "partial functional maps need the same number of descriptors on both shapes, at least 1, "
                 f"not {described_x} and {described_y}"
             )
-        # The rows of C are orthonormal, so their number is at most k_Y. A shape with many holes can have more
-        # eigenvalues in the common range.
+        # The rows of C are orthonormal, so there are at most k_Y. A shape with many holes can have more than
+        # k_Y eigenvalues in the common range.
         spectrum_x = spectrum_x.truncate(spectrum_y.eigenvalues.shape[0])
         dual_x, dual_y = (dual_eigenvectors(spectrum, "area") for spectrum in (spectrum_x, spectrum_y))
         coefficients_x = product(dual_x.T, _functions(spectrum_x))
@@ -256,11 +272,11 @@ class _Energies(eqx.Module):
         return jnp.clip(product(self.spectrum_y.eigenvectors, coefficients), 0, 1)
 
     def inside(self, membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
-        """Returns B(v), the coefficients of the functions on Y, restricted to the region."""
+        """Returns B(v), the coefficients of the functions on Y after their restriction to the region."""
         return product(self.dual_y.T, eta(membership)[:, None] * self.functions_y)
 
     def best_map(self, c: Float[Array, "r k_y"], membership: Float[Array, " n"]) -> Float[Array, "r k_y"]:
-        """Minimises over the functional map, starting from `c`."""
+        """Returns the functional map that minimises the energy, starting from `c`."""
         coefficients_y = self.inside(membership)
         weights = slanted_weights(*c.shape).astype(self.coefficients_x.dtype)
 
@@ -271,9 +287,9 @@ class _Energies(eqx.Module):
         return _minimum(energy, c, _MAP_TOLERANCE, _MAP_STEPS)
 
     def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Minimises over the membership function, starting from `covered`."""
+        """Returns the membership function that minimises the energy, starting from `covered`."""
         area_x = jnp.sum(self.spectrum_x.vertex_areas)
-        # In u = v sqrt(area) all vertices have equal weight, whatever the density of the mesh.
+        # With the variable u = v sqrt(area), the density of the mesh has no influence on the solver.
         metric = jnp.sqrt(jnp.where(self.spectrum_y.mask, self.spectrum_y.vertex_areas, 1))
 
         def energy(scaled: Float[Array, " n"]) -> Float[Array, ""]:
@@ -285,15 +301,20 @@ class _Energies(eqx.Module):
 
 
 def eta(membership: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the membership eta(v), from 0 outside the region to 1 inside."""
+    """Returns eta(v) (n,) for a membership function v (n,): near 0 outside the region and near 1 inside."""
     return (jnp.tanh(6 * (membership - 0.5)) + 1) / 2
 
 
 def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
-    """Returns W of the paper for the pullback: the distance of each entry from the slanted diagonal.
+    """Returns W of the paper for the pullback (k_x, k_y): weights that grow with the distance to a diagonal.
 
-    The diagonal starts at the first entry and moves k_x / k_y rows per column. Distances are measured in
-    entries and multiplied by `exp(-0.03 sqrt(i^2 + j^2))`, with rows i and columns j counted from 1.
+    The slanted diagonal starts at the first entry and moves k_x / k_y rows per column. The weight of an entry
+    is its distance to the diagonal, measured in entries, times `exp(-0.03 sqrt(i^2 + j^2))`. Rows i and
+    columns j are counted from 1.
+
+    **Arguments:**
+
+    - `k_x`, `k_y`: the numbers of rows and columns of the functional map.
     """
     row, column = jnp.meshgrid(*(jnp.arange(1, k + 1, dtype=float) for k in (k_x, k_y)), indexing="ij")
     slope = k_x / k_y
@@ -306,13 +327,30 @@ def fidelity(
     coefficients_x: Float[Array, "k_x functions"],
     coefficients_y: Float[Array, "k_y functions"],
 ) -> Float[Array, ""]:
-    """Returns `||C A - B||_{2,1}`: the mean norm of the columns, plus that of the last (the constant)."""
+    """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
+
+    The value is the mean norm of the columns of descriptors, plus the norm of the last column, which belongs
+    to the constant function.
+
+    **Arguments:**
+
+    - `functional_map`: C in the pullback convention (k_x, k_y), the transpose of C in the formula.
+    - `coefficients_x`, `coefficients_y`: A (k_x, functions) and B (k_y, functions).
+    """
     norms = _smoothed_norm(product(functional_map.T, coefficients_x) - coefficients_y, axis=0)
     return jnp.mean(norms[:-1]) + norms[-1]
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """Returns the terms of mu_1 to mu_3, which keep C near the slanted diagonal and its rows orthonormal."""
+    """Returns the sum of the terms of mu_1 to mu_3, multiplied by these weights.
+
+    The terms keep C near the slanted diagonal, and keep its rows orthonormal.
+
+    **Arguments:**
+
+    - `functional_map`: C in the pullback convention (k_x, k_y).
+    - `weights`: the result of `slanted_weights` (k_x, k_y).
+    """
     slant, orthogonality, length = MAP_WEIGHTS
     gram = product(functional_map, functional_map.T)
     lengths = jnp.diagonal(gram)
@@ -329,7 +367,16 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """Returns the terms of mu_4 and mu_5, which keep the region as large as X and its boundary short."""
+    """Returns the sum of the terms of mu_4 and mu_5, multiplied by these weights.
+
+    The terms keep the region as large as X, and keep its boundary short.
+
+    **Arguments:**
+
+    - `membership`: the membership function v on Y (n,).
+    - `area_x`: the area of X, in the unit in which Y has area 1.
+    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient on Y, in the same unit.
+    """
     area, length = REGION_WEIGHTS
     missing = area_x - jnp.sum(spectrum_y.vertex_areas * eta(membership))
     return area * missing**2 + length * gradient_y.total_variation(membership)
@@ -343,14 +390,17 @@ def _functions(spectrum: Spectrum) -> Float[Array, "n functions"]:
 
 
 def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, " c"]:
-    """Returns Euclidean norms that are smoothed to be differentiable at zero; zero vectors keep norm zero."""
+    """Returns Euclidean norms, smoothed to be differentiable at zero. A zero vector has norm zero."""
     return jnp.sqrt(jnp.sum(vectors**2, axis=axis) + _SMOOTHING**2) - _SMOOTHING
 
 
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """Alternates nearest neighbours and the nearest C with orthonormal rows (the refinement of the paper)."""
+    """Refines C by some steps of spectral ICP (the refinement at the end of the paper).
+
+    Each step searches nearest neighbours, then computes the nearest C with orthonormal rows.
+    """
 
     def step(c: Float[Array, "k_x k_y"], nothing: None) -> tuple[Float[Array, "k_x k_y"], None]:
         matched = encode(decode(c, spectrum_x, spectrum_y), spectrum_x, spectrum_y)
@@ -367,7 +417,10 @@ def _minimum(
     tolerance: float,
     steps: int,
 ) -> Float[Array, " ..."]:
-    """Returns the result of some L-BFGS steps; stopping before the minimum is not a failure."""
+    """Returns the point that L-BFGS reaches in at most `steps` steps.
+
+    It is not an error if the point is not yet a minimum.
+    """
     import optimistix as optx  # imported here because the import is slow
 
     solver: optx.LBFGS = optx.LBFGS(tolerance, tolerance)
@@ -376,7 +429,12 @@ def _minimum(
 
 @dataclass(frozen=True)
 class PartialFunctionalMaps(Method):
-    """Matches a partial shape X with a full shape Y by `partial_functional_map`."""
+    """Matches a partial shape X with a full shape Y by `partial_functional_map`.
+
+    **Attributes:** those of `Method`, and
+
+    - `iterations`: see `partial_functional_map`.
+    """
 
     reference: str
     number_of_eigenvectors: int = 100

@@ -1,13 +1,14 @@
-"""ZoomOut by other libraries, on the same spectra and initial maps; needs optional packages.
+"""ZoomOut of other libraries, on the same spectra and initial maps as all other methods.
+
+The methods need optional packages, and are available if these are installed:
 
     pip install 'jaxsmw[benchmark,peers]'
 
-The methods appear under their names where the packages are installed. They run in the same process and on the
-same number of cores as all other methods. Both are called with the settings of the ZoomOut paper (see
-`zoomout`): k = 20, 25, ..., 120, all vertices in every iteration.
+The methods run in the same process and on the same number of cores as all other methods. Both have the
+settings of the ZoomOut paper (see `zoomout`): k = 20, 25, ..., 120, all vertices in every iteration.
 
-- `PyFM`: pyFM (`pyfmaps` on the package index) by R. Magnet, its function `zoomout_refine` with one job.
-- `Geomfum`: geomfum, its class `ZoomOut`.
+- `PyFM`: the function `zoomout_refine` of pyFM (`pyfmaps` on the package index) by R. Magnet, with one job.
+- `Geomfum`: the class `ZoomOut` of geomfum.
 """
 
 from __future__ import annotations
@@ -31,6 +32,10 @@ class Peer(Method):
 
     Shape 1 of the other libraries is our Y, and shape 2 is our X. Their functional maps take functions on
     shape 1 to functions on shape 2, and their pointwise maps take vertices of shape 2 to vertices of shape 1.
+
+    **Attributes:**
+
+    - `package`: the name under which the other library is imported.
     """
 
     number_of_eigenvectors = LAST_EIGENVECTORS
@@ -47,12 +52,26 @@ class Peer(Method):
 
     @abc.abstractmethod
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Returns the refined map between the referenced vertices of X and of Y, both numbered from 0."""
+        """Returns the refined map X -> Y (u,) between referenced vertices, which are numbered from 0.
+
+        **Arguments:**
+
+        - `initial_map`: the initial map X -> Y (u,), in the same numbering.
+        - `x`, `y`: the referenced vertices of X and of Y.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The referenced vertices of a shape, without padding, in the float64 of the other libraries."""
+    """The spectrum of a shape at its u referenced vertices, without padding, in float64 for other libraries.
+
+    **Attributes:**
+
+    - `vertices`: the referenced vertices (u,).
+    - `eigenvalues`: the eigenvalues (k,).
+    - `eigenvectors`: the eigenvectors (u, k).
+    - `areas`: the vertex areas (u,).
+    """
 
     vertices: Int64[np.ndarray, " u"]
     eigenvalues: Float64[np.ndarray, " k"]
@@ -61,7 +80,7 @@ class _Shape:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Shape:
-        """Returns the referenced vertices of a spectrum."""
+        """Returns a spectrum at its referenced vertices."""
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
@@ -121,6 +140,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Returns the methods whose packages are installed, by name."""
+    """Returns the methods of this module whose packages are installed, by name."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

@@ -1,9 +1,9 @@
-"""This library's own methods: MWP at one number of eigenvectors, and the presets of `jaxsmw.PRESETS`.
+"""This library's own methods: MWP with a fixed number of eigenvectors, and the presets of `jaxsmw.PRESETS`.
 
-MWP is written from Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
+MWP is implemented from Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
 manifold wavelets preservation*, CVPR 2021, Algorithm 1. `MWP` has the settings of the paper: 100
 eigenvectors, a Meyer frame of 6 filters, 3 iterations. `MWP_SAMPLED` iterates on 500 samples of each shape,
-like the fast variant of the authors.
+like the fast variant of the paper's authors.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
-from jaxsmw.preparation import fewest_vertices
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.stage import Stage
@@ -24,7 +23,17 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True)
 class Refined(Method):
-    """Refines the initial map with `jaxsmw.refine`, at one number of eigenvectors."""
+    """Refines the initial map with `jaxsmw.refine` and a fixed number of eigenvectors.
+
+    **Attributes:**
+
+    - `reference`: see `Method`.
+    - `refiner`: the refiner.
+    - `number_of_eigenvectors`: k of both shapes.
+    - `iterations`: the number of iterations.
+    - `number_of_samples`: the number of samples of each shape on which the refiner iterates; None for all
+      vertices.
+    """
 
     reference: str
     refiner: Refiner = field(default_factory=WaveletPreservation)
@@ -46,7 +55,13 @@ class Refined(Method):
 
 @dataclass(frozen=True)
 class Chosen(Method):
-    """Refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does."""
+    """Refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
+
+    **Attributes:**
+
+    - `reference`: see `Method`.
+    - `preset`: the name of the preset.
+    """
 
     reference: str
     preset: PresetName
@@ -64,7 +79,7 @@ class Chosen(Method):
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """See `Method`."""
         assert pair.prepared is not None
-        preset = PRESETS[self.preset].fitted(fewest_vertices(pair.prepared.pair))
+        preset = PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
         outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
         return outcome.pointwise_map, outcome.refinements[-1].result
 

@@ -21,14 +21,20 @@ from jaxsmw.runtime.padding import pad_rows
 
 @dataclass(frozen=True)
 class PublishedMaps(Method):
-    """Reads the map of each pair from a directory; see `read_published_map`."""
+    """Reads the map of each pair from a directory; see `read_published_map`.
+
+    **Attributes:**
+
+    - `directory`: the directory that contains the files `X_Y.map`.
+    - `number_of_eigenvectors`: see `Method`; the method uses no eigenvectors.
+    """
 
     directory: Path
     number_of_eigenvectors: int = 1
 
     @property
     def reference(self) -> str:  # type: ignore[override]
-        """The name of the directory."""
+        """The name of the directory, in a phrase for the results."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
@@ -46,8 +52,8 @@ class PublishedMaps(Method):
         missing = [pair for pair in pairs if not published_file(self.directory, pair.names).is_file()]
         if missing:
             raise InputError(
-                f"{published_file(self.directory, missing[0].names)}: is missing, like {len(missing)} of "
-                f"{len(pairs)} maps: add them, or choose pairs with --pairs FILE."
+                f"{published_file(self.directory, missing[0].names)}: is missing ({len(missing)} of "
+                f"{len(pairs)} maps are missing): add the maps, or choose pairs with --pairs FILE."
             )
 
 
@@ -59,7 +65,13 @@ def published_file(directory: Path, names: tuple[str, str]) -> Path:
 def read_published_map(
     directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
 ) -> Int64[np.ndarray, " m"]:
-    """Reads the map X -> Y from `X_Y.map`: one vertex of Y per line, counted from 1.
+    """Reads the map X -> Y from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
+
+    **Arguments:**
+
+    - `directory`: the directory of the file.
+    - `names`: the names of X and Y, which give the name of the file.
+    - `meshes`: X with m vertices, and Y.
 
     **Returns:** The map (m,), 0-based vertices of Y.
 

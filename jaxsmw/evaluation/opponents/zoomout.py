@@ -5,7 +5,7 @@ shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration 
 functional map of size k, searches nearest neighbours, and enlarges k.
 
 - `ZOOMOUT`: k = 20, 25, ..., 120, all vertices in every iteration.
-- `ZOOMOUT_SAMPLED`: the same on 1000 samples of each shape (section 4.3 of the paper).
+- `ZOOMOUT_SAMPLED`: the same sizes, on 1000 samples of each shape (section 4.3 of the paper).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, Method, MethodInput
 from jaxsmw.runtime.compilation import compiled
 
 FIRST_EIGENVECTORS, ZOOMOUT_STEP, LAST_EIGENVECTORS = 20, 5, 120
-"""The first k, the step between two k, and the last k."""
+"""The first size k of the functional map, the step from one size to the next, and the last size."""
 
 _UNFILTERED = WaveletPreservation(Identity())
 _UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_inverse="least_squares"))
@@ -36,8 +36,14 @@ _UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_invers
 class ZoomOut(Method):
     """ZoomOut (Melzi et al. 2019): encodes and decodes the map with more eigenvectors in each iteration.
 
-    With samples (section 4.3) both halves of an iteration use the samples only. The last search is among all
-    vertices.
+    With samples (section 4.3 of the paper), both half-steps of an iteration use the samples only. The last
+    search uses all vertices.
+
+    **Attributes:**
+
+    - `reference`: see `Method`.
+    - `first`, `step`, `number_of_eigenvectors`: the first size k, the step between sizes, and the last size.
+    - `number_of_samples`: the number of samples of each shape; None for all vertices.
     """
 
     reference: str
@@ -68,7 +74,7 @@ def _at(
     samples_x: Int[Array, " s_x"] | None,
     samples_y: Int[Array, " s_y"] | None,
 ) -> tuple[Spectrum, Spectrum]:
-    """Restricts both spectra to the samples; without samples, returns both as they are."""
+    """Restricts both spectra to the samples. Without samples, returns both spectra unchanged."""
     if samples_x is None or samples_y is None:
         return spectra
     return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
