@@ -69,6 +69,7 @@ def test_batched_pairs_get_the_results_of_single_pairs(refiner, pairs, batch_siz
         np.testing.assert_allclose(refined.history.energy, alone.history.energy, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_samples_and_early_stops_give_the_results_of_single_pairs():
     spectra, starts = make_problem()
     samples = [jnp.asarray(np.random.default_rng(n).choice(n, 60, replace=False)) for n in SIZES]

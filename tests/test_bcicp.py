@@ -15,6 +15,8 @@ from jaxsmw.evaluation.opponents import bcicp as steps
 from jaxsmw.evaluation.opponents.bcicp import bcicp
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 
+pytestmark = pytest.mark.study
+
 K = 20
 
 

@@ -58,6 +58,7 @@ def command(data: Path, output: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "jaxsmw", *map(str, arguments)]
 
 
+@pytest.mark.slow
 def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
     output = tmp_path / "results"
     call = command(scape, output, "--workers", "1", "--evaluation-samples", "300")
@@ -142,6 +143,7 @@ def wait_for(condition, processes) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_named(scape, tmp_path):
     call = command(scape, tmp_path / "results", "--scheduler", "tcp://127.0.0.1:1")
     outcome = subprocess.run(call, capture_output=True, text=True)
@@ -259,6 +261,7 @@ def finished(scape, tmp_path_factory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     generator = np.random.default_rng(0)
     for kind, wrong in (("rough", 0.3), ("perfect", 0.0)):
@@ -291,6 +294,7 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
         found.check()
 
 
+@pytest.mark.slow
 def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(measure, tmp_path):
     """The ground truth is the identity. The mirrored ground truth and the map are a reflection."""
     vertices, faces = sphere_mesh(3)
@@ -314,6 +318,7 @@ def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(meas
         assert float(row["mean"]) == 0 if mirrored else float(row["mean"]) > 0.2
 
 
+@pytest.mark.slow
 def test_a_changed_shape_is_detected(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
@@ -325,6 +330,7 @@ def test_a_changed_shape_is_detected(measure, scape, tmp_path):
         measure(["initial"], data=data, output=output)
 
 
+@pytest.mark.slow
 def test_a_bad_shape_does_not_stop_other_pairs(measure, scape, tmp_path):
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
@@ -355,6 +361,7 @@ def with_words_for_numbers(lines: list[str]) -> list[str]:
     return [lines[0], *(re.sub(r"\d+\.\d+", "many", line) for line in lines[1:])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize(
     ("damage", "message"),
@@ -380,6 +387,7 @@ def test_damaged_results_are_named_and_not_changed(measure, finished, tmp_path, 
     assert (tmp_path / name).read_text() == damaged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv", "provenance.json"])
 @pytest.mark.parametrize("contents", [bytes(range(256)) * 4, b"\0" * 100 + b"\n", b"not a table", b"\xff\n"])
 def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_path, name, contents):
@@ -392,6 +400,7 @@ def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_
     assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize("kept", [None, 0, 10])
 def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
@@ -419,6 +428,7 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
     assert "is not a table of results" in message and "remove it to measure its rows again" in message
 
 
+@pytest.mark.slow
 def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
     """The environment, the listeners and the compiled programs are kept. Only workers release programs."""
     monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
@@ -457,6 +467,7 @@ def test_tables_are_written_although_a_shape_cannot_be_read(scape, tmp_path, mon
     assert printed.err.count("mesh002.off:") == 1 and (output / "results.parquet").exists()
 
 
+@pytest.mark.slow
 def test_results_of_another_data_set_are_refused(measure, scape, tmp_path):
     output, data = tmp_path / "output", tmp_path / "data"
     output.mkdir()

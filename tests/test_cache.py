@@ -220,6 +220,7 @@ def _work(seed):
     return True
 
 
+@pytest.mark.slow
 def test_many_processes_share_a_directory(directory, monkeypatch):
     monkeypatch.setenv("JAXSMW_CACHE_LIMIT", str(60_000 / 2**30))
     context = multiprocessing.get_context("spawn")
@@ -228,6 +229,7 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
     assert all(entry.name.startswith("test-") for entry in directory.iterdir())
 
 
+@pytest.mark.slow
 def test_commands_cache_compiled_programs(tmp_path):
     """The next process loads the programs from a directory for its processor.
 

@@ -207,6 +207,7 @@ def test_options_reach_the_method(run, pair, tmp_path, options, monkeypatch):
     assert changed.functional_map.dtype == (np.float64 if "float64" in options else np.float32)
 
 
+@pytest.mark.slow
 def test_the_report_has_all_files_settings_and_maps(run, pair, tmp_path):
     report = tmp_path / "deep" / "report"
     outcome = run(
@@ -347,6 +348,7 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
     assert outcome.code == 0 and mean_error(outcome.output) == 0 and not outcome.errors
 
 
+@pytest.mark.slow
 def test_render_writes_figures_and_pages(run, pair, tmp_path):
     for name, inputs in {
         "one.png": ["x.off"],
@@ -505,6 +507,7 @@ def test_a_note_names_all_options_that_replace_the_preset(run, tmp_path):
     assert "because --bank and --iterations change the paper's method" in outcome.errors
 
 
+@pytest.mark.slow
 def test_written_files_are_named(run, pair, tmp_path):
     """Standard error has a line for every file that a command writes."""
     meshes, truth = (pair / "x.off", pair / "y.ply"), pair / "truth.txt"
@@ -531,6 +534,7 @@ def files_in(directory: Path) -> set[str]:
     return {str(path) for path in directory.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_the_times_account_for_the_whole_run(run, pair, tmp_path):
     began = time.perf_counter()
     outcome = run(
@@ -590,6 +594,7 @@ def test_every_exported_name_exists():
         assert getattr(jaxsmw, name) is not None
 
 
+@pytest.mark.slow
 def test_every_bank_has_a_different_figure(run, pair, tmp_path):
     pictures = set()
     for name in BANKS:

@@ -108,6 +108,7 @@ IN_COMPILED_CODE = """
     """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", [IN_GARBAGE_COLLECTION, IN_A_WRITE, IN_COMPILED_CODE])
 def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
@@ -119,6 +120,7 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     assert_interrupted(process, tmp_path)
 
 
+@pytest.mark.slow
 def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
     """The signal ends compiled code that would run for hours."""
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--iterations", "10000000")
@@ -131,6 +133,7 @@ def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
     assert_interrupted(process, tmp_path)
 
 
+@pytest.mark.slow
 def test_an_interrupted_benchmark_prints_one_line(tmp_path):
     """A terminal sends the signal to the workers as well, but only the main process prints a line."""
     data, output = tmp_path / "data", tmp_path / "output"

@@ -46,6 +46,7 @@ def test_sums_compile_to_one_loop_and_stay_accurate():
     np.testing.assert_allclose(program(values), values.astype(np.float64).sum(axis=0), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_compiled_functions_are_traced_once_and_return_the_same_results(points):
     traced = []
 

@@ -18,6 +18,8 @@ from jaxsmw.evaluation.opponents.cpd import (
     recover_by_drift,
 )
 
+pytestmark = pytest.mark.study
+
 
 def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
     """The method of Myronenko and Song (figure 4) with dense matrices."""

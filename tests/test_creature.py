@@ -18,7 +18,8 @@ from jaxsmw.geometry.creature import (
     creature_pair,
 )
 
-KINDS = tuple(CREATURES)
+# Generating a dragon takes longest.
+KINDS = [pytest.param(kind, marks=pytest.mark.slow) if kind == "dragon" else kind for kind in CREATURES]
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -97,6 +98,7 @@ def test_vertices_lie_on_the_zero_set_of_the_signed_distance(kind, rest):
     assert np.abs(_grown(kind, 4).signed_distance(rest.vertices)).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vertices", "seed"), [(500, 123456789), (733, 2**40)])
 def test_any_size_and_any_seed_give_a_topological_sphere(kind, vertices, seed):
     mesh = creature(kind, vertices=vertices, seed=seed)
@@ -112,6 +114,7 @@ def test_a_body_with_a_handle_is_refused():
         _triangulated(body, 500, random)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_identical_pairs():
     first, again = (creature_pair("biped", vertices=600, seed=7) for _ in range(2))
     for mesh, same in ((first.source, again.source), (first.target, again.target)):

@@ -251,6 +251,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_data_sets_are_recognised(shared, name):
     layout, pairs = REAL[name]

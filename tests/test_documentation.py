@@ -65,9 +65,20 @@ def mentioned_commands(page: str) -> list[str]:
     return re.findall(r"`(jaxsmw [a-z]+ [^`]+)`", (ROOT / page).read_text("utf-8"))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if code_blocks(page)])
-def test_code_blocks_run(page, tmp_path, monkeypatch):
-    pair = creature_pair(vertices=700)
+@pytest.fixture(scope="module")
+def pair():
+    return creature_pair(vertices=700)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        page if page == "README.md" else pytest.param(page, marks=pytest.mark.slow)
+        for page in PAGES
+        if code_blocks(page)
+    ],
+)
+def test_code_blocks_run(page, pair, tmp_path, monkeypatch):
     write_mesh(tmp_path / "source.off", pair.source)
     write_mesh(tmp_path / "target.ply", pair.target)
     monkeypatch.chdir(tmp_path)

@@ -334,6 +334,7 @@ def falls_back(mesh, k):
 
 
 # The radius of the cells is one edge in the first case, and three edges in the second case.
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])
 @pytest.mark.parametrize("factor", [1, 2, 4, 6, 20])
@@ -347,6 +348,7 @@ def test_an_approximation_is_accurate_or_refused(size, k, factor, noise):
         assert verdict == (factor == 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
 def test_a_region_of_bad_triangles_is_detected(factor):
     """The mesh is an even grid, except that ten columns of triangles are longer by `factor`."""

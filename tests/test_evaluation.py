@@ -157,6 +157,7 @@ class TestReading:
             with pytest.raises(InputError, match=message):
                 read_landmarks(write("l.txt", content), X, Y)
 
+    @pytest.mark.slow
     def test_real_files_are_read(self, shared):
         data = shared / "data"
 
@@ -449,6 +450,7 @@ class TestStatistics:
             coverage(Y, [9])
 
 
+@pytest.mark.slow
 def test_errors_agree_with_published_errors_of_the_same_maps(shared):
     # The published means are over 1000 selected vertices, with exact distances. Here the means are over other
     # rows of the same ground truth, so the difference is mainly a sampling error.

@@ -287,6 +287,7 @@ def test_maps_of_pyfm_equal_ours(spectra, pointwise_map):
     )
 
 
+@pytest.mark.slow
 def test_zoomout_of_pyfm_equals_ours_in_our_basis(spectra, pointwise_map):
     refine = pytest.importorskip("pyFM.refine", reason="pip install pyfmaps")
     x, y = spectra

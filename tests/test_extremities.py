@@ -24,6 +24,7 @@ def test_the_tips_of_arms_are_extremities():
     assert sorted(np.sign(tips)) == [-1, 1] and np.abs(tips).min() > 0.9 * np.abs(mesh.vertices[:, 0]).max()
 
 
+@pytest.mark.slow
 def test_distances_run_along_the_surface(creature):
     """Distances are slightly too long, because they run along edges. Their unit is the mean remoteness."""
     pair, ends, _ = creature

@@ -146,6 +146,7 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
+@pytest.mark.slow
 def test_search_in_patches_ignores_descriptors(pair):
     """The first map is the same as for spectra without descriptors."""
     x, y, initial_map, truth = pair

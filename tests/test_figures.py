@@ -90,6 +90,7 @@ def error_scale(figure: Any) -> Any:
     return next(axes for axes in figure.axes if axes.get_label() == "error scale")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_the_scale_of_errors_is_the_same_for_all_maps() -> None:
     n = len(TALL.vertices)
@@ -256,6 +257,7 @@ def test_without_matplotlib_only_figures_are_refused(monkeypatch: pytest.MonkeyP
     write_page(tmp_path / "page.html", TALL, TALL, {"map": shown}, title="no figures needed")
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_on_first_use_and_without_pyplot() -> None:
     script = (
         "import sys, jaxsmw.report.page, jaxsmw.report.figures as f; assert 'matplotlib' not in sys.modules; "

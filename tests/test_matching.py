@@ -74,6 +74,7 @@ def test_matches_a_noisy_copy(pair):
     assert list(result.seconds) == ["eigenbases", "initial map", "refinement"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("init", ["shot", "wks", "functional", [[0, 0], [900, 900], [2000, 2000]]])
 def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
     """Descriptors at half of the vertices suffice for the right map."""
@@ -143,6 +144,7 @@ def compilations():
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["fast", "accurate", replace(STAGE, stop_when_unchanged=True)], ids=str)
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
     """Refinement runs the programs that were compiled ahead from the shapes of the arrays."""
@@ -151,6 +153,7 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
     assert compilations.count("jit(refine)") == len(found.preset.stages)
 
 
+@pytest.mark.slow
 def test_the_reverse_map_of_registration_compares_all_columns():
     """Above 15 000 vertices the search uses patches, even if columns outnumber eigenvectors."""
     creature = creature_pair(vertices=15_600)
@@ -171,6 +174,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     assert agree.mean() > 0.999 and apart.max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["exhaustive", "patches"])
 @pytest.mark.parametrize(
     "refiner", [WaveletPreservation, FeatureRegression, Registration], ids=lambda r: r.__name__
@@ -185,6 +189,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 
 
+@pytest.mark.slow
 def test_pairs_of_similar_size_share_compiled_programs(caplog):
     pairs = [creature_pair(vertices=vertices) for vertices in (700, 720)]
     assert len({len(mesh.vertices) for pair in pairs for mesh in (pair.source, pair.target)}) == 4
@@ -367,6 +372,7 @@ def test_the_initial_map_by_shot_takes_nearest_neighbours(pair):
     np.testing.assert_array_equal(initial_map(Pair(mesh_x, mesh_y), *spectra), distances.argmin(axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thinned", [False, True])
 def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair, thinned, monkeypatch):
     mesh_x, mesh_y, truth = pair
@@ -405,6 +411,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     assert np.abs(np.asarray(described[0].descriptors - coarse[0].descriptors)).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_functional_initial_map_is_better_than_nearest_neighbours(pair):
     """From the same descriptors, a functional map gives better matches than nearest neighbours."""
     mesh_x, mesh_y, truth = pair
@@ -490,6 +497,7 @@ def test_a_mesh_of_one_triangle_is_refused(pair):
         match(triangle, pair[1])
 
 
+@pytest.mark.slow
 def test_triangle_soup_is_refused_with_a_hint_to_weld(pair):
     mesh = pair[0]
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))

@@ -21,6 +21,8 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 
+pytestmark = pytest.mark.study
+
 M, N, K = 200, 180, 40
 
 

@@ -29,6 +29,8 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 
+pytestmark = pytest.mark.study
+
 K, D = 40, 8
 
 

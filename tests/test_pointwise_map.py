@@ -31,6 +31,7 @@ def test_decode_finds_nearest_neighbours_and_the_objective_is_their_distance(con
     assert worse > objective
 
 
+@pytest.mark.slow
 def test_decode_with_patches_gives_the_same_map():
     x, y = random_spectrum(200, 30, seed=1), random_spectrum(180, 30, seed=2).pad(256)
     functional_map = jnp.asarray(np.random.default_rng(0).normal(size=(30, 30)))

@@ -277,6 +277,7 @@ def test_vmap_over_pairs_equals_a_loop():
             assert batched.iterations[index] == alone.iterations
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux for the peak memory")
 def test_memory_stays_far_below_all_distances():
     """30 000 x 30 000 distances would take 3.6 GB; the whole process must use less than a fifth of that."""

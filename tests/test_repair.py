@@ -80,6 +80,7 @@ def test_padding_changes_nothing(body, swapped, monkeypatch):
     np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map[:n])
 
 
+@pytest.mark.slow
 def test_an_alternative_initial_map_helps_where_a_single_round_does_not(body, swapped, mirrored, identity):
     """A single round keeps the mirrored map, but alternative initial maps lead to the right map."""
     mesh, spectrum = body
@@ -98,6 +99,7 @@ def test_a_map_that_looks_right_precedes_a_map_with_a_better_score(body, mirrore
     assert wrong < 0.02 and not found.suspicious
 
 
+@pytest.mark.slow
 def test_the_map_on_which_three_initial_maps_agree_is_taken_if_none_looks_right(body, mirrored, identity):
     alternatives = [mirrored, identity, mirrored]
     wrong, found = outcome(body, mirrored, alternatives=alternatives)

@@ -58,6 +58,7 @@ def test_the_report_states_the_time_of_every_step_and_the_total(
     assert sorted(written) == sorted(tmp_path.iterdir()) == sorted(tmp_path / name for name in REPORT_FILES)
 
 
+@pytest.mark.slow
 def test_the_report_states_the_times_of_match_by_default(found: Correspondence, tmp_path: Path) -> None:
     write_report(tmp_path, found)
     summary, page = read(tmp_path)
@@ -68,6 +69,7 @@ def test_the_report_states_the_times_of_match_by_default(found: Correspondence, 
     assert re.search(r'<p data-for="error-0">An estimate of the distance .* not use the true points', page)
 
 
+@pytest.mark.slow
 def test_the_summary_states_the_results_of_the_match(
     found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
 ) -> None:

@@ -116,6 +116,7 @@ def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_
     return nearest_neighbor_in_patches(queries, database, *patches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("m", "n", "d"), [(1, 1, 1), (3, 50, 2), (50, 3, 30), (130, 210, 5), (300, 300, 1), (257, 500, 20)]
 )
@@ -147,6 +148,7 @@ def test_search_in_patches_equals_exhaustive_search_on_surfaces(embedding, dtype
     np.testing.assert_allclose(*exact, rtol=1e-6 if dtype == jnp.float32 else 1e-13)
 
 
+@pytest.mark.slow
 def test_patches_contain_all_points_and_have_equal_sizes(embedding):
     mask = jnp.asarray(np.random.default_rng(0).random(len(embedding)) < 0.9)
     patches = make_patches(embedding, mask, size=40, rank=4)
@@ -158,6 +160,7 @@ def test_patches_contain_all_points_and_have_equal_sizes(embedding):
         assert not valid.any() or jnp.var(embedding[rows[valid]][:, :6], axis=0).sum() < 0.3 * everywhere
 
 
+@pytest.mark.slow
 def test_patches_ignore_masked_points(embedding):
     generator = np.random.default_rng(0)
     query_mask, database_mask = (jnp.asarray(generator.random(2562) < 0.5) for _ in range(2))
@@ -166,18 +169,21 @@ def test_patches_ignore_masked_points(embedding):
     np.testing.assert_array_equal(found[query_mask], wanted[query_mask])
 
 
+@pytest.mark.slow
 def test_patches_break_ties_like_the_exhaustive_search(embedding):
     """Every point occurs twice, in rows that are far apart."""
     twice = jnp.concatenate([embedding, embedding])
     np.testing.assert_array_equal(in_patches(embedding, twice, size=64), jnp.arange(2562))
 
 
+@pytest.mark.slow
 def test_search_in_patches_gives_the_same_under_vmap(embedding):
     turned = jnp.stack([embedding, embedding * jnp.linspace(1, 0.1, 30)[None, :]])
     looped = [in_patches(embedding, database) for database in turned]
     np.testing.assert_array_equal(jax.vmap(in_patches, (None, 0))(embedding, turned), jnp.stack(looped))
 
 
+@pytest.mark.slow
 def test_most_patches_are_skipped(embedding):
     for scales, most in ((jnp.ones(30), 0.15), (jnp.linspace(1, 0.1, 30), 0.3)):
         ones = jnp.ones(2562, bool)
@@ -186,6 +192,7 @@ def test_most_patches_are_skipped(embedding):
         assert 0 < numbers.mean() / len(database.rows) < most
 
 
+@pytest.mark.slow
 def test_search_in_patches_never_stores_all_distances():
     points, mask = jax.ShapeDtypeStruct((50_000, 100), jnp.float32), jax.ShapeDtypeStruct((50_000,), bool)
     patches = [jax.eval_shape(partial(make_patches, size=s, rank=5), points, mask) for s in (128, 128)]

@@ -40,6 +40,7 @@ def dense_plan(queries, database, a, b, temperature, iterations=3000):
     return np.exp(kernel + (np.log(a) + f)[:, None] + np.log(b) + g)
 
 
+@pytest.mark.slow
 def test_agrees_with_dense_iterations():
     (queries, database), areas = points()
     soft = compiled(queries, database, **areas, temperature=0.5, iterations=3000, tolerance=1e-13)
@@ -165,6 +166,7 @@ def test_derivatives_agree_with_finite_differences():
     assert float(ahead - behind) / (2 * step) == pytest.approx(float(expected), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_iterations_converge_for_degenerate_points():
     """The cases are single points, coinciding points, exact matches, and equal distances."""
     one, three = jnp.zeros((1, 2)), jnp.asarray([[0.0, 0], [1, 0], [0, 1]])

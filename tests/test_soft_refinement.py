@@ -159,6 +159,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_derivatives_agree_with_finite_differences(pair, case):
     recovery, solution, differentiation = case
@@ -227,6 +228,7 @@ def test_a_missing_fixed_point_is_reported(pair):
     assert few.result == RESULTS.fixed_point_not_reached
 
 
+@pytest.mark.slow
 def test_there_is_no_implicit_derivative_without_a_fixed_point(pair):
     x, y, initial_map = pair
 
@@ -337,6 +339,7 @@ def test_signs_of_eigenvectors_do_not_matter(pair):
     np.testing.assert_allclose(found.functional_map * signs, expected.functional_map, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("differentiation", ["checkpointed", "implicit"])
 def test_vmap_over_pairs_equals_a_loop(pair, differentiation):
     x, y, initial_map = pair
@@ -353,6 +356,7 @@ def test_vmap_over_pairs_equals_a_loop(pair, differentiation):
         np.testing.assert_allclose(each, gradient(a.eigenvectors, a, b, s), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_float32_in_float32_out(pair):
     spectra = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, pair[:2])
     for recovery in RECOVERIES.values():
@@ -362,6 +366,7 @@ def test_float32_in_float32_out(pair):
             assert found.change.dtype == jnp.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recovery", [Softmax(), NearestFew()], ids=["softmax", "few"])
 @pytest.mark.parametrize("differentiation", ["checkpointed", "implicit"])
 def test_derivatives_need_far_less_than_a_matrix_of_all_pairs(recovery, differentiation):
@@ -399,6 +404,7 @@ def test_failures_are_reported(pair):
     assert refine_softly(x, y, initial_map, recovery=below_zero).result == RESULTS.nonfinite_functional_map
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "recovery", [Softmax(), NearestFew(5), Sinkhorn()], ids=["softmax", "few", "sinkhorn"]
 )
@@ -463,6 +469,7 @@ def test_iterations_must_be_an_integer(pair, loop):
             loop(x, y, initial_map, iterations=few)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", [Softmax, NearestFew, Sinkhorn])
 def test_derivatives_exist_at_the_lowest_temperatures(pair, kind, dtype):

@@ -111,6 +111,7 @@ def with_weights(weights, descriptors, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize("weights", QUADRATIC, ids=lambda w: ", ".join(w))
 def test_quadratic_objectives_are_minimised_exactly(pair, pointwise_map, descriptors, weights, convention):
@@ -154,6 +155,7 @@ def test_orthogonality_is_minimised_to_first_order(pair, pointwise_map, descript
         assert loss(c + size * generator.normal(size=c.shape)) > loss(c)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("term", TERMS[1:])
 def test_every_weight_changes_the_result_and_lowers_its_term(pair, pointwise_map, descriptors, term):
     def minimiser(weight):
@@ -182,6 +184,7 @@ def test_norm_changes_the_result(pair, pointwise_map):
     assert jnp.max(jnp.abs(area - frobenius)) > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solution", [LeastSquares(), RegularizedLeastSquares(**PRECISE)], ids=["exact", "regularized"])  # fmt: skip
 def test_vmap_equals_a_loop(solution):
     pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(3)]
@@ -200,6 +203,7 @@ def test_vmap_equals_a_loop(solution):
     assert bool(jnp.all(results == RESULTS.successful))
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, descriptors):
     weights = dict.fromkeys(TERMS, 0.5)
 
@@ -256,6 +260,7 @@ class Gap(FilterBank):
         return jnp.where(jnp.abs(points / eigenvalues[-1] - 0.5) < 0.2, 0.0, Meyer(3)(points, eigenvalues))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize(
     "solution",
@@ -310,6 +315,7 @@ def test_new_weights_do_not_compile_again(pair, pointwise_map):
     assert len(traces) == 1 and jnp.max(jnp.abs(first - second)) > 1e-3
 
 
+@pytest.mark.slow
 def test_all_solutions_on_samples_agree_with_a_loop_under_vmap():
     pairs = [(random_spectrum(M, K_X, seed=s), random_spectrum(N, K_Y, seed=s + 9)) for s in range(2)]
     maps = jnp.stack([jnp.asarray(np.random.default_rng(s).integers(0, N, M)) for s in range(2)])
@@ -469,6 +475,7 @@ def test_minimize_accepts_another_energy(pair):
         solution.minimize(None, pair[0].eigenvalues, pair[1].eigenvalues)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
 @pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])

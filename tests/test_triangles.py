@@ -52,6 +52,7 @@ def test_agrees_with_libigl_in_space(generator, dtype):
     assert weights.min() >= (-1e-7 if dtype == np.float32 else -1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [2, 5, 12])
 def test_agrees_with_brute_force_in_any_dimension(generator, dimensions):
     points, queries = generator.normal(size=(20, dimensions)), generator.normal(size=(40, dimensions))
