@@ -603,7 +603,12 @@ def test_unsupported_and_damaged_files_are_refused(bodies, spectra, tmp_path):
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
         "written as .npz or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
-        "has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.mat", x, bodies[1]),
+        "x.mat: the spectrum has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(
+            tmp_path / "x.mat", x, bodies[1]
+        ),
+        "x.npz: the spectrum has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(
+            tmp_path / "x.npz", x, bodies[1]
+        ),
         "written as .mat": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.txt", np.eye(3)),
         "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
         "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),

@@ -35,6 +35,7 @@ from jaxsmw.matching import match
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.presets import choose_preset
 from jaxsmw.repair.alternatives import alternative_initial_maps
+from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.runtime import threads as threads_module
 from jaxsmw.stage import Stage
@@ -385,6 +386,9 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
     # Spectra with descriptors add maps from pairings of extremities. This body adds only one map.
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
+    without = RepairSettings(alternatives=())
+    (alone,) = alternative_initial_maps(Pair(mesh_x, mesh_y), *described, without)
+    np.testing.assert_array_equal(alone, by_extremities)
     assert mean_error(mesh_y, by_extremities, truth) < 0.1
     usual = initial_map(Pair(mesh_x, mesh_y), *spectra)
     for start in starts:

@@ -124,7 +124,7 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(
             f"{points}: surface points are written as .baryc_gt: choose a name that ends in .baryc_gt."
         )
-    if expected and Path(expected).suffix in (".npy", ".mat"):
+    if expected and Path(expected).suffix.lower() in (".npy", ".mat"):
         raise InputError(
             f"{expected}: expected errors are written as text: choose another suffix, such as .txt."
         )

@@ -177,7 +177,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             raise InputError(f"{path}: contains {found}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
         return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
-    if Path(path).suffix != ".npz":
+    if Path(path).suffix.lower() != ".npz":
         raise InputError(
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
         )
@@ -224,13 +224,18 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
         are not written.
     - `mesh`: the mesh of the spectrum (n vertices). A `.npz` file does not contain the mesh.
 
-    **Raises:** `InputError` for another suffix, a mesh with another number of vertices (for `.mat`), or a
-    file that cannot be written.
+    **Raises:** `InputError` for another suffix, a mesh with another number of vertices, or a file that cannot
+    be written.
     """
     values, vectors, areas = (
         np.asarray(array, np.float64)
         for array in (spectrum.eigenvalues, spectrum.eigenvectors, spectrum.vertex_areas)
     )
+    if mesh is not None and len(mesh.vertices) != len(areas):
+        raise InputError(
+            f"{path}: the spectrum has {len(areas)} vertices, but {mesh.name} has {len(mesh.vertices)}: "
+            "give the mesh of this spectrum."
+        )
     if not is_mat_file(path):
         check_spectrum_path(path)
         with atomic_write(path) as temporary:
@@ -246,11 +251,6 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
         "nv": float(len(areas)),
     }
     if mesh is not None:
-        if len(mesh.vertices) != len(areas):
-            raise InputError(
-                f"{path}: the spectrum has {len(areas)} vertices, but {mesh.name} has {len(mesh.vertices)}: "
-                "give the mesh of this spectrum."
-            )
         position = mesh.vertices * np.sqrt(area / mesh.area)
         surface = dict(zip("XYZ", position.T, strict=True)) | {"TRIV": mesh.faces + 1.0}
         struct |= {"nf": float(len(mesh.faces)), "surface": surface}
@@ -266,7 +266,7 @@ def check_spectrum_path(path: str | os.PathLike[str]) -> None:
 
     **Raises:** `InputError` for any other suffix.
     """
-    if Path(path).suffix != ".npz" and not is_mat_file(path):
+    if Path(path).suffix.lower() != ".npz" and not is_mat_file(path):
         raise InputError(
             f"{path}: spectra are written as .npz or .mat: choose a name that ends in one of these."
         )

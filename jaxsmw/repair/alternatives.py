@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 from itertools import islice
 
 import jax
@@ -64,22 +64,20 @@ def alternative_initial_maps(
     **Raises:** `InputError` if a mesh is too coarse for SHOT, or a spectrum belongs to another mesh.
     """
     sampled = sample_pair(pair, spectrum_x, spectrum_y)
-    shot: dict[float, _Shot] = {}
+
+    @cache
+    def shot(multiple: int) -> _Shot:
+        return paired_shot(sampled, multiple * SHOT_RADIUS)
+
     for multiples, weight in settings.alternatives:
-        radii = [multiple * SHOT_RADIUS for multiple in multiples]
-        for radius in radii:
-            if radius not in shot:
-                shot[radius] = paired_shot(sampled, radius)
-        features_x, features_y = (
-            np.hstack(of_shape) for of_shape in zip(*(shot[radius] for radius in radii), strict=True)
-        )
+        features_x, features_y = (np.hstack(side) for side in zip(*map(shot, multiples), strict=True))
         k = settings.alternative_eigenvectors
         truncated = spectrum_x.truncate(k), spectrum_y.truncate(k)
         yield extend_to_unreferenced(
             pair.mesh_x, _in_both_directions(sampled, features_x, features_y, weight, *truncated)
         )
     if not pair.partial and spectrum_x.descriptors is not None:
-        yield from _by_extremities(sampled, shot[SHOT_RADIUS], spectrum_x, settings)
+        yield from _by_extremities(sampled, shot(1), spectrum_x, settings)
 
 
 def _in_both_directions(
