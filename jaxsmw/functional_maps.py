@@ -1,6 +1,6 @@
 """Functional maps: solutions, energies, nearest-neighbour searches and spectral signatures.
 
-`docs/mathematics.md` explains the equations.
+`docs/mathematics.md` explains the equations behind these functions and classes.
 """
 
 from jaxsmw.core.functional_map import QuadraticEnergy, WaveletProblem, encode, multiscale_kernel

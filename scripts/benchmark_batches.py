@@ -2,11 +2,16 @@
 
     python scripts/benchmark_batches.py [--vertices N] [--eigenvectors K] [--batch-sizes B ...] [--quick]
 
-The script refines the same pairs in several ways, in turns in one process, in float32 with 3 iterations: by
-a Python loop over `refine`, by `jax.lax.map`, by `jax.vmap` with several batch sizes, and by
-`jaxsmw.refine_pairs`. Users call `refine_pairs`; its time includes the transfer of initial maps and results.
-The lower bound is the time of the matrix products of all iterations alone, in full float32. The memory is the
-temporary memory that the compiled program reports, without its arguments.
+The script refines the same pairs in float32, with 3 iterations per pair. The following candidates run in
+turns in one process:
+
+- a Python loop over `refine`;
+- `jax.lax.map`;
+- `jax.vmap` with several batch sizes;
+- `jaxsmw.refine_pairs`, the function for users. Its time includes the transfer of initial maps and results.
+
+The lower bound is the time of the matrix products of all iterations, in full float32 precision. The table also
+has the temporary memory of each compiled program, which excludes the memory of the program's arguments.
 """
 
 from __future__ import annotations
@@ -59,12 +64,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("--vertices", type=int, default=5000, help="(default: %(default)s)")
-    parser.add_argument("--eigenvectors", type=int, default=100, help="(default: %(default)s)")
+    parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
+    parser.add_argument("--eigenvectors", type=int, default=100, help="per shape (default: %(default)s)")
     parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="8 pairs, batches of 2 and 8, one repeat")
+    parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
     options = parser.parse_args()
     if options.quick:
         options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1
@@ -79,7 +84,7 @@ def main() -> None:
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
     batch = x, y, jnp.stack(initial_maps)
 
-    # The matrix products of one iteration, for several pairs at once. Only the maxima are kept.
+    # These are the matrix products of one iteration, in batches of pairs. Only the maximum of each column is kept.
     @jax.jit
     def products(a: Array, b: Array) -> Array:
         return lax.map(
@@ -114,7 +119,7 @@ def main() -> None:
         },
         options.repeats,
     )
-    print(f"\n{count} pairs of {n} vertices, k = {k}, {ITERATIONS} iterations, float32")
+    print(f"\n{count} pairs of shapes with {n} vertices each, k = {k}, {ITERATIONS} iterations, float32")
     print(f"estimated memory of one pair with its arguments: {bytes_per_pair(n, n, k) / 2**20:.0f} MiB\n")
     print("| | pairs per second | time, products = 1 | program's memory, MiB |\n|---|---|---|---|")
     for name, median in seconds.items():

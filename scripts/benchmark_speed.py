@@ -2,27 +2,28 @@
 
     python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
 
-- `refinement`: three iterations at the paper's setting in float32, at several sizes. The search compares all
-  with all, works in patches, or works on samples. The lower bound is three matrix products (m x k) (k x n)
-  alone, computed in the fastest of several ways. A plain argmin over stored distances is measured, too.
-- `eigenbasis`: CPU time of 100 exact and approximate eigenpairs, compared with SciPy's shift-invert `eigsh`
-  with default settings; also the errors of the approximate eigenvalues.
-- `side_by_side_eigenbases`: the eigenbases of two shapes at once, in threads and in processes, compared with
-  the eigenbasis of one shape.
-- `stages`: other computations on the host for one shape.
-- `command`: whole commands, from the start of Python to the map on the disk, with and without cached
-  compiled programs.
-- `peers`: from two mesh files to the refined map, and refinement alone, compared with pyFM and geomfum if
-  they are installed (`jaxsmw[peers]`).
-- `scale`: from two mesh files of up to a million vertices to the refined map, with a new process for each
-  size. The table shows time, peak memory, errors, and the exponents of the growth of time and memory.
+- `refinement`: the time of three iterations in float32 with 100 eigenvectors, as in the paper, at several
+  sizes. The candidates are exhaustive search, search in patches, refinement on samples, and a plain argmin
+  over stored distances. The lower bound is the time of three matrix products (m x k) (k x n), in the fastest
+  of several implementations.
+- `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert `eigsh`
+  with default settings. The note above the table states the errors of the approximate eigenvalues.
+- `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
+  compared with the time to compute one eigenbasis.
+- `stages`: the times of other computations on the host for one shape, such as SHOT and samples.
+- `command`: the times of whole commands, from the start of Python until the map is written, with and without
+  cached compiled programs.
+- `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
+  are included if they are installed (`jaxsmw[peers]`).
+- `scale`: the time from two mesh files of up to a million vertices to the refined map. Each size runs in a new
+  process. The table has times, peak memory, errors, and the exponents with which time and memory grow.
 
-The candidates of a comparison run in turns in one process, so that other load on the machine affects all of
-them. Ratios are ratios of medians. Shapes are procedural creatures. For `scale`, their edges are split and
-their vertices are moved at random. With `--data`, `peers` and `scale` use two people of the remeshed FAUST
-set instead. The script writes the tables to `speed.md`, all numbers to `speed.json`, and a plot over the
-sizes to `speed.png`, all in DIR. With `--quick` it measures only the smallest sizes, which takes three
-minutes.
+The candidates of a comparison run in turns in one process, so other load on the machine affects all
+candidates. Each ratio compares two medians. The shapes are procedural creatures. To obtain the large shapes,
+the script splits edges of a creature and moves its vertices at random. With `--data`, `peers` and `scale` use
+two people of the remeshed FAUST set instead of creatures. The script writes three files to DIR: the tables to
+`speed.md`, all measurements to `speed.json`, and a plot of the times against the sizes to `speed.png`. With
+`--quick`, the script measures only the smallest sizes, which takes three minutes.
 """
 
 from __future__ import annotations
@@ -86,11 +87,11 @@ ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
 LARGE = (100_000, 300_000, 1_000_000)
 XLA_DEFAULTS = ", XLA's defaults"
-# With more vertices, a stored matrix of all distances would take gigabytes.
+# For shapes with more vertices, a stored matrix of all distances would take gigabytes.
 STORED = 10_000
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
-"""The title of a table, a note on what was measured, the rows of the table, and all numbers."""
+"""The title of a table, a note on the measurement, the rows of the table, and all measured numbers."""
 
 
 class PlainSearch(WaveletPreservation):
@@ -109,14 +110,14 @@ def medians(
     *,
     warm: bool = True,
 ) -> dict[str, float]:
-    """Run the candidates in turns, and return the median seconds of each candidate.
+    """Run the candidates in turns, and return the median time of each candidate in seconds.
 
     **Arguments:**
 
     - `candidates`: the functions to time, by name.
-    - `repeats`: the number of turns that count.
-    - `clock`: the clock, in seconds.
-    - `warm`: whether to run one more turn first, which compiles and does not count.
+    - `repeats`: the number of timed turns.
+    - `clock`: a function that returns the current time in seconds.
+    - `warm`: whether an additional, untimed turn runs first, in which JAX compiles the candidates.
     """
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
@@ -129,17 +130,17 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table with the seconds of each candidate and the ratio to the candidate `of`."""
+    """Return a table with the seconds of each candidate, and the ratio to the seconds of the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
 
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Return several ways to multiply all rows of both eigenbases, `ITERATIONS` times, by name.
+    """Return functions by name that multiply the eigenvector matrices of X and Y, `ITERATIONS` times each.
 
-    The products are the lower bound for a search that compares all vertices with all vertices.
+    The time of the products is the lower bound for a search that compares all vertices with all vertices.
     """
-    # Blocks of products fit into the processor's cache. Only the maximum of each row is kept.
+    # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
     blocks = jnp.pad(rows, ((0, -rows.shape[0] % 256), (0, 0))).reshape(-1, 256, rows.shape[1])
 
@@ -163,7 +164,7 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
 
 
 def refinement(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times of refinement of one pair, for each size."""
+    """For each size, yield the times of several ways to refine one pair."""
     for size in options.sizes:
         pair = creature_pair(vertices=size)
         meshes = pair.source, pair.target
@@ -174,7 +175,7 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
 
             def once() -> Any:
-                with one_blas_thread():  # as in `match`
+                with one_blas_thread():  # `match` has the same limit
                     return jax.block_until_ready(
                         run(x, y, start, refiner=refiner, iterations=ITERATIONS, samples=sampled or None)
                     )
@@ -203,15 +204,15 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         m, n = (mesh.vertices.shape[0] for mesh in meshes)
         yield (
             f"Refinement, {m} x {n} vertices",
-            f"k = {EIGENVECTORS}, {ITERATIONS} iterations, float32. In patches {same[0]:.3%} of the matches "
-            f"are the same, on samples {same[1]:.3%}.",
+            f"k = {EIGENVECTORS}, {ITERATIONS} iterations, float32. Search in patches finds {same[0]:.3%} of "
+            f"the matches of the exhaustive search, and {same[1]:.3%} on samples.",
             compared(seconds, floor),
             {"vertices": [m, n], "seconds": seconds, "same": same},
         )
 
 
 def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the CPU times of the eigenbasis of one shape, for each size."""
+    """For each size, yield the CPU times of several eigensolvers on one shape."""
     for size in [*options.sizes, *LARGE[: 0 if options.quick else 1]]:
         mesh = finer(creature_pair(vertices=min(size, SIZES[-1])).source, size)
         stiffness, areas = assemble_laplacian(mesh)
@@ -237,18 +238,18 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
         excess = ours("approximate")[1:] / ours("exact")[1:] - 1
         yield (
             f"Eigenbasis, {len(mesh.vertices)} vertices",
-            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the Laplacian and a check. "
-            f"Approximate eigenvalues are {excess.mean():.2%} too large in the mean, and "
-            f"{excess.max():.2%} at most.",
+            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the assembly of the Laplacian "
+            f"and a check of the result. Approximate eigenvalues are {excess.mean():.2%} too large on average, "
+            f"and at most {excess.max():.2%} too large.",
             compared(seconds, "SciPy's eigsh"),
             {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
         )
 
 
 def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the wall times of the eigenbases of two shapes at once, for each size.
+    """For each size, yield the wall-clock times to compute the eigenbases of two shapes concurrently.
 
-    `match` uses threads. The processes are started beforehand, so their start does not count.
+    `match` uses threads. The processes start before the timed turns, so the times exclude their start.
     """
     for size in options.sizes:
         pair = creature_pair(vertices=size)
@@ -271,14 +272,14 @@ def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
         m, n = (len(mesh.vertices) for mesh in meshes)
         yield (
             f"Eigenbases side by side, {m} and {n} vertices",
-            f"{EIGENVECTORS} eigenpairs, one BLAS thread each, wall time.",
+            f"Wall-clock time of {EIGENVECTORS} eigenpairs for each shape, with one BLAS thread for each shape.",
             compared(seconds, "one"),
             {"vertices": [m, n], "seconds": seconds},
         )
 
 
 kept_meshes: list[Mesh] = []
-"""The meshes of this process, of which `eigenbasis_of` computes eigenbases."""
+"""The meshes that `keep` stored in this process."""
 
 
 def keep(meshes: Sequence[Mesh]) -> None:
@@ -287,18 +288,18 @@ def keep(meshes: Sequence[Mesh]) -> None:
 
 
 def eigenbasis_of(number: int) -> None:
-    """Compute the eigenbasis of one of the `kept_meshes`."""
+    """Compute the eigenbasis of the mesh with this index in `kept_meshes`."""
     eigenpairs(kept_meshes[number], EIGENVECTORS)
 
 
 def eigenbasis_in_one_thread(number: int) -> None:
-    """Compute the eigenbasis of one of the `kept_meshes` with one BLAS thread."""
+    """Compute the eigenbasis of the mesh with this index in `kept_meshes`, with one BLAS thread."""
     with one_blas_thread():
         eigenbasis_of(number)
 
 
 def stages(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times of computations on the host for one shape, for each size."""
+    """For each size, yield the times of computations on the host for one shape."""
     for size in options.sizes:
         mesh = creature_pair(vertices=size).source
         sources = np.arange(0, len(mesh.vertices), len(mesh.vertices) // 100)
@@ -342,7 +343,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
 
             def run() -> None:
                 for entry in cache.glob("*.npz") if cache else ():
-                    entry.unlink()  # cached spectra; compiled programs stay
+                    entry.unlink()  # removes cached spectra but no compiled programs
                 subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
 
             return run
@@ -370,7 +371,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         )
     yield (
         "Commands",
-        "New processes without cached spectra.",
+        "Each command runs in a new process without cached spectra.",
         compared(seconds, "two eigenbases"),
         {"seconds": seconds},
     )
@@ -382,8 +383,8 @@ class Truth(NamedTuple):
     **Attributes:**
 
     - `meshes`: source and target.
-    - `rows`: the vertices of the source with ground truth (r,).
-    - `targets`: the true match of each of these vertices (r,).
+    - `rows`: the vertices of the source that have ground truth (r,).
+    - `targets`: the true match of each vertex in `rows` (r,).
     """
 
     meshes: tuple[Mesh, Mesh]
@@ -393,8 +394,8 @@ class Truth(NamedTuple):
     def error(self, pointwise_map: np.ndarray, target: Mesh) -> float:
         """Return the mean geodesic error in thousandths of the square root of the target's area.
 
-        The map may lead from a finer version of the source (see `finer`) to a finer version `target` of the
-        target. Each match is then replaced by the nearest vertex of the target of this pair.
+        The map may belong to subdivided versions of both meshes (see `finer`). In this case, `target` is the
+        subdivided target, and each match is replaced by the nearest vertex of the original target.
         """
         coarse = self.meshes[1]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
@@ -421,10 +422,10 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
 
 
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
-    """Split the longest edges of a mesh until it has `number_of_vertices`, and add noise to the positions.
+    """Split the longest edges of a mesh until there are `number_of_vertices`, and add noise to the positions.
 
-    The standard deviation of the noise is a tenth of the mean edge length. The vertices of the given mesh
-    come first. A mesh that already has enough vertices gets no noise.
+    The standard deviation of the noise is 10 % of the mean edge length. The given vertices keep their numbers.
+    A mesh that already has enough vertices gets no noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -446,20 +447,20 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
 def split_faces(
     faces: Int64[np.ndarray, "f 3"], middles: Int64[np.ndarray, "f 3"], number: int
 ) -> Int64[np.ndarray, "g 3"]:
-    """Select the faces of which `number` edges are split, and subdivide them.
+    """Subdivide those faces that have exactly `number` split edges.
 
     **Arguments:**
 
     - `faces`: the faces of the mesh (f, 3).
-    - `middles`: for each face, the new vertices on the edges from corner i to the next corner (f, 3); -1 for
-      an edge that is not split.
-    - `number`: the number of split edges, 0 to 3. With 3, a face becomes four similar faces.
+    - `middles`: for each face and corner, the new vertex on the edge from this corner to the next corner, or
+      -1 if this edge is not split (f, 3).
+    - `number`: the number of split edges, 0 to 3. With 3 split edges, a face becomes four similar faces.
 
     **Returns:** The subdivided faces (g, 3).
     """
     chosen = (middles >= 0).sum(axis=1) == number
     faces, middles = faces[chosen], middles[chosen]
-    # Rotate the corners: with two split edges the third edge is last, with one split edge this edge is first.
+    # Rotate the corners. If one edge is split, this edge comes first. If two are split, the third comes last.
     first = (np.argmin(middles >= 0, axis=1) + 1) % 3
     if number == 1:
         first = np.argmax(middles, axis=1)
@@ -492,15 +493,16 @@ def matched_from_files(
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
     """Match two mesh files, and measure the stages.
 
-    **Returns:** Name, seconds and peak memory in GiB of each stage; the initial and the refined map.
+    **Returns:** A list with the name, the seconds and the peak memory in GiB of each stage, and a list with the
+    initial map and the refined map.
     """
     stages = [("start", time.perf_counter(), 0.0)]
 
     class Watch(logging.Handler):
-        """Records the time of each log message. Each stage logs its beginning, after the end of the last."""
+        """Records the time of each log message. A message marks the end of one stage and the start of the next."""
 
         def emit(self, record: logging.LogRecord) -> None:
-            if not record.args:  # messages with arguments report outcomes
+            if not record.args:  # messages with arguments report results and start no stage
                 stages.append((record.getMessage(), time.perf_counter(), peak_memory()))
 
     logger = logging.getLogger("jaxsmw")
@@ -515,14 +517,14 @@ def matched_from_files(
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the scaling of the presets `paper` and `accurate`."""
+    """For the presets `paper` and `accurate`, yield times and memory at growing sizes."""
     large = () if options.quick else LARGE
     yield scaled(options, "paper", (10_000, 30_000, *large))
     yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
 
 
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
-    """Measure one preset at several sizes, each in a new process."""
+    """Measure one preset at several sizes. Each size runs in a new process."""
     truth = pair_with_truth(options)
     rows, measured = [], []
     for size in sizes:
@@ -545,7 +547,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
     columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
 
     def exponent(values: list[float]) -> str:
-        # The smallest size is left out: constant costs dominate its time.
+        # The fit leaves out the smallest size, because constant costs dominate its time.
         return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
 
     if len(measured) > 2:
@@ -555,8 +557,8 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
         rows.append(["exponent", *stages, total, memory, "", ""])
     return (
         f"Scale, {preset}",
-        f"The preset {preset}, from two PLY files, with compilation; peak memory of the whole process; "
-        "mean geodesic errors x10^-3.",
+        f"Times of the preset {preset} from two PLY files to the map, including compilation. The peak memory is "
+        "the memory of the whole process. The errors are mean geodesic errors x10^-3.",
         [["vertices", *columns], *rows],
         {"measured": measured},
     )
@@ -565,12 +567,12 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
 def peers(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the times of several libraries for one pair.
 
-    Each library reads the files, computes its eigenbases and refines.
+    Each library reads the files, computes its eigenbases and refines a map.
     """
     truth = pair_with_truth(options)
     missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
     if missing:
-        print(f"\npeers: {' and '.join(missing)} not installed: install with pip install 'jaxsmw[peers]'.")
+        print(f"\npeers: {' and '.join(missing)} not installed and left out: run pip install 'jaxsmw[peers]'.")
     with tempfile.TemporaryDirectory() as directory:
         files = [str(Path(directory) / f"{side}.off") for side in range(2)]
         for file, mesh in zip(files, truth.meshes, strict=True):
@@ -588,10 +590,10 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
         our_initial_map(*files)
         measured: dict[str, dict[str, Any]] = {}
-        for turn in range(2 if options.quick else 4):  # the first compiles
+        for turn in range(2 if options.quick else 4):  # JAX compiles in the first turn
             for name, run in runs.items():
                 if turn > 1 and name.startswith("geomfum"):
-                    continue  # each run takes a minute
+                    continue  # one timed run is enough, because each run takes a minute
                 start = time.perf_counter()
                 found, refining = run(files)
                 taken = time.perf_counter() - start
@@ -617,9 +619,9 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     m, n = (len(mesh.vertices) for mesh in truth.meshes)
     yield (
         f"Peers, {m} x {n} vertices",
-        f"One process, medians; the first time includes compilation. Ours: k = {EIGENVECTORS}, {ITERATIONS} "
-        "iterations from SHOT. Rows from our start begin with our initial map, and leave out the time of its "
-        "computation.",
+        "Times are medians of runs in one process. Only the first time includes compilation. Our rows use "
+        f"k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. Rows from our start begin with our initial "
+        "map, and leave out the time to compute this map.",
         table,
         {"measured": measured},
     )
@@ -628,7 +630,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
 def ours_from_files(
     files: list[str], search: Search = "auto", samples: int | None = None
 ) -> tuple[np.ndarray, float]:
-    """Match with this library; return the map, and the seconds of refinement alone."""
+    """Match with this library, and return the map and the seconds that refinement takes."""
     refiner = WaveletPreservation(search=search)
     stage = Stage(
         refiner, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples
@@ -639,12 +641,12 @@ def ours_from_files(
 
 @cache
 def our_initial_map(*files: str) -> np.ndarray:
-    """Return the initial map of `match`, cached, so that its time does not count for other libraries."""
+    """Return the initial map of `match`. A cache excludes its computation from the times of other libraries."""
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
 def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
-    """Match with `pyFM.functional.FunctionalMapping`: default descriptors, functional map, and ZoomOut.
+    """Match with `pyFM.functional.FunctionalMapping`, its default descriptors, and ZoomOut.
 
     ZoomOut takes ten steps from k = 50. Each step adds `step` eigenvectors.
     """
@@ -711,7 +713,7 @@ ZOOMOUT_STEPS = 16
 
 
 def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Plot seconds and memory over the sizes, for the parts with several sizes."""
+    """Plot time and memory against the number of vertices, for the parts that measure several sizes."""
     panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for part in ("refinement", "eigenbasis"):
         for measured in numbers.get(part, []):
@@ -731,7 +733,7 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # One colour with and without our compiler options; dotted lines are without.
+            # Runs with and without our compiler options have the same colour. Runs without them are dotted.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

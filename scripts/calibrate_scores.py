@@ -5,14 +5,16 @@
 
 The script draws pairs at random from each data set (see `docs/datasets.md`) and prints three tables:
 
-- `Correspondence.expected_error` of the results of a preset, compared with the true errors: the rank
-  correlation, and the share of gross errors (over a tenth of the square root of the area) among the tenth of
-  the vertices with the largest expected errors.
-- The true errors of all vertices, in tenths by their expected errors.
-- For the preset `accurate`: how often each score prefers the result to a mirrored map. The mirrored map is
-  computed from the mirrored ground truth, by the same stages without repair. The table covers only data sets
-  with a mirrored ground truth for every vertex. The uncertainty comes from a feature regression that starts
-  from the map.
+- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. It states
+  the rank correlation of both errors and the share of gross errors. A gross error exceeds 0.1 times the square
+  root of the area. The last column states how many of the gross errors belong to the 10 % of the vertices with
+  the largest expected errors.
+- The second table divides the vertices of all pairs into ten groups of equal size by expected error, and states
+  the true errors of each group.
+- The third table states for how many pairs a score is better for the result than for a mirrored map. It needs
+  the preset `accurate`, and covers only full shapes whose mirrored ground truth consists of vertices. The
+  stages after the first compute the mirrored map from the mirrored ground truth, without repair. The
+  uncertainty of a map comes from a feature regression that has this map as its initial map.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
-# The stages of the preset after the first, without repair.
+# These are all stages of the preset except the first. They run without repair.
 WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 
@@ -49,8 +51,9 @@ class Measured(NamedTuple):
 
     **Attributes:**
 
-    - `true`, `expected`: the true and the expected errors of some vertices (p,).
-    - `scores`: each score of the direct and of the mirrored map, by name.
+    - `true`, `expected`: the true and the expected errors of the evaluated vertices (p,).
+    - `scores`: for the name of each score, its values for the result and for the mirrored map. It is empty if
+      there is no mirrored map.
     """
 
     true: Float64[np.ndarray, " p"]
@@ -116,7 +119,10 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
                 f"{sum(held) / total:.0%}" if total else "—",
             ]
         )
-    yield "Errors x 10⁻³. The worst tenth is determined for each pair separately.\n\n" + markdown(rows)
+    yield (
+        "Errors x 10⁻³ √area. The last column is the share of all gross errors that belong to the 10 % of each "
+        "pair's vertices with the largest expected errors.\n\n" + markdown(rows)
+    )
 
     everything = [pair for pairs in measured.values() for pair in pairs]
     true, expected = (
@@ -129,11 +135,11 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         figures = own.mean(), np.median(own)
         rows.append([f"{1e3 * low:.1f} to {1e3 * high:.1f}", *(f"{1e3 * figure:.1f}" for figure in figures)])
         rows[-1].append(f"{np.mean(own > GROSS):.1%}")
-    yield "All vertices, in tenths by their expected errors:\n\n" + markdown(rows)
+    yield "Vertices of all pairs, in ten groups of equal size by expected error:\n\n" + markdown(rows)
 
     names = list(dict.fromkeys(name for pair in everything for name in pair.scores))
     if names:
-        rows = [["prefers the direct map to the mirrored one", *names]]
+        rows = [["pairs on which the score prefers the result to the mirrored map", *names]]
         for data_set, pairs in measured.items():
             if with_both := [pair.scores for pair in pairs if pair.scores]:
                 right = [sum(scores[name][0] < scores[name][1] for scores in with_both) for name in names]
@@ -146,16 +152,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
-    parser.add_argument("--pairs", metavar="N", default="20", help="pairs from each data set (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the draws (default: 0)")
+    parser.add_argument("--pairs", metavar="N", default="20", help="number of pairs from each data set (default: 20)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     parser.add_argument(
-        "--preset", choices=PRESETS, default="accurate", help="preset of the matches (default: accurate)"
+        "--preset", choices=PRESETS, default="accurate", help="preset that matches the pairs (default: accurate)"
     )
     parser.add_argument(
-        "--output", metavar="FILE.md", type=Path, help="file to which the tables are written, too"
+        "--output", metavar="FILE.md", type=Path, help="also write the tables to this file"
     )
     options = parser.parse_args()
-    warnings.simplefilter("ignore")  # about the quality of each mesh
+    warnings.simplefilter("ignore")  # hides warnings about the quality of each mesh
 
     chosen: list[tuple[DataSet, DataPair]] = []
     for directory in options.data_sets:

@@ -5,12 +5,18 @@
 
 The script needs the extra `dev`: `pip install -e ".[dev]"`.
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r`, the remeshed sets of Ren et al. (2018): meshes
-`off/NAME.off`, ground truth `corres/NAME.vts`, and `test_pairs.txt` with two names per line. The script
-writes to the output directory: `summary.md` with all tables, the figures, `results.csv` (a row per pair and
-variant), `parameters.csv` (eigenvectors x filters x iterations), `invariance.csv`, `times.csv`, and
-`provenance.json` with versions, machine, seeds and settings. After an interruption the same command
-continues.
+DATA_DIRECTORY contains `faust_r` and `tosca_r`, the remeshed sets of Ren et al. (2018). Each set consists of
+meshes (`off/NAME.off`), ground truth (`corres/NAME.vts`), and the file `test_pairs.txt` with two names per
+line. The script writes the figures and these files to the output directory:
+
+- `summary.md`: all tables;
+- `results.csv`: the results of each variant on each pair;
+- `parameters.csv`: the errors for each number of eigenvectors, filters and iterations;
+- `invariance.csv`: the similarity of wavelets around corresponding points;
+- `times.csv`: the time of each update and of the nearest-neighbour search;
+- `provenance.json`: versions, machine, seeds and settings.
+
+After an interruption, the same command continues from the saved results.
 """
 
 from __future__ import annotations
@@ -95,7 +101,7 @@ def digest(data: Path, pairs: list[PairName]) -> str:
 
 
 class Journals:
-    """The tables that grow while the study runs, and the rows that they must contain at the end."""
+    """The result tables of a study, and the rows that each table must contain when the study is complete."""
 
     def __init__(self, output: Path, pairs: list[PairName], settings: Settings, measured: list[Variant]):
         self.pairs, self.settings, self.measured = pairs, settings, measured
@@ -145,9 +151,9 @@ class Journals:
 
 
 def run(data: Path, journals: Journals, workers: int) -> None:
-    """Measure the missing rows pair by pair in worker processes, and save the rows of each pair at once.
+    """Measure the missing rows pair by pair in worker processes. The rows of each pair are saved immediately.
 
-    **Raises:** `InputError` at the end if pairs could not be measured.
+    **Raises:** `InputError` after all other pairs are measured, if some pairs could not be measured.
     """
     tasks = list(journals.missing())
     if not tasks:
@@ -171,21 +177,21 @@ def run(data: Path, journals: Journals, workers: int) -> None:
     if failed:
         raise InputError(
             f"{len(failed)} pairs could not be measured ({'; '.join(failed)}), and the results of the other "
-            "pairs are kept: repair the files of these pairs, and start again."
+            "pairs are kept: repair the files of the failed pairs, and run the same command again."
         )
 
 
 def measured_times(
     output: Path, data: Path, pairs: list[PairName], measured: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Return the times per update, from `times.csv` if this file exists.
+    """Return the time of each update of the functional map, from `times.csv` if this file exists.
 
-    Otherwise they are measured in one process while nothing else of this study runs.
+    If the file does not exist, one process measures the times while no other part of this study runs.
     """
     path = output / "times.csv"
     key = [*PairName._fields, *Variant._fields]
     if not path.exists():
-        print("measuring times per update", file=sys.stderr)
+        print("measuring the time of each update", file=sys.stderr)
         firsts = [next(pair for pair in pairs if pair.data_set == data_set) for data_set in DATA_SETS]
         with Workers(1) as executor:
             rows = executor.submit(measure_times, data, firsts, measured, settings).result()
@@ -253,7 +259,8 @@ def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
         times = measured_times(output, data, pairs, measured, settings)
         if code_digest(code) != origin["versions"]["code"]:
             raise InputError(
-                f"{output}: the code changed during the study: remove this directory, and start again."
+                f"{output}: its results come from different versions of the code, because the code changed "
+                "during the study: remove this directory, and start again."
             )
         whole = Study(journals.results.rows, times, pairs, every, same, settings)
         with atomic_write(output / "summary.md") as temporary:

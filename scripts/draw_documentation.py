@@ -3,9 +3,10 @@
     pip install -e ".[report]"
     python scripts/draw_documentation.py [DATA_DIRECTORY]
 
-The code in the tutorial draws the pictures of the tutorial. The failure cases are procedural. With a
-DATA_DIRECTORY (see docs/datasets.md), the script adds two cases with real shapes: a pair of SHREC'16 topology
-(`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The script takes some minutes.
+The script runs the code of the tutorial to draw the tutorial's pictures. The failure cases use procedural
+shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes: a pair
+of SHREC'16 topology (`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The script
+takes several minutes.
 """
 
 import argparse
@@ -32,20 +33,20 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# With dithering, this number of colours suffices for smoothly coloured bodies. The files take a third of the
-# space.
+# With dithering, this number of colours is enough for smoothly coloured bodies. It reduces the size of the files
+# to a third.
 COLORS = 256
 
 
 class Case(NamedTuple):
-    """A failure case.
+    """A pair whose match fails with some options.
 
     **Attributes:**
 
-    - `name`: the name of the case and of its picture.
+    - `name`: the name of the failure case and of its picture.
     - `source`, `target`, `truth`: the pair and its ground truth.
     - `failing`: options of `jaxsmw.match` with which the match fails.
-    - `cure`: options with which the match succeeds; None if there are none.
+    - `cure`: options with which the match succeeds; None if there are no such options.
     - `up`: the vertical axis of both shapes, or None to let the drawing choose it.
     """
 
@@ -59,7 +60,7 @@ class Case(NamedTuple):
 
 
 def procedural_cases() -> Iterator[Case]:
-    """Yields the cases that need no data."""
+    """Yields the failure cases with procedural shapes, which need no data."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
@@ -79,7 +80,7 @@ def procedural_cases() -> Iterator[Case]:
 
 
 def real_cases(data: Path) -> Iterator[Case]:
-    """Yields the cases with real shapes."""
+    """Yields the failure cases with real shapes."""
     for name, directory, names, cure in (
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
@@ -92,7 +93,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Returns a body with five equal hanging arms, and for each vertex its point on a sphere (n, 3)."""
+    """Returns a body with five equal hanging arms, and the point of the unit sphere for each vertex (n, 3)."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -129,7 +130,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Decimates the target; the ground truth becomes the vertex that is nearest to each true match."""
+    """Returns the decimated target, and the vertex nearest to each true match as the new ground truth."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
@@ -137,7 +138,7 @@ def coarser(
 
 
 def draw_case(case: Case) -> str:
-    """Writes the picture of a case, and returns its row of the table."""
+    """Writes the picture of a failure case, and returns the table row of this case."""
     cells = []
     for settings in (case.failing, case.cure):
         if settings is None:

@@ -3,8 +3,8 @@
     pip install -e ".[report]"
     python scripts/draw_imports.py
 
-A layer is a module or a package directly below `jaxsmw/`. Each arrow points from a layer to a layer that it
-imports. The picture leaves out an arrow if a chain of other arrows already connects the two layers.
+A layer is a module or a package directly below `jaxsmw/`. Each arrow points from an importing layer to an
+imported layer. The picture leaves out an arrow if a chain of other arrows already connects the two layers.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from jaxsmw.report.figures import save_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "pictures" / "imports.png"
-# Modules that only gather names of other layers for users.
+# These modules only re-export names of other layers, so they are not layers themselves.
 NAMESPACES = ("__main__", "banks", "functional_maps", "learning")
 
 
 def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
-    """Each module of the library, and the modules of the library that it imports anywhere in its code.
+    """Return, for each module of the library, the modules that its `from jaxsmw... import` statements import.
 
-    Names are dotted and relative to the library; a package has the name of its folder.
+    Names are dotted and relative to the library. A package has the name of its folder.
     """
     modules = {".".join(p.relative_to(library).with_suffix("").parts): p for p in library.rglob("*.py")}
     names = {name.removesuffix(".__init__"): path for name, path in modules.items() if name != "__init__"}
@@ -44,7 +44,7 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
 
 
 def imported_layers() -> dict[str, set[str]]:
-    """Each layer, and the other layers that its modules import."""
+    """Return, for each layer, the other layers that its modules import."""
     layers: dict[str, set[str]] = {}
     for module, others in imported_modules().items():
         layer = module.split(".")[0]
@@ -54,7 +54,7 @@ def imported_layers() -> dict[str, set[str]]:
 
 
 def heights(layers: dict[str, set[str]]) -> dict[str, int]:
-    """The length of the longest chain of imports below each layer; 0 for layers that import no other layer.
+    """Return the length of the longest import chain below each layer; 0 if the layer imports no other layer.
 
     **Raises:** `graphlib.CycleError` if layers import each other in a circle.
     """
@@ -65,7 +65,7 @@ def heights(layers: dict[str, set[str]]) -> dict[str, int]:
 
 
 def direct(layers: dict[str, set[str]]) -> dict[str, set[str]]:
-    """The imports that no chain of other imports implies (the transitive reduction)."""
+    """Return the imports that no chain of other imports implies (the transitive reduction)."""
     reachable: dict[str, set[str]] = {}
     for layer in graphlib.TopologicalSorter(layers).static_order():
         reachable[layer] = layers[layer].union(*(reachable[other] for other in layers[layer]))
@@ -92,7 +92,7 @@ def draw(axes: Axes, layers: dict[str, set[str]]) -> None:
     for layer, others in direct(layers).items():
         for other in others:
             rows = height[layer] - height[other]
-            bend = 0 if rows == 1 else min(0.15 * rows, 0.5)  # around the layers in between
+            bend = 0 if rows == 1 else min(0.15 * rows, 0.5)  # leads the arrow around the layers in between
             style = {
                 "arrowstyle": "-|>",
                 "color": "0.4",

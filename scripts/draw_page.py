@@ -1,6 +1,7 @@
-"""Takes a screenshot of an interactive page in headless Chromium, with the wavelets around one point.
+"""Opens an interactive page in headless Chromium, and takes a screenshot of the wavelets around one vertex.
 
-Run `python scripts/draw_page.py PAGE.html PICTURE.png`. This needs the extra `test`, Chromium and its driver.
+Run `python scripts/draw_page.py PAGE.html PICTURE.png`. The script needs the extra `test`, Chromium and
+chromedriver.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # 256 dithered colours look the same and halve the size of the file.
+        # 256 dithered colours look the same as full colour, and halve the size of the file.
         picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 

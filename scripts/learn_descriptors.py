@@ -5,23 +5,24 @@
 
 The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` computes descriptors of
-vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` computes a functional map and a
-soft map from the descriptors of two shapes. Gradients pass through the layer and the network. Each step of
-Adam (optax) uses one pair of the first five people of FAUST. Two networks are trained: one with ground truth
-(`labels`), one without (`cycles`).
+DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` computes descriptors
+of vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` computes a functional map and
+a soft map from the descriptors of two shapes. Gradients pass through the layer and the network. Each step of
+Adam (optax) uses one pair of the first five people of FAUST. The script trains one network with the loss
+`labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
-Then the preset `paper` refines pairs of the other people and of TOSCA from four initial maps: the nearest
-neighbours of SHOT, of the untrained network, and of both trained networks. The script writes
+The script then tests both networks on pairs of the other people and of TOSCA. The preset `paper` refines each
+pair from four initial maps. Each initial map takes nearest neighbours of one kind of descriptors: SHOT, the
+untrained network, or one of the two trained networks. The script writes these files:
 
 - `summary.md`: the comparison;
-- `curves.png`: the losses over the steps;
+- `curves.png`: the losses against the training steps;
 - `errors.csv`: the errors of every pair;
 - `provenance.json`: settings, versions and machine;
-- `descriptors_labels.eqx` and `descriptors_cycles.eqx`: the trained networks, for
+- `descriptors_labels.eqx` and `descriptors_cycles.eqx`: the trained networks. The descriptors of a mesh are
   `load(path)(described(mesh))`.
 
-After an interruption the same command continues.
+After an interruption, the same command continues from the saved state.
 """
 
 from __future__ import annotations
@@ -81,14 +82,14 @@ from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
-# The weight of those terms of the loss `cycles` that are not lengths.
+# The loss `cycles` is a sum of lengths and of other terms. This number is the weight of the other terms.
 WEIGHT = 0.1
 WATCHED_PAIRS = 4
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes of a network, from which a network with leaves of the same shapes can be built.
+    """The sizes of a network. They determine the shapes of all arrays of the network.
 
     **Attributes:**
 
@@ -118,10 +119,10 @@ class Sizes:
 class WaveletBlock(eqx.Module):
     """A residual block that combines the features of each vertex with features of its neighbourhood.
 
-    The block filters every channel on the surface. The filter of a channel is a sum of the squared filters of
-    a Meyer frame, weighted by learned shares. At each vertex, two dense layers take the normalised and the
-    filtered features, and the block adds their output to its input. The output does not depend on the signs
-    of the eigenvectors. Renumbering the vertices permutes the rows of the output.
+    The block filters every channel on the surface. The filter of a channel is a weighted sum of the squared
+    filters of a Meyer frame, with learned weights. At each vertex, two dense layers take the normalised and the
+    filtered features, and the block adds the output of these layers to the features. The result does not depend
+    on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
     """
 
     shares: Float[Array, "filters width"]
@@ -151,7 +152,8 @@ class WaveletBlock(eqx.Module):
 class DescriptorNetwork(eqx.Module):
     """A network that computes descriptors of the n vertices of a shape.
 
-    The spectrum of the shape must carry SHOT descriptors (`Spectrum.descriptors`); see `described`.
+    The spectrum of the shape must contain SHOT descriptors (`Spectrum.descriptors`). `described` computes such
+    a spectrum.
 
     **Raises:** `ValueError` if the spectrum has no descriptors, or descriptors of another dimension.
     """
@@ -174,11 +176,12 @@ class DescriptorNetwork(eqx.Module):
         given = spectrum.descriptors
         if given is None or given.shape[1] != self.sizes.inputs:
             raise ValueError(
-                f"the spectrum has {'no' if given is None else given.shape[1]} descriptors, where "
-                f"{self.sizes.inputs} are needed: add the result of shot_descriptors by with_descriptors"
+                f"the spectrum has {'no' if given is None else given.shape[1]} descriptors, but "
+                f"{self.sizes.inputs} per vertex are needed: pass the result of shot_descriptors to "
+                "Spectrum.with_descriptors"
             )
         waves = wave_kernel_signature(spectrum, dimensions=self.sizes.waves) - 1
-        # Each SHOT descriptor has length 1. Scaled, its entries have mean square 1.
+        # Each SHOT descriptor has norm 1. This factor gives its entries a mean square of 1.
         inputs = jnp.concatenate([given * self.sizes.inputs**0.5, waves], axis=1)
         features = jax.vmap(self.enter)(inputs)
         for block in self.blocks:
@@ -187,21 +190,21 @@ class DescriptorNetwork(eqx.Module):
 
 
 def layer() -> WaveletPreservationLayer:
-    """Return the layer that computes maps from descriptors; its own parameters are not trained here."""
-    # Eigenvectors restricted to samples are not orthonormal.
+    """Return the layer that computes maps from descriptors. The layer's own parameters are not trained."""
+    # Eigenvectors restricted to samples are not orthonormal, so they need a least-squares pseudo-inverse.
     refiner = WaveletPreservation(Meyer(6), Filtering("least_squares"))
     return WaveletPreservationLayer(refiner, iterations=2)
 
 
 class Shape(NamedTuple):
-    """A shape for training: its spectrum with SHOT, and the positions, both at s samples of its vertices."""
+    """A shape for training: its spectrum with SHOT descriptors, and its positions, both at s sampled vertices."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
 
 
 class TrainingPair(NamedTuple):
-    """Two shapes, and the position on Y of the ground truth of each sample of X."""
+    """Two shapes, and the position of the true match on Y for each of the s samples of X."""
 
     x: Shape
     y: Shape
@@ -209,7 +212,7 @@ class TrainingPair(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A mesh, the vertices that were sampled, and the sampled shape."""
+    """A mesh, the numbers of its sampled vertices, and the shape restricted to these vertices."""
 
     mesh: Mesh
     samples: Int[np.ndarray, " s"]
@@ -234,7 +237,7 @@ def prepared(pair: DataPair) -> TrainingPair:
 
 
 def described(mesh: Mesh) -> Spectrum:
-    """Return the spectrum of a mesh as a `DescriptorNetwork` needs it: of area 1, with SHOT, padded."""
+    """Return the input of a `DescriptorNetwork`: a mesh's padded spectrum with SHOT descriptors, for area 1."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
     return padded(spectrum.with_descriptors(jnp.asarray(shot)))
@@ -248,7 +251,8 @@ class Matched(NamedTuple):
     - `by_descriptors`: the soft map between the descriptors.
     - `by_layer`: the soft map that the layer recovers from its functional map.
     - `functional_map`: the functional map of the layer.
-    - `energy`: the wavelet-preservation energy of the functional map under `by_layer`, per eigenvector.
+    - `energy`: the wavelet-preservation energy of the functional map under the soft map `by_layer`, divided by
+      the number of eigenvectors.
     """
 
     by_descriptors: SoftMap | SparseSoftMap
@@ -269,7 +273,7 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
 
 
 def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
-    """The loss `labels`: the distances between the ground truth and both soft maps of `Matched`, weighted."""
+    """Return the loss `labels`: a weighted sum of the distances of both soft maps of `Matched` from the truth."""
     found = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
         root_mean_square(soft_map.pull_back, pair.y.positions, pair.truth)
@@ -279,11 +283,13 @@ def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[A
 
 
 def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
-    """The loss `cycles`, which needs no ground truth.
+    """Return the loss `cycles`, which needs no ground truth.
 
-    The loss is a weighted sum of the wavelet-preservation energies in both directions, the deviation of the
-    product of both functional maps from the identity, and the distances between points of X and their images
-    under the forward and backward soft maps.
+    The loss is a weighted sum of these terms:
+
+    - the wavelet-preservation energies of the forward and the backward functional map;
+    - the squared deviation of the product of both functional maps from the identity;
+    - the distances between points of X and their images under the forward map followed by the backward map.
     """
     forward, backward = matched(network, pair.x, pair.y), matched(network, pair.y, pair.x)
     round_trip = product(forward.functional_map, backward.functional_map)
@@ -311,7 +317,7 @@ LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]]
 
 
 def save(network: DescriptorNetwork, path: Path) -> None:
-    """Write a network to a file: one line of JSON with the sizes and the float type, then the leaves."""
+    """Write a network to a file: first a line of JSON with the sizes and the float type, then the arrays."""
     header = {"sizes": asdict(network.sizes), "dtype": str(network.leave.weight.dtype)}
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         stream.write(json.dumps(header).encode() + b"\n")
@@ -345,7 +351,7 @@ def nearest_descriptors(network: DescriptorNetwork, x: Spectrum, y: Spectrum) ->
 def descriptor_errors(
     pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
 ) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of each initial map, before and after refinement."""
+    """Return the mean geodesic error of each initial map, before and after refinement, multiplied by 10³."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
@@ -366,10 +372,10 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
     """Yield the parts of `summary.md`."""
     yield "# Learned descriptors\n"
     yield (
-        f"{steps} steps of Adam for each loss, each step on one pair with {SAMPLES} samples per shape. Mean "
-        "geodesic errors x 10⁻³ √area of the nearest neighbours of descriptors (initial map), and after "
-        f"refinement by the preset `paper` (k = {EIGENVECTORS}, {ITERATIONS} iterations); in parentheses the "
-        "mean paired difference from SHOT with its 95 % bootstrap interval.\n"
+        f"Training takes {steps} steps of Adam for each loss. Each step uses one pair with {SAMPLES} samples per "
+        "shape. The numbers are mean geodesic errors x 10⁻³ √area. The initial map takes nearest neighbours of "
+        f"descriptors. The preset `paper` (k = {EIGENVECTORS}, {ITERATIONS} iterations) refines this map. "
+        "Parentheses contain the mean paired difference from SHOT with its 95 % bootstrap interval.\n"
     )
     first_pair = next(iter(measured.values()))[0]
     names = [name.removesuffix(START) for name in first_pair if name.endswith(START)]
@@ -383,7 +389,7 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
 
 
 def draw(curves: Mapping[str, Trained], path: Path) -> None:
-    """Draw the losses over the steps, on the training pairs and on pairs of other people."""
+    """Plot the losses on the training pairs and on pairs of other people against the training steps."""
     figure, axes = plt.subplots(1, len(curves), figsize=(5 * len(curves), 3.4), layout="constrained")
     for axis, (name, curve) in zip(axes, curves.items(), strict=True):
         axis.plot(*smoothed(curve.losses), label="training pairs, running mean")

@@ -5,21 +5,22 @@
 
 The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
-DATA_DIRECTORY holds `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which is
+DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which is
 a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step of
-Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on
-samples of both shapes. Two frames are trained, each with its own loss:
+Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on samples
+of both shapes. The script trains one frame with each of these losses:
 
 - `labels`: the distance between matches and the ground truth;
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
   This loss needs no ground truth.
 
-Both distances are root mean squares over the shares of the soft maps.
+The distance of a point is a root mean square, weighted by the shares of the soft maps.
 
-Then `jaxsmw.refine` refines pairs of the five other people and of TOSCA with the Meyer frame and with both
-trained frames, from the same initial maps. The script writes `summary.md` with the errors, `frames.png` with
-the filters and losses, and `frame_labels.npz` and `frame_cycles.npz` with the trained frames
-(`Warped(SoftmaxFrame(logits), Power())`). After an interruption the same command continues.
+The script then tests the frames on pairs of the five other people and of TOSCA. `jaxsmw.refine` refines each
+pair with the Meyer frame and with both trained frames, from the same initial map. The script writes `summary.md`
+with the errors, and `frames.png` with the filters and losses. It also writes the logits of the trained frames,
+`Warped(SoftmaxFrame(logits), Power())`, to `frame_labels.npz` and `frame_cycles.npz`. After an interruption, the
+same command continues from the saved state.
 """
 
 from __future__ import annotations
@@ -81,10 +82,10 @@ class Sampled(NamedTuple):
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of both shapes at the samples.
-    - `positions_x`, `positions_y`: the positions of the samples, in square roots of the area of each shape.
+    - `positions_x`, `positions_y`: the positions of the samples, in units of the square root of the shape's area.
     - `initial_map`: the initial map from the samples of X to the samples of Y.
     - `reverse_initial_map`: the initial map from the samples of Y to the samples of X.
-    - `truth`: the position on Y of the ground truth of each sample of X, in the units of `positions_y`.
+    - `truth`: the position of the true match on Y for each sample of X, in the unit of `positions_y`.
     """
 
     spectrum_x: Spectrum
@@ -102,7 +103,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 
 def like_meyer() -> SoftmaxFrame:
-    """Return the frame from which training starts: close to the Meyer frame, with all filters positive."""
+    """Return the frame from which training starts. It is close to the Meyer frame, with positive filters."""
     return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 
@@ -118,7 +119,7 @@ def sampled(pair: DataPair) -> Sampled:
     ]
 
     def nearest(pointwise_map: np.ndarray, source: int, mesh: Mesh) -> np.ndarray:
-        """Restrict a map between all vertices to the samples: each match becomes the nearest sample."""
+        """Restrict a map between all vertices to the samples, and move each match to the nearest sample."""
         found = unit_area_positions(mesh)[pointwise_map[samples[source]]]
         return KDTree(positions[1 - source]).query(found)[1].astype(np.int32)
 
@@ -136,7 +137,7 @@ def soft_map(
     frame: SoftmaxFrame, spectrum_x: Spectrum, spectrum_y: Spectrum, initial: Int[Array, " s"]
 ) -> SoftMap | SparseSoftMap:
     """Return the soft map that `refine_softly` computes with the frame from an initial map."""
-    # Eigenvectors restricted to samples are not orthonormal.
+    # Eigenvectors restricted to samples are not orthonormal, so they need a least-squares pseudo-inverse.
     refiner = WaveletPreservation(bank_of(frame), Filtering("least_squares"))
     recovery: Recovery = Softmax(TEMPERATURE)
     options = {"refiner": refiner, "recovery": recovery, "iterations": ITERATIONS - 1}
@@ -144,13 +145,13 @@ def soft_map(
 
 
 def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """The loss `labels`: the mean distance between soft matches and the ground truth."""
+    """Return the loss `labels`: the mean distance between soft matches and the ground truth."""
     found = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     return root_mean_square(found.pull_back, pair.positions_y, pair.truth)
 
 
 def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """The loss `cycles`: the mean distance between points of X and their images under both soft maps."""
+    """Return the loss `cycles`: the mean distance of points of X from their images under both soft maps in turn."""
     forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
     return root_mean_square(
@@ -177,7 +178,7 @@ def load(path: Path) -> FilterBank:
 
 
 def refinement_errors(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of refinement with each bank, from the same initial map."""
+    """Return the mean geodesic error of refinement with each bank from one initial map, multiplied by 10³."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
     spectra, initial = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map
@@ -189,16 +190,17 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
     """Yield the parts of `summary.md`."""
     yield "# Learned frames\n"
     yield (
-        f"Frames of {FILTERS} filters and {KNOTS} knots, {steps} steps of Adam; k = {EIGENVECTORS}, "
-        f"{ITERATIONS} iterations from SHOT. Mean geodesic errors x 10⁻³ √area; in parentheses the mean "
-        "paired difference from the Meyer frame with its 95 % bootstrap interval.\n"
+        f"The frames have {FILTERS} filters and {KNOTS} knots. Training takes {steps} steps of Adam. Refinement "
+        f"uses k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. The numbers are mean geodesic errors "
+        "x 10⁻³ √area. Parentheses contain the mean paired difference from the Meyer frame with its 95 % "
+        "bootstrap interval.\n"
     )
     yield comparison(measured, list(next(iter(measured.values()))[0]), seed)
     yield begun_with + "\n"
 
 
 def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path: Path) -> None:
-    """Draw the filters of each bank, and the losses over the steps."""
+    """Plot the filters of each bank, and the losses against the training steps."""
     figure, axes = plt.subplots(1, len(banks) + 1, figsize=(4 * len(banks) + 4, 3.2), layout="constrained")
     points = jnp.linspace(0, 1, 500)
     for axis, (name, bank) in zip(axes[:-1], banks.items(), strict=True):
@@ -230,7 +232,7 @@ def main() -> None:
                 steps=run.steps,
                 seed=run.seed,
                 directory=run.directory,
-                # The loss varies more between pairs than between frames.
+                # The loss varies more between pairs than between frames, so each pair's loss is normalised.
                 unit=lambda pair, loss=loss: loss(like_meyer(), pair),
             )
             losses[name] = trained.losses

@@ -29,10 +29,10 @@ from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, m
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10
 EVALUATED_POINTS = 500
-# The number of steps between saves, and between evaluations of the loss on watched pairs.
+# These are the numbers of steps between two saves, and between two evaluations of the loss on watched pairs.
 _SAVED_EVERY, _WATCHED_EVERY = 10, 20
-# Shapes are padded to a multiple of this number of vertices, so that shapes of similar size share one
-# compiled program.
+# Shapes are padded to a multiple of this number of vertices. Shapes of similar size then share one compiled
+# program.
 _SIZES = 512
 
 Model = TypeVar("Model", bound=eqx.Module)
@@ -44,9 +44,9 @@ class Data(NamedTuple):
 
     **Attributes:**
 
-    - `seen`: the listed pairs of the training people.
-    - `seen_further`: the other pairs of the training people with ground truth.
-    - `unseen`: the listed pairs of the other people, for evaluation.
+    - `seen`: the pairs of the training people that the pair list of FAUST contains.
+    - `seen_further`: the other pairs of the training people that have ground truth.
+    - `unseen`: the pairs of the other people that the pair list of FAUST contains, for evaluation.
     - `animals`: the pairs of TOSCA, for evaluation.
     """
 
@@ -57,7 +57,7 @@ class Data(NamedTuple):
 
 
 def person(shape: str) -> int:
-    """Return the number of the person: FAUST numbers the ten poses of each person consecutively."""
+    """Return the number of the person in a shape. FAUST numbers the ten poses of each person consecutively."""
     return int(shape.rsplit("_", 1)[1]) // POSES
 
 
@@ -81,7 +81,7 @@ def open_data(directory: Path) -> Data:
     if not data.seen or not data.unseen:
         raise InputError(
             f"{faust.directory}: has no pairs among the first {TRAINING_PEOPLE} people, or no pairs among "
-            "the other people: complete the copy."
+            "the other people: complete this copy of the data set."
         )
     return data
 
@@ -96,15 +96,15 @@ def root_mean_square(
     positions: Float[Array, "s 3"],
     wanted: Float[Array, "s 3"],
 ) -> Float[Array, ""]:
-    """Return the mean distance between the images of points under soft maps and their wanted positions.
+    """Return the mean distance between the soft matches of points and their target positions.
 
-    The distance of one point is the root of its mean squared distance over the shares of the soft map.
+    The distance of one point is a root mean square, weighted by the shares of the soft map.
 
     **Arguments:**
 
-    - `carried`: pulls functions back by one or several soft maps.
-    - `positions`: the positions of the points on the shape from which `carried` pulls back.
-    - `wanted`: the wanted position of each image.
+    - `carried`: a function that pulls functions back by one soft map or by several soft maps in turn.
+    - `positions`: the vertex positions of the shape from which `carried` pulls functions back.
+    - `wanted`: the target position of each point.
     """
     found = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
     squares = found[:, 3] - 2 * jnp.sum(found[:, :3] * wanted, axis=1) + jnp.sum(wanted**2, axis=1)
@@ -128,8 +128,8 @@ class Trained(NamedTuple):
 
     - `model`: the trained model.
     - `losses`: the loss of every step.
-    - `steps`: the numbers of completed steps at which the loss on the watched pairs was evaluated.
-    - `watched`: the mean loss on the watched pairs after these numbers of steps.
+    - `steps`: the numbers of completed steps after which the loss on the watched pairs was evaluated.
+    - `watched`: the mean loss on the watched pairs after each of these numbers of steps.
     """
 
     model: Any
@@ -152,14 +152,14 @@ def train(
     unit: Callable[[Prepared], Float[Array, ""]] | None = None,
     watched: Sequence[DataPair] = (),
 ) -> Trained:
-    """Train a model; each step uses one pair, drawn at random.
+    """Train a model. Each step uses one pair, which is drawn at random.
 
     The state is saved regularly as `training_NAME.eqx` in `directory`. If that file exists, training
     continues from it.
 
     **Arguments:**
 
-    - `name`: the name of the loss, for the file and the progress bar.
+    - `name`: the name of the loss, for the name of the file and for the progress bar.
     - `loss`: a function of the model and a prepared pair.
     - `model`: the initial model.
     - `pairs`: the training pairs.
@@ -168,9 +168,9 @@ def train(
     - `steps`: the number of steps.
     - `seed`: the seed of the draws.
     - `directory`: an existing directory for the saved state.
-    - `unit`: a function of a prepared pair. Each recorded loss is divided by its value, because losses vary
-      more between pairs than between models. By default losses are recorded without this division.
-    - `watched`: pairs whose mean loss is recorded at regular intervals; they do not influence training.
+    - `unit`: a function of a prepared pair. Each recorded loss is divided by the value of this function, because
+      losses vary more between pairs than between models. The default None records losses without division.
+    - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence training.
 
     **Raises:** `InputError` if the saved state is damaged or has other settings; `ArithmeticError` if a loss
     is not finite.
@@ -191,7 +191,7 @@ def train(
             state = eqx.tree_deserialise_leaves(stream, state)
 
     def watch(state: State) -> State:
-        """Record the mean loss on the watched pairs if it is due at this step."""
+        """Record the mean loss on the watched pairs if the current step requires a record."""
         here = np.flatnonzero(records == int(state.step))
         if not len(here):
             return state
@@ -223,7 +223,7 @@ def train(
     return Trained(state.model, np.asarray(state.losses), records, np.asarray(state.watched))
 
 
-# These two functions are at module level so that each is compiled only once for each loss and optimiser.
+# The next two functions are at module level, so JAX compiles them only once for each loss and optimiser.
 @eqx.filter_jit
 def _improve(
     state: State,
@@ -247,16 +247,17 @@ def _evaluate(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """Open a file of leaves that equinox wrote; the body of the `with` statement must read all of it.
+    """Open a file of arrays that equinox wrote. The body of the `with` statement must read the whole file.
 
-    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if data remain.
+    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if the body leaves data
+    unread.
     """
     try:
         with open(path, "rb") as stream:
             yield stream
             if stream.read(1):
                 raise ValueError("the file has trailing data")
-    except Exception as error:  # the readers of NumPy and equinox raise many types
+    except Exception as error:  # NumPy and equinox raise errors of many types for damaged files
         raise InputError(
             f"{path}: is damaged, or was written by other code or with other settings: remove it, or give "
             "another file."
@@ -284,14 +285,14 @@ def refined(
 def errors(
     pair: DataPair, mesh_x: Mesh, mesh_y: Mesh, maps: Mapping[str, Int[np.ndarray, " m"]], seed: int
 ) -> dict[str, float]:
-    """Mean geodesic errors x 10³ of several maps, all at the same points of the ground truth."""
+    """Return the mean geodesic error of each map at the same ground-truth points, multiplied by 10³."""
     truth = pair.ground_truth(mesh_x, mesh_y)
     options: dict[str, Any] = {"number_of_samples": EVALUATED_POINTS, "seed": seed}
     return {name: 1e3 * geodesic_error(mesh_y, found, truth, **options).mean for name, found in maps.items()}
 
 
 Measured = dict[str, list[dict[str, float]]]
-"""For each data set a list of pairs, and for each pair its errors by name."""
+"""A list of pairs for each data set. A pair is a dictionary of its errors by name."""
 
 
 def measure(
@@ -304,9 +305,9 @@ def measure(
 ) -> Measured:
     """Measure random pairs of the other people and of TOSCA.
 
-    The errors of each pair are appended to `errors.csv` at once. Pairs that the file already
-    contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset of the
-    pairs that a larger number selects.
+    The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the file
+    already contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset of
+    the pairs that a larger number selects.
 
     **Arguments:**
 
@@ -333,7 +334,7 @@ def measure(
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """Return a table of mean errors, with paired differences from the first name and their intervals."""
+    """Return a table of mean errors, with confidence intervals of paired differences from the first name."""
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}
@@ -346,7 +347,7 @@ def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
 
 
 def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps and running means over a tenth of the values, for a plot."""
+    """Return the steps and the running means for a plot. The window is 10 % of the number of values."""
     window = max(1, len(values) // 10)
     means = np.convolve(values, np.ones(window) / window, "valid")
     return np.arange(len(means)) + window / 2, means
@@ -355,15 +356,15 @@ def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarra
 def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentParser:
     """Return the parser for the arguments of a training script."""
     made = argparse.ArgumentParser(description=description)
-    made.add_argument("data", type=Path, help="directory with faust_r and tosca_r")
-    made.add_argument("--output", type=Path, default=Path(output), help=f"default: {output}")
+    made.add_argument("data", type=Path, help="directory that contains faust_r and tosca_r")
+    made.add_argument("--output", type=Path, default=Path(output), help=f"output directory (default: {output})")
     made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
     made.add_argument(
         "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
     )
     made.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     made.add_argument(
-        "--quick", action="store_true", help="3 steps and 2 test pairs, to check that the script works"
+        "--quick", action="store_true", help="run 3 steps and 2 test pairs, to check that the script works"
     )
     return made
 
@@ -376,7 +377,7 @@ class Run(NamedTuple):
     - `data`: the pairs.
     - `directory`: the output directory.
     - `steps`, `test_pairs`, `seed`: see the command-line options.
-    - `begun_with`: commit, machine and versions in one line.
+    - `begun_with`: a line with commit, machine and versions at the start of the run.
     """
 
     data: Data
@@ -391,9 +392,8 @@ class Run(NamedTuple):
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
     """Read the arguments, open the data, and reserve the output directory for this process.
 
-    The provenance of the results is written to `provenance.json` in the output directory; see
-    `jaxsmw.evaluation.journal.claimed_directory`. Bad input and interruptions end the process with one
-    sentence.
+    `jaxsmw.evaluation.journal.claimed_directory` writes the provenance of the results to `provenance.json` in the
+    output directory. Bad input and interruptions end the process with a message of one sentence.
 
     **Arguments:**
 
@@ -403,8 +403,8 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
     options = arguments.parse_args()
     steps, test_pairs = (3, 2) if options.quick else (options.steps, options.test_pairs)
     if steps < 1 or test_pairs < 1 or options.seed < 0:
-        arguments.error("--steps and --test-pairs must be at least 1, --seed at least 0")
-    warnings.simplefilter("ignore")  # about the quality of each mesh
+        arguments.error("--steps and --test-pairs must be at least 1, and --seed at least 0")
+    warnings.simplefilter("ignore")  # hides warnings about the quality of each mesh
     script = Path(sys.argv[0])
     try:
         data, directory = open_data(options.data), make_directory(options.output)

@@ -3,22 +3,22 @@
     python scripts/reproduce_paper.py DATA_DIRECTORY [--output DIR] [--only NAME ...]
         [--sets NAME ...] [--pairs N] [--quick]
 
-DATA_DIRECTORY holds data sets in the layouts of `docs/datasets.md`, each in its own directory. Each
-experiment uses the data sets that suit the experiment:
+DATA_DIRECTORY contains data sets in the layouts of `docs/datasets.md`, each in its own directory. Each
+experiment uses only the data sets that suit this experiment:
 
 - `table1`: error and refinement time of all methods (Table 1), time with precomputation (Table 2) and
-  correspondence quality curves (Fig. 4), on data sets whose pairs are of one class;
+  correspondence quality curves (Fig. 4), on data sets in which each pair belongs to one class;
 - `fig6`: partial shapes, separately for cuts and holes;
 - `fig7`: shapes with topological noise;
-- `fig9`: other meshes and resolutions of the target, and other initial maps;
-- `nonisometric`: pairs of different classes, from published initial maps if there are any, compared with
-  published results;
-- `settings`: MWP and the other methods with settings other than the published ones, on the data sets of
-  `table1`.
+- `fig9`: targets with other triangulations and resolutions, and other initial maps;
+- `nonisometric`: pairs of different classes, compared with published results. The initial maps are published
+  maps if the data set contains any, and SHOT otherwise;
+- `settings`: MWP and the other methods with settings that differ from the published settings, on the data sets
+  of `table1`.
 
-The output directory gets a directory for each run, with the same files as from `jaxsmw benchmark`, and a
-`README.md` with all tables. After an interruption the same command continues. With `--quick` the script takes
-minutes on shapes with 5000 vertices.
+For each run, the script creates a directory with the same files as `jaxsmw benchmark` in the output directory.
+It writes all tables to `README.md`. After an interruption, the same command continues from the saved results.
+With `--quick`, the script takes minutes on shapes with 5000 vertices.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# fig9 uses one in this number of the pairs that the other experiments use.
+# `fig9` divides the number of pairs (`--pairs`, or else 40) by this number, and uses at least 2 pairs.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
-# These descriptors cannot distinguish left from right; SHOT can, and "functional" is computed from SHOT.
+# These descriptors cannot distinguish left from right. SHOT and "functional", which uses SHOT, can do so.
 _MIRRORED = {"wks", "hks", "wavelet"}
 
 
 class Run(NamedTuple):
-    """One benchmark, which is one column in the table of an experiment."""
+    """One benchmark. It fills one column in the table of its experiment."""
 
     experiment: str
     name: str
@@ -89,21 +89,21 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
 
 
 def is_isometric(data_set: DataSet) -> bool:
-    """Whether each pair shows two poses of a full shape of one class."""
+    """Returns whether each pair of a data set consists of two full shapes of one class without topological noise."""
     special = ("SHREC'16 partial", "SHREC'16 topology")
     within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
     return within and data_set.layout not in special
 
 
 def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Full near-isometric shapes, all methods."""
+    """Yields the runs of all methods on full near-isometric shapes."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Partial shapes to full shapes."""
+    """Yields the runs that match partial shapes to full shapes."""
     for data_set in data_sets:
         if data_set.layout != "SHREC'16 partial":
             continue
@@ -122,7 +122,7 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Shapes with topological noise."""
+    """Yields the runs on shapes with topological noise."""
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
             pairs = chosen(data_set, options)
@@ -130,7 +130,7 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Other meshes and resolutions of the target, and other initial maps."""
+    """Yields the runs with remeshed targets, and the runs from other initial maps."""
     some = {name: METHODS[name] for name in FIG9_METHODS}
     few = argparse.Namespace(**{**vars(options), "pairs": max(2, (options.pairs or 40) // FIG9_SHARE)})
     for data_set in filter(is_isometric, data_sets):
@@ -148,12 +148,13 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Non-isometric shapes, compared with published results from the same initial maps."""
+    """Yields the runs on non-isometric shapes, with published results from the same initial maps."""
     for data_set in data_sets:
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # The name of a directory with results begins with the name of the directory with their initial maps.
+        # Published results come from initial maps in another directory. The name of the directory with the results
+        # begins with the name of the directory with these initial maps.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -168,14 +169,14 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Settings other than the published ones."""
+    """Yields the runs with settings that differ from the published settings."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
 
 
 def other_settings() -> dict[str, Method]:
-    """Returns the methods with published settings, and with each of the changes in `_CHANGES`, by name."""
+    """Returns, by name, the methods with published settings and with each changed setting in `_CHANGES`."""
     found = {"initial": METHODS["initial"]}
     for name, changes in _CHANGES.items():
         method = found[name] = METHODS[name]
@@ -206,18 +207,18 @@ EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric, s
 
 
 def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
-    """Returns the pairs of a data set to measure."""
+    """Returns the pairs of a data set that the run measures."""
     return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
 
 
 def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
-    """Returns all methods that suit the pairs; with `--quick` three fast methods."""
+    """Returns all methods that suit the pairs. With `--quick`, returns only three fast methods."""
     every = suited_methods(pairs)
     return {name: every[name] for name in ("initial", "mwp", "zoomout-sampled")} if options.quick else every
 
 
 def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
-    """Returns the settings of a run."""
+    """Returns the benchmark settings of a run. Only the initial map and mirroring differ between runs."""
     return Settings(init, mirrored, 200 if options.quick else None, options.seed)
 
 
@@ -227,17 +228,17 @@ def published(data_set: DataSet) -> list[str]:
 
 
 def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
-    """Whether to measure results from this kind of initial map against the mirrored ground truth, too."""
+    """Returns whether results from this initial map may also be compared with the mirrored ground truth."""
     ambiguous = init in _MIRRORED or "symm" in Path(init).name
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# A new mesh, and for each of its vertices the old vertex at the same place, or -1.
+# A new mesh, and for each of its vertices the old vertex at the same position, or -1 if there is no such vertex.
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 
 def finer(mesh: Mesh) -> Remeshed:
-    """Splits every face into four."""
+    """Splits every face into four faces."""
     vertices, faces = igl.upsample(mesh.vertices, mesh.faces, 1)
     old = np.full(len(vertices), -1)
     old[: len(mesh.vertices)] = np.arange(len(mesh.vertices))
@@ -245,7 +246,7 @@ def finer(mesh: Mesh) -> Remeshed:
 
 
 def coarser(mesh: Mesh) -> Remeshed:
-    """Collapses edges, the shortest first, until a quarter of the faces are left."""
+    """Collapses edges, the shortest edges first, until a quarter of the faces are left."""
     return _decimate(mesh, mesh.vertices, len(mesh.faces) // 4)
 
 
@@ -267,7 +268,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """Writes a data set with the same sources and remeshed targets, and opens this data set."""
+    """Writes a data set with the sources of the pairs and their remeshed targets, and opens this data set."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")
@@ -299,10 +300,10 @@ def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[s
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
-    """Returns a table for each experiment, with mean error and seconds for each method and run."""
+    """Returns a table for each experiment, with the mean error and the seconds of each method in each run."""
     parts = [
         "# The paper's comparisons",
-        "Mean error x 10⁻³ of √area; seconds from the initial map to the result.",
+        "Each cell contains the mean error x 10⁻³ √area, and the seconds from the initial map to the result.",
     ]
     for experiment in dict.fromkeys(experiment for experiment, _ in found):
         columns = {name: summaries for (own, name), summaries in found.items() if own == experiment}
@@ -332,7 +333,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
-    parser.add_argument("--quick", action="store_true", help="only two pairs, three methods and 200 points")
+    parser.add_argument("--quick", action="store_true", help="use only two pairs, three methods and 200 points")
     options = parser.parse_args()
     if options.quick:
         options.pairs = min(options.pairs or 2, 2)

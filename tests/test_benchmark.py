@@ -361,7 +361,6 @@ def with_words_for_numbers(lines: list[str]) -> list[str]:
     return [lines[0], *(re.sub(r"\d+\.\d+", "many", line) for line in lines[1:])]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize(
     ("damage", "message"),
@@ -387,7 +386,6 @@ def test_damaged_results_are_named_and_not_changed(measure, finished, tmp_path, 
     assert (tmp_path / name).read_text() == damaged
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv", "provenance.json"])
 @pytest.mark.parametrize("contents", [bytes(range(256)) * 4, b"\0" * 100 + b"\n", b"not a table", b"\xff\n"])
 def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_path, name, contents):
@@ -400,7 +398,6 @@ def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_
     assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize("kept", [None, 0, 10])
 def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(

@@ -8,8 +8,10 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import scipy.io
@@ -18,9 +20,11 @@ from command_line import COMMANDS, SMALL, assert_refused, runner, write_pair
 from synthetic import grid_mesh
 
 import jaxsmw
+import jaxsmw.matching
+from jaxsmw.banks import CubicSpline, Itersine, Meyer, SpectralDistribution, Warped
 from jaxsmw.cli.banks import BANKS, bounds_unless_tight, make_bank
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.solutions import Filtering
+from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.measurement import Settings
 from jaxsmw.evaluation.metrics import geodesic_error
@@ -159,52 +163,64 @@ def test_quiet_prints_nothing_on_standard_error(run, pair, tmp_path):
     assert outcome.code == 0 and outcome.errors == ""
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--init", "wks"],
-        ["--init", "landmarks:{pair}/landmarks.txt"],
-        ["--init", "map:{pair}/truth.txt"],
-        ["--iterations", "1"],
-        ["--samples", "40"],
-        ["--eigenvectors", "15"],
-        ["--init", "functional"],
-        ["--filters", "2"],
-        ["--bank", "itersine"],
-        ["--bank", "adapted-itersine"],
-        ["--bank", "cubic-spline"],
-        ["--solution", "least-squares"],
-        ["--solution", "least-squares-frobenius"],
-        ["--solution", "regularized"],
-        ["--laplacian", "robust"],
-        ["--precision", "float64"],
-        ["--stop-when-unchanged", "--iterations", "20"],
-    ],
-    ids=" ".join,
-)
-def test_options_reach_the_method(run, pair, tmp_path, options, monkeypatch):
-    import jaxsmw.matching
-
+@pytest.fixture
+def calls(monkeypatch):
+    """All settings of each call of `match`: of the function, of the stage and of the refiner, by name."""
     calls, match = [], jaxsmw.matching.match
 
-    def recorded(*meshes, **settings):
-        calls.append((settings, match(*meshes, **settings)))
-        return calls[-1][1]
+    def recorded(*meshes, preset, **settings):
+        found = match(*meshes, preset=preset, **settings)
+        of_stage, of_refiner = (
+            {field.name: getattr(part, field.name) for field in fields(part)}
+            for part in (preset, preset.refiner)
+        )
+        settings |= of_stage | of_refiner | {"float type": found.functional_map.dtype}
+        del settings["refiner"]
+        calls.append(settings)
+        return found
 
     monkeypatch.setattr(jaxsmw.matching, "match", recorded)
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("options", "changed"),
+    [
+        ("--init wks", lambda: {"init": "wks"}),
+        ("--init functional", lambda: {"init": "functional"}),
+        ("--iterations 1", lambda: {"iterations": 1}),
+        ("--samples 40", lambda: {"number_of_samples": 40}),
+        ("--eigenvectors 15", lambda: {"number_of_eigenvectors": 15}),
+        ("--filters 2", lambda: {"bank": Meyer(2)}),
+        ("--bank itersine", lambda: {"bank": Itersine(4)}),
+        ("--bank adapted-itersine", lambda: {"bank": Warped(Itersine(4), SpectralDistribution())}),
+        ("--bank cubic-spline", lambda: {"bank": CubicSpline(4)}),
+        ("--solution least-squares", lambda: {"solution": LeastSquares()}),
+        ("--solution least-squares-frobenius", lambda: {"solution": LeastSquares(norm="frobenius")}),
+        ("--solution regularized", lambda: {"solution": RegularizedLeastSquares()}),
+        ("--laplacian robust", lambda: {"laplacian": "robust"}),
+        ("--precision float64", lambda: {"float type": np.float64}),
+        ("--stop-when-unchanged", lambda: {"stop_when_unchanged": True}),
+    ],
+)
+def test_an_option_changes_the_setting_that_it_names_and_no_other(
+    run, pair, tmp_path, calls, options, changed
+):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
     assert run(*call).code == 0
-    assert run(*call, *(option.format(pair=pair) for option in options)).code == 0
-    (settings, plain), (other_settings, changed) = calls
-    if "--stop-when-unchanged" in options:
-        assert changed.iterations < 20
-    elif "--laplacian" in options:  # the two Laplacians agree on these well-shaped triangles
-        assert (settings["laplacian"], other_settings["laplacian"]) == ("auto", "robust")
-    else:
-        assert plain.functional_map.shape != changed.functional_map.shape or not np.array_equal(
-            plain.functional_map, changed.functional_map
-        )
-    assert changed.functional_map.dtype == (np.float64 if "float64" in options else np.float32)
+    assert run(*call, *options.split()).code == 0
+    before, after = calls
+    with jax.enable_x64(False):  # as in the command
+        assert {name: value for name, value in after.items() if value != before[name]} == changed()
+
+
+@pytest.mark.parametrize("kind", ["landmarks", "map"])
+def test_initial_maps_are_read_from_files(run, pair, tmp_path, calls, kind):
+    file = pair / {"landmarks": "landmarks.txt", "map": "truth.txt"}[kind]
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
+    assert run(*call, "--init", f"{kind}:{file}").code == 0
+    (settings,) = calls
+    np.testing.assert_array_equal(settings["init"], np.loadtxt(file, dtype=int))
 
 
 @pytest.mark.slow

@@ -220,9 +220,9 @@ def test_damaged_files_are_named(network, pair, tmp_path):
 
 def test_invalid_inputs_are_refused(network, pair, spectra, tmp_path):
     x, _ = spectra
-    with pytest.raises(ValueError, match="no descriptors, where 352 are needed"):
+    with pytest.raises(ValueError, match="no descriptors, but 352 per vertex are needed"):
         network(x.with_descriptors(None))
-    with pytest.raises(ValueError, match="10 descriptors, where 352"):
+    with pytest.raises(ValueError, match="10 descriptors, but 352"):
         network(x.with_descriptors(x.descriptors[:, :10]))
     for wrong in ({"width": 0}, {"blocks": 1.5}, {"filters": True}):
         with pytest.raises(ValueError, match=f"Sizes.{next(iter(wrong))} must be an integer"):

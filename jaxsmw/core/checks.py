@@ -20,7 +20,7 @@ Returned = TypeVar("Returned")
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
-    """Returns a continuous setting as an array of the default float type, so that JAX traces the setting."""
+    """Returns a continuous setting as an array of the default float type, which JAX can trace."""
     return jnp.asarray(value, dtype=float)
 
 
@@ -34,7 +34,7 @@ def all_finite(tree: PyTree) -> Bool[Array, ""]:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Checks an option that is one of several words.
+    """Checks that the value of an option is one of several words.
 
     **Raises:** `ValueError` if the value is not one of the choices.
     """
@@ -45,8 +45,8 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def check_kind(name: str, value: object, *kinds: type) -> None:
     """Checks the type of an argument.
 
-    **Raises:** `TypeError` if the value is not an instance of one of the kinds. The message names
-    the first kind.
+    **Raises:** `TypeError` if the value is not an instance of one of the types `kinds`. The message names
+    only the first type.
     """
     if isinstance(value, kinds):
         return
@@ -63,15 +63,15 @@ def check_between(
 
     If the parameter is traced, only its number of dimensions is checked.
 
-    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if a number in the parameter
-    is not finite or not strictly between the limits.
+    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if a number in it is not
+    finite or not strictly between `low` and `high`.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
-    # The comparison uses NumPy because jit traces even comparisons of JAX constants.
+    # The comparison uses NumPy, because `jax.jit` would trace a comparison of JAX constants.
     host = np.asarray(value)
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"
@@ -102,7 +102,7 @@ def _whole_number(caller: str, iterations: object) -> int:
         number = operator.index(iterations)  # type: ignore[arg-type]
     except TypeError:
         raise TypeError(
-            f"{caller} needs a whole number of iterations that is known when it is compiled, such as 3, "
+            f"{caller} needs a whole number of iterations that is known at compile time, such as 3, "
             f"not {iterations!r}"
         ) from None
     if number < 1:

@@ -1,16 +1,18 @@
 r"""Functional maps: the matrix form of a pointwise map, and the energy of wavelet preservation.
 
-The functional map C comes in two conventions, named after the direction of C:
+T: X -> Y is a pointwise map, and P (m, n) is its matrix, with a one at (x, T(x)) in each row x. Phi_X and
+Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering. There are two
+conventions for the direction of a functional map C:
 
-- **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, `C_0 = Phi_X^+ P Phi_Y`. The
-  program of the MWP authors uses this convention.
-- **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, `C_0 = Phi_Y^+ P^T Phi_X`. The MWP
-  paper prints this convention.
+- **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, and `C_0 = Phi_X^+ P Phi_Y`.
+  The program of the MWP authors uses this convention.
+- **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
+  MWP paper prints this convention.
 
 This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions
 every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x, and C should map a_x to
-b_x. In the area norm, each vertex has its area as its weight. In the Frobenius norm, which the paper uses in
-eq. (5), all vertices have the same weight:
+b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which the paper uses in
+eq. (5), all vertices have the same weight. The following table defines the weights and the vectors:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -19,22 +21,25 @@ eq. (5), all vertices have the same weight:
 | pushforward | area      | area_X(x)  | Phi_X(x)           | area_Y(T(x)) Phi_Y(T(x)) / area_X(x) |
 | pushforward | frobenius | 1          | area_X(x) Phi_X(x) | area_Y(T(x)) Phi_Y(T(x))             |
 
-In the last line, inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the paper. The
-energy of eq. (5) is
+In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the
+paper. The energy of eq. (5) of the paper, with the filters g_l of a bank, is
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
-The sum over scales is an elementwise product, `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`.
-So the energy depends on two moments only. They require no loop over scales and no array of size m x n:
+Lambda contains the eigenvalues, and the rows of G are the responses of the filters at the eigenvalues. For
+every matrix M, the sum over scales equals an elementwise product:
+`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on two matrices and a
+constant. Their computation needs no loop over scales and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
-The minimiser solves the (k_in, k_in) system `C gram = cross`. If the inputs are orthonormal, the gram matrix
-is diagonal and holds the frame function. The minimiser is then `cross` with its columns divided by the frame
-function. For a Parseval frame this minimiser is the filtered map of eq. (8). The inputs are always
-orthonormal in the pushforward convention with the area norm, and in the pullback convention if T preserves
-area. `docs/frames.md` derives all of this.
+The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
+orthonormal if `sum_x w a a^T` is the identity. Then the gram matrix is diagonal, its diagonal is the frame
+function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval frame
+this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always orthonormal
+in the pushforward convention. In the pullback convention they are orthonormal if T preserves area.
+`docs/frames.md` derives these results.
 """
 
 from __future__ import annotations
@@ -60,9 +65,11 @@ Side = TypeVar("Side")
 
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Returns a quantity of X and the same quantity of Y in the order of C: out first, in second.
+    """Returns a quantity of X and the same quantity of Y in the order (out, in).
 
-    The function is its own inverse: given (out, in), it returns (X, Y).
+    "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
+    pullback convention and (Y, X) in the pushforward convention. The function is its own inverse: for the
+    arguments (out, in), it returns (X, Y).
     """
     return (of_x, of_y) if convention == "pullback" else (of_y, of_x)
 
@@ -73,10 +80,10 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     **Arguments:**
 
     - `spectrum`: the shape.
-    - `pseudo_inverse`: `"area"` for `Phi^T A`, the projection in the inner product of the surface (the
-      paper); `"least_squares"` for `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight (the
-      authors' program). The difference is small if the vertices are spread evenly. On samples, only
-      `"least_squares"` is a pseudo-inverse.
+    - `pseudo_inverse`: `"area"` for `Phi^T A`, the projection in the inner product of the surface, which the
+      MWP paper uses. `"least_squares"` for `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same
+      weight. The authors' program uses this form. Both are nearly equal if the vertices are spread evenly. On
+      samples, only `"least_squares"` is a pseudo-inverse.
     """
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
@@ -92,15 +99,23 @@ def encode(
     convention: Convention = "pullback",
     pseudo_inverse: PseudoInverse = "area",
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the unfiltered functional map C_0 of a pointwise map T: X -> Y.
+    """Returns the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
+
+    Phi_X and Phi_Y contain the eigenvectors as columns, `Phi^+` is a pseudo-inverse, and P (m, n) is the
+    matrix of T, with a one at (x, T(x)) in each row x.
 
     **Arguments:**
 
     - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `convention`: `"pullback"` gives `Phi_X^+ P Phi_Y` (k_X, k_Y). `"pushforward"` gives `Phi_Y^+ P^T Phi_X`
-      (k_Y, k_X).
-    - `pseudo_inverse`: `"area"` or `"least_squares"`; see `dual_eigenvectors`.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
+      vertices, k_Y eigenvectors).
+    - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
+      maps functions on Y to functions on X. `"pushforward"` gives `Phi_Y^+ P^T Phi_X` (k_Y, k_X), which maps
+      functions on X to functions on Y.
+    - `pseudo_inverse`: `"area"` (the default) uses `Phi^+ = Phi^T A`, with the vertex areas A.
+      `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight.
+
+    **Returns:** C_0, (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention.
     """
     spectrum_out, spectrum_in = out_and_in(convention, spectrum_x, spectrum_y)
     dual_out = dual_eigenvectors(spectrum_out, pseudo_inverse)
@@ -113,9 +128,10 @@ def _encode(
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
 ) -> Float[Array, "k_out k_in"]:
-    """Returns `encode` for given dual eigenvectors: a sum over the vertices of X in both conventions.
+    """Returns the functional map of `encode` for given dual eigenvectors.
 
-    Padded vertices of X contribute nothing, because their rows in the array of X are zero.
+    In both conventions the functional map is a sum over the vertices of X. Padded vertices of X do not
+    contribute, because their rows in the array of X are zero.
     """
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
@@ -125,25 +141,32 @@ def _encode(
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the kernel K (k_out, k_in) of a bank, for which filtering is an elementwise product.
+    """Returns the kernel K (k_out, k_in) with which filtering becomes an elementwise product.
 
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals `C * K` for every C (k_out, k_in). The arguments are the
-    responses (filters, k) of the bank at the eigenvalues of the shapes that C maps to and maps from.
+    For every functional map C (k_out, k_in) and the filters g_l of a bank, the filtered map
+    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals `C * K`.
+
+    **Arguments:**
+
+    - `responses_out`: (filters, k_out), the responses g_l of the bank at the eigenvalues of the shape that C
+      maps to.
+    - `responses_in`: (filters, k_in), the responses at the eigenvalues of the shape that C maps from.
     """
     return product(responses_out.T, responses_in)
 
 
 class QuadraticEnergy(eqx.Module):
-    """The energy `E(C) = <C, C gram> - 2 <C, cross> + constant`.
+    """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Every sum of squares `sum ||C a - b||²` has this form, for any number of columns a and b. Energies can be
-    added, and multiplied by a weight.
+    Every sum of squares `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i.
+    `energy(C)` returns the energy of C (k_out, k_in), and `energy.minimizer()` returns the C of least energy.
+    `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of shape ().
 
     **Attributes:**
 
-    - `gram`: `sum a a^T` (k_in, k_in), positive semi-definite.
-    - `cross`: `sum b a^T` (k_out, k_in).
-    - `constant`: `sum ||b||²`, the energy of C = 0.
+    - `gram`: (k_in, k_in), `sum_i a_i a_i^T`, positive semi-definite.
+    - `cross`: (k_out, k_in), `sum_i b_i a_i^T`.
+    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0.
     """
 
     gram: Float[Array, "k_in k_in"]
@@ -158,7 +181,7 @@ class QuadraticEnergy(eqx.Module):
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
         """Returns the energy of a functional map.
 
-        The energy is a difference of large sums, so rounding can make the result slightly negative.
+        The energy is a difference of large sums, so rounding errors can make it slightly negative.
         """
         return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
 
@@ -173,7 +196,7 @@ class QuadraticEnergy(eqx.Module):
     def minimizer(self) -> Float[Array, "k_out k_in"]:
         """Returns the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
-        The result is NaN or meaningless if the gram matrix is singular; see `is_regular`.
+        If the gram matrix is singular, the returned map is NaN or meaningless. `is_regular` detects this case.
         """
         return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
 
@@ -183,14 +206,15 @@ class QuadraticEnergy(eqx.Module):
 
     def is_regular(self) -> Bool[Array, ""]:
         """Returns whether the gram matrix differs from a singular matrix by more than rounding."""
-        # The pivots of a singular matrix are rounding errors, or NaN from the first negative pivot on.
+        # If the matrix is singular, a pivot is as small as the rounding error. From the first negative pivot
+        # on, all pivots are NaN.
         pivots = jnp.diagonal(self.cholesky()) ** 2
         return jnp.min(pivots) > self.rounding()
 
     def rounding(self) -> Float[Array, ""]:
-        """Returns the rounding error of the gram matrix.
+        """Returns an estimate of the rounding error of the gram matrix.
 
-        The error is the largest diagonal entry times k_in times the precision of the float type.
+        The estimate is the product of the largest diagonal entry, k_in, and the precision of the float type.
         """
         relative = self.gram.shape[0] * jnp.finfo(self.gram.dtype).eps
         return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
@@ -205,18 +229,21 @@ class QuadraticEnergy(eqx.Module):
 
 
 class WaveletProblem(eqx.Module):
-    """Two shapes, the responses of a filter bank on both, and the convention of C.
+    """The data from which a `Solution` computes the functional map C of a pointwise map from X to Y.
 
-    Solutions do not depend on the convention. They use the methods of this class, which return quantities of
-    the shapes in the order of C: the shape that C maps to ("out"), then the shape that C maps from ("in").
+    The code of a solution is the same for both conventions. It uses the methods of this class, which return
+    the quantities of both shapes in the order (out, in): first the shape that C maps to ("out"), then the
+    shape that C maps from ("in").
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: source X and target Y.
-    - `responses_x`, `responses_y`: the responses of the bank at the eigenvalues of X (filters, k_x) and of Y
-      (filters, k_y).
-    - `convention`: `"pullback"` or `"pushforward"`.
-    - `sampled`: whether the spectra contain samples only, on which eigenvectors are not orthonormal.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
+    - `responses_x`, `responses_y`: the responses of the filter bank at the eigenvalues of X, (filters, k_x),
+      and of Y, (filters, k_y).
+    - `convention`: `"pullback"` (the default) if C maps functions on Y to functions on X; `"pushforward"` if
+      C maps functions on X to functions on Y.
+    - `sampled`: whether the spectra contain samples only, by default False. On samples the eigenvectors are
+      not orthonormal.
     """
 
     spectrum_x: Spectrum
@@ -227,23 +254,23 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Returns a quantity of X and the same quantity of Y in the order of C: out first, in second."""
+        """Returns a quantity of X and the same quantity of Y in the order (out, in)."""
         return out_and_in(self.convention, of_x, of_y)
 
     @property
     def spectra(self) -> tuple[Spectrum, Spectrum]:
-        """The spectra in the order of C: out first, in second."""
+        """The spectra of the shape that C maps to and of the shape that C maps from, in this order."""
         return self.out_and_in(self.spectrum_x, self.spectrum_y)
 
     @property
     def responses(self) -> tuple[Float[Array, "filters k_out"], Float[Array, "filters k_in"]]:
-        """The responses in the order of C: out first, in second."""
+        """The responses on the shape that C maps to and on the shape that C maps from, in this order."""
         return self.out_and_in(self.responses_x, self.responses_y)
 
     def encode(
         self, pointwise_map: PointwiseMap, dual_out: Float[Array, "n_out k_out"]
     ) -> Float[Array, "k_out k_in"]:
-        """Returns the unfiltered functional map C_0 (k_out, k_in) of a pointwise map; see `encode`.
+        """Returns the functional map C_0 (k_out, k_in) of a pointwise map, without any filtering.
 
         **Arguments:**
 
@@ -254,19 +281,24 @@ class WaveletProblem(eqx.Module):
         return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
 
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
-        """Returns the energy of eq. (5): how badly functional maps preserve wavelets at all scales under T.
+        """Returns the wavelet-preservation energy, eq. (5) of the MWP paper, as a function of C.
 
-        The docstring of the module `jaxsmw.core.functional_map` states the formula, which holds for every
-        filter bank. Call the result with a functional map to get the energy of this map. `minimizer()` of the
-        result is the exact solution, also for frames that are not tight. The map C = 0 preserves nothing and
-        has the energy `constant`. In the pullback convention with the area norm, this constant is `sum_i
-        G_X(lambda_i)`, which is k_X for a Parseval frame.
+        For each functional map C, the energy sums over all scales and all vertices of X how far C is from
+        preserving the wavelets under the pointwise map T. The docstring of the module
+        `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
+
+        `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
+        also for frames that are not tight. The energy of C = 0 is the attribute `constant`. In the pullback
+        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, with the frame function G_X on
+        X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 
         - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
-        - `norm`: `"area"` to weight vertices by area, `"frobenius"` for equal weights, as in eq. (5) of the
-          paper.
+        - `norm`: `"area"` (the default) to weight the vertices of X by their areas; `"frobenius"` for equal
+          weights, as in eq. (5) of the paper.
+
+        **Returns:** A `QuadraticEnergy`.
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses
@@ -279,7 +311,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns w_x, a_x and b_x of the vertices of X: one row of the table at the top of this module."""
+        """Returns w_x, a_x and b_x of all vertices of X, which the table at the top of this module defines."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

@@ -22,19 +22,22 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class History(eqx.Module):
-    """A record of each iteration. Numbers are NaN for iterations that an early stop skipped.
+    """A record of the iterations of `refine`, which returns it if `history=True`.
+
+    Entries are NaN for iterations that an early stop skipped, except in `pointwise_maps`.
 
     **Attributes:**
 
-    - `changed`: (iterations,), the share of source vertices whose match changed. With samples, `changed` is
-      the share of samples. It is then NaN in the first and last iteration, which have no earlier map to
-      compare with.
-    - `energy`: (iterations,), `Refiner.energy` of the state and the pointwise map from which the state
-      follows; for `WaveletPreservation` the energy of eq. (5).
-    - `objective`: (iterations,), `Refiner.objective` of the state and the map recovered from the state.
-    - `pointwise_maps`: (iterations, m), the map recovered in each iteration. Skipped iterations repeat the
-      last map; a failure fills all entries with -1. None with samples, because the iterations then map only
-      the samples.
+    - `changed`: (iterations,), the share, from 0 to 1, of the vertices of X whose match changed in each
+      iteration. If the refinement uses samples, `changed` is the share of the samples of X. Its first and
+      last entries are then NaN, because these iterations have no earlier map of the same vertices.
+    - `energy`: (iterations,), the result of `Refiner.energy` for the state and for the pointwise map from
+      which the state was computed. For `WaveletPreservation`, this is the energy of eq. (5) of the MWP paper.
+    - `objective`: (iterations,), the result of `Refiner.objective` for the state and for the pointwise map
+      that was recovered from the state.
+    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Skipped
+      iterations repeat the final map. After a failure, all entries are -1. `pointwise_maps` is None if the
+      refinement uses samples, because the iterations then map only the samples.
     """
 
     changed: Float[Array, " iterations"]
@@ -48,12 +51,16 @@ class Refinement(eqx.Module):
 
     **Attributes:**
 
-    - `pointwise_map`: T: X -> Y (m,), one vertex of Y per vertex of X; all -1 after a failure.
-    - `functional_map`: the C (k_out, k_in) from which the pointwise map was recovered.
-    - `state`: the refiner's last state.
-    - `result`: a member of `RESULTS`; compare it with `RESULTS.successful`.
-    - `iterations`: the number of iterations done, fewer than requested after an early stop.
-    - `history`: a `History` if requested, else None.
+    - `pointwise_map`: the refined map T: X -> Y (m,), one vertex of Y per vertex of X; all entries are -1
+      after a failure.
+    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. C is a
+      pullback (k_X, k_Y) or a pushforward (k_Y, k_X), depending on the refiner.
+    - `state`: the final `State` of the refiner, which contains the functional map.
+    - `result`: a member of `RESULTS`. Compare it with `RESULTS.successful`; `RESULTS[result]` explains it in
+      words.
+    - `iterations`: the number of iterations that were run. An early stop makes it smaller than the requested
+      number.
+    - `history`: a `History` if it was requested, else None.
     """
 
     pointwise_map: Int32[Array, " m"]
@@ -64,7 +71,7 @@ class Refinement(eqx.Module):
 
     @property
     def functional_map(self) -> Float[Array, "*batch k_out k_in"]:
-        """The functional map of the last state."""
+        """The functional map of the final state."""
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
@@ -96,33 +103,40 @@ def refine(
     stop_when_unchanged: bool = False,
     history: bool = False,
 ) -> Refinement:
-    """Refine a pointwise map T: X -> Y by alternating functional and pointwise maps (Algorithm 1).
+    """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
-    The function is pure and jit-compiled. It is compiled again only when sizes or static settings change. For
-    many pairs of equal size use `jax.vmap`, or `jax.lax.map` if memory is scarce.
+    The loop is Algorithm 1 of the MWP paper, and it accepts any refiner. The function is pure and
+    jit-compiled. It is compiled again only when sizes or static settings change. For many pairs of equal
+    size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
+    `jaxsmw.refine_pairs`.
 
-    With samples, the first functional map is computed from all vertices, the iterations run on the samples,
-    and the last search is over all vertices. With `WaveletPreservation`, this is the MWP authors' fast
-    variant.
+    If samples are given, the first functional map is computed from all vertices. The iterations then match
+    only the samples, and the final search matches all vertices. With `WaveletPreservation`, this procedure is
+    the fast variant of the MWP authors.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_map`: the initial map T (m,), one vertex of Y per vertex of X.
-    - `refiner`: the method.
-    - `iterations`: the number of functional maps, each followed by its pointwise map; an integer, at least 1.
-    - `samples`: vertices of X (s_x,) and of Y (s_y,) on which to iterate. They should be evenly spread and
-      outnumber the eigenvectors.
-    - `partial`: whether one shape is a part of the other. Both shapes must then have the same unit of length.
-    - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. (Under `vmap`
-      every pair takes as long as the slowest pair, but has the same result as alone.)
-    - `history`: whether to record a `History`, which takes about a tenth more time.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
+    - `pointwise_map`: the initial map T, an integer array (m,) with one vertex of Y, from 0 to n - 1, per
+      vertex of X.
+    - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
+    - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
+      map and then a pointwise map.
+    - `samples`: a pair of integer arrays, the vertices of X (s_x,) and of Y (s_y,) on which to iterate. The
+      samples should be evenly spread and outnumber the eigenvectors. With None, all iterations use all
+      vertices.
+    - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
+      length.
+    - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
+      every pair takes as long as the slowest pair, but the result of a pair stays the same.
+    - `history`: whether to record a `History`. The record increases the run time by about 10 %.
 
-    **Returns:** A `Refinement`. Numerical failures raise no error: check the attribute `result`.
+    **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,), `functional_map` (k_out, k_in)
+    and `result`. Numerical failures raise no error, so compare `result` with `RESULTS.successful`.
 
-    **Raises:** `ValueError` for fewer than one iteration, an initial map that is not one vertex per vertex of
-    X, samples that are not a pair, or spectra of two float types; `TypeError` if `iterations` or the entries
-    of the initial map are not integers, or another argument has the wrong type.
+    **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
+    is not a pair, or the two spectra have different float types. `TypeError` if `iterations` or the entries
+    of the initial map are not integers, or if another argument has the wrong type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     pointwise_map = pointwise_map.astype(jnp.int32)
@@ -135,8 +149,8 @@ def refine(
     loop = _Loop(refiner, prepared, stop_when_unchanged, history, keeps_maps=history and samples is None)
     progress = loop.init(in_full, pointwise_map, first_map)
     if samples is None:
-        # The last search is an iteration of the same loop, because a search takes longer to compile than
-        # anything else.
+        # The loop also runs the last search. A second search outside the loop would have to be compiled
+        # separately, and a search takes longer to compile than any other part of the program.
         is_last = jnp.arange(iterations) == iterations - 1
         progress, records = lax.scan(loop.step, progress, is_last)
         refined = progress.pointwise_map
@@ -156,7 +170,7 @@ def refine(
 
 
 class _Progress(NamedTuple):
-    """The variables of the loop."""
+    """The variables of the refinement loop."""
 
     pointwise_map: Int32[Array, " s"]
     state: State
@@ -176,9 +190,10 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Returns the record of a loop on samples, extended by the last iteration, a search of all vertices.
+        """Returns the record of a loop on samples, extended by the final search of all vertices.
 
-        The first map of the samples and the last map of all vertices have no earlier map to compare with.
+        The first map of the samples and the final map of all vertices have no earlier map of the same
+        vertices. Their `changed` is therefore NaN.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -198,10 +213,11 @@ class _Record(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Loop:
-    """Algorithm 1 on one prepared problem: `init`, then `step` until `terminate`.
+    """Algorithm 1 of the MWP paper for one prepared problem.
 
-    A step searches for the pointwise map of the current state, then updates the state. The last step does not
-    update the state.
+    `init` computes the first state. Then each call of `step` runs one iteration, until `terminate` returns
+    True. A step searches for the pointwise map of the current state. Every step except the last step then
+    updates the state.
     """
 
     refiner: Refiner
@@ -213,10 +229,10 @@ class _Loop:
     def init(
         self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """Computes the first state, from the initial map of all vertices.
+        """Computes the first state from the initial map of all vertices.
 
-        `first_map` is compared with the map of the first iteration. It is the initial map or, with samples,
-        an array of -1.
+        The first iteration compares its map with `first_map` to count the changed matches. `first_map` is the
+        initial map or, if the loop runs on samples, an array of -1.
         """
         state, result = self.refiner.update(in_full, pointwise_map, None)
         return _Progress(
@@ -238,13 +254,16 @@ class _Loop:
         )
 
     def terminate(self, progress: _Progress) -> Bool[Array, ""]:
-        """Returns whether the last iteration is done."""
+        """Returns whether the loop has finished its last iteration."""
         return progress.finished
 
     def search(
         self, prepared: Prepared, state: State, before: Int32[Array, " s"]
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """Returns the pointwise map of a state, the share of matches that changed, and the objective."""
+        """Returns the pointwise map of a state, the share of changed matches, and the objective.
+
+        A match has changed if it differs from the map `before`.
+        """
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
         changed = jnp.sum((after != before) & mask) / jnp.sum(mask)
@@ -292,7 +311,9 @@ def _check_arguments(
     check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
-            raise ValueError("samples must be a pair: the sampled vertices of X and those of Y")
+            raise ValueError(
+                "samples must be a pair: give a tuple of the sampled vertices of X and the sampled vertices of Y"
+            )
         check_kind("samples of X", samples[0], np.ndarray, jax.Array)
         check_kind("samples of Y", samples[1], np.ndarray, jax.Array)
     if pointwise_map.shape != spectrum_x.mask.shape:
@@ -301,28 +322,32 @@ def _check_arguments(
             "give one vertex of Y for each vertex of X"
         )
     if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-        raise TypeError(f"the initial map has type {pointwise_map.dtype}; it must be integer vertex indices")
+        raise TypeError(
+            f"the initial map has type {pointwise_map.dtype}, but its entries must be integer vertex indices"
+        )
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
     """Checks that two spectra can be refined together.
 
-    **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the float types differ.
+    **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the spectra have different
+    float types.
     """
     check_kind("spectrum of X", spectrum_x, Spectrum)
     check_kind("spectrum of Y", spectrum_y, Spectrum)
     dtype_x, dtype_y = spectrum_x.eigenvectors.dtype, spectrum_y.eigenvectors.dtype
     if dtype_x != dtype_y:
         raise ValueError(
-            f"the spectrum of X is {dtype_x} and that of Y {dtype_y}: compute both with the same "
-            "jax_enable_x64"
+            f"the spectrum of X has type {dtype_x}, but the spectrum of Y has type {dtype_y}: compute both "
+            "spectra with the same jax_enable_x64"
         )
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Returns how an update ended: a failure that the update reports, or else a fault of its state.
+    """Returns the outcome of an update, as a member of `RESULTS`.
 
-    The faults of a state are NaN, infinity, and a functional map of zeros.
+    If the update reports a failure, the outcome is this failure. Otherwise the outcome depends on the state,
+    which must not contain NaN, infinity or a functional map of zeros.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -333,10 +358,17 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Returns how a refinement ended: a fault of the spectra or of the initial map, or else `result`.
+    """Returns the outcome of a refinement, as a member of `RESULTS`.
 
-    `matches` are the vertices of Y in the initial map, one or several per vertex of X (m, ...). They are None
-    if the initial map contains no vertex indices.
+    If the spectra contain numbers that are not finite, or the initial map is invalid, the outcome states this
+    fault. Otherwise the outcome is `result`.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+    - `matches`: the vertices of Y in the initial map, one or several per vertex of X (m, ...); None if the
+      initial map contains no vertex indices.
+    - `result`: the outcome of the refinement itself.
     """
     if matches is not None:
         vertices_y = spectrum_y.mask.shape[0]

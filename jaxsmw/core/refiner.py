@@ -15,17 +15,19 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 
 Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
-"""Vertices of X (s_x,) and of Y (s_y,) on which a refiner iterates instead of all vertices."""
+"""The indices of the samples of X (s_x,) and of Y (s_y,): the vertices on which a refiner iterates."""
 
 
 class Problem(eqx.Module):
-    """The shapes that a refiner matches.
+    """The two shapes that a refiner matches, and the vertices on which the refiner iterates.
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `samples`: the vertices on which the refiner iterates; None for all vertices.
-    - `partial`: whether one shape is a part of the other. Both shapes must then have the same unit of length.
+    - `spectrum_x`, `spectrum_y`: the spectra of source X (m vertices) and target Y (n vertices).
+    - `samples`: a pair of integer arrays, the sampled vertices of X (s_x,) and of Y (s_y,); None if the
+      refiner iterates on all vertices.
+    - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
+      length.
     """
 
     spectrum_x: Spectrum
@@ -36,7 +38,7 @@ class Problem(eqx.Module):
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
         """Returns the spectra of X and of Y at the vertices on which the refiner iterates.
 
-        These vertices are the samples, or all vertices if there are no samples.
+        If the problem has samples, the spectra contain only the samples. Otherwise they contain all vertices.
         """
         if self.samples is None:
             return self.spectrum_x, self.spectrum_y
@@ -46,12 +48,12 @@ class Problem(eqx.Module):
 class Prepared(eqx.Module):
     """The values that a refiner computes once per problem.
 
-    Refiners extend this class with their own fields.
+    Each refiner can define a subclass with further fields.
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the result of `Problem.query_spectra`. The pointwise map has one entry per
-      vertex of `spectrum_x`.
+    - `spectrum_x`, `spectrum_y`: the two spectra that `Problem.query_spectra` returns. Pointwise maps have
+      one entry per vertex of `spectrum_x`.
     """
 
     spectrum_x: Spectrum
@@ -61,18 +63,21 @@ class Prepared(eqx.Module):
 class State(eqx.Module):
     """The values that a refiner passes from one iteration to the next.
 
-    Refiners extend this class with their own fields.
+    Each refiner can define a subclass with further fields.
 
     **Attributes:**
 
-    - `functional_map`: C (k_out, k_in), in the refiner's convention.
+    - `functional_map`: C (k_out, k_in), in the convention that `Refiner.convention` returns.
     """
 
     functional_map: Float[Array, "k_out k_in"]
 
     @property
     def uncertainty(self) -> Float[Array, ""] | None:
-        """The uncertainty of the matches, a number; lower is better. None if the refiner has no estimate."""
+        """An estimate of the uncertainty of the matches, as a scalar array; lower is better.
+
+        The value is None if the refiner computes no such estimate.
+        """
         return None
 
 
@@ -81,15 +86,39 @@ StateT = TypeVar("StateT", bound=State)
 
 
 class Refiner(eqx.Module, Generic[PreparedT, StateT]):
-    """A method of refinement: the two half-steps between pointwise map and state.
+    """A method of refinement for `jaxsmw.refine`: the abstract base class of all refiners.
 
-    `jaxsmw.refine` calls `prepare` once (with samples, a second time for the samples). Then it calls `update`
-    and `recover` in each iteration.
+    Ready subclasses are `jaxsmw.WaveletPreservation`, `jaxsmw.FeatureRegression` and `jaxsmw.Registration`. A
+    refiner defines both half-steps of an iteration: `update` computes a state from a pointwise map, and
+    `recover` computes a pointwise map from a state. The state contains the functional map. `jaxsmw.refine`
+    calls `prepare` once for all vertices and, if there are samples, once more for the samples. It then calls
+    `update` and `recover` in each iteration. JAX traces all methods, so Python code in the methods must not
+    branch on the values of arrays.
+
+    A subclass is an equinox module. Below, m is the number of vertices of X to be matched, and n is the
+    number of vertices of Y.
+
+    **Methods that a subclass must define:**
+
+    - `prepare(problem)`: takes a `Problem` and returns a `Prepared`, the values that all iterations share.
+    - `update(prepared, pointwise_map, previous)`: takes a pointwise map X -> Y (m,) and the previous `State`
+      (None in the first iteration). It returns the next `State` and a member of `RESULTS`.
+    - `recover(prepared, state)`: returns the pointwise map X -> Y, an int32 array (m,).
+    - `recover_reverse(prepared, state)`: returns the reverse map Y -> X, an int32 array (n,).
+    - `energy(prepared, state, pointwise_map)`: returns a scalar array for `History.energy`.
+
+    **Methods that a subclass can override:** `embeddings`, `objective` and `is_settled`, and the properties
+    `levels` and `convention`.
     """
 
     @abc.abstractmethod
     def prepare(self, problem: Problem) -> PreparedT:
-        """Computes everything that stays the same in all iterations."""
+        """Returns the values that stay the same in all iterations, as a `Prepared`.
+
+        **Arguments:**
+
+        - `problem`: both spectra, the samples if there are any, and whether the pair is partial.
+        """
 
     @abc.abstractmethod
     def update(
@@ -100,7 +129,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         **Arguments:**
 
         - `prepared`: the result of `prepare`.
-        - `pointwise_map`: T: X -> Y, one entry per vertex of `prepared.spectrum_x`.
+        - `pointwise_map`: T: X -> Y, one vertex of Y per vertex of `prepared.spectrum_x`.
         - `previous`: the state from which the pointwise map was recovered; None in the first iteration.
         """
 
@@ -108,27 +137,27 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
         """Returns the pointwise map X -> Y that follows from a state.
 
-        The map has one entry per vertex of `prepared.spectrum_x`. `update` must accept this map with the same
-        `prepared`.
+        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. `update` must accept this map
+        together with the same `prepared`.
         """
 
     @abc.abstractmethod
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
         """Returns the reverse map Y -> X that follows from a state, (n,).
 
-        The map assigns to each vertex of Y the nearest vertex of X. The search compares the `embeddings` of X
-        and Y. `prepared` must belong to a problem without samples.
+        The map assigns to each vertex of Y the vertex of X that is nearest in the `embeddings`. `prepared`
+        must belong to a problem without samples.
         """
 
     @abc.abstractmethod
     def energy(self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """Returns the quantity that the method minimises, a number for `History.energy`.
+        """Returns the quantity that the method minimises, as a scalar array for `History.energy`.
 
         **Arguments:**
 
         - `prepared`: the result of `prepare`.
-        - `state`: the state that follows from the pointwise map.
-        - `pointwise_map`: T: X -> Y, one entry per vertex of `prepared.spectrum_x`.
+        - `state`: the state that `update` computed from the pointwise map.
+        - `pointwise_map`: T: X -> Y, one vertex of Y per vertex of `prepared.spectrum_x`.
         """
 
     def embeddings(
@@ -136,17 +165,20 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """Returns two point sets in which each vertex of X is close to its match on Y.
 
-        `jaxsmw.Correspondence.surface_points` finds points between the vertices of Y in this space.
+        `jaxsmw.Correspondence.surface_points` searches the triangles of Y in these embeddings for the nearest
+        point to each vertex of X.
 
-        **Returns:** One row per vertex of X to be matched (m, d), and one row per vertex of Y (n, d), in the
-        units of the method.
+        **Returns:** One point per vertex of X to be matched (m, d), and one point per vertex of Y (n, d).
+        Each refiner chooses the dimension d and the unit, which is the same for both point sets.
         """
         return spectral_embeddings(state.functional_map, prepared.spectrum_x, prepared.spectrum_y)
 
     def objective(
         self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the area-weighted mean squared distance between matched embeddings, for the history.
+        """Returns the area-weighted mean squared distance between matched embeddings, a scalar array.
+
+        `jaxsmw.refine` stores this value in `History.objective`.
 
         **Arguments:**
 
@@ -159,18 +191,23 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether a map that one iteration leaves unchanged also stays unchanged in later iterations.
+        """Returns whether all later iterations use the same settings as this iteration.
 
-        The result is False while the refiner changes its settings between iterations.
+        If the settings stay the same, a map that one iteration leaves unchanged also stays unchanged in all
+        later iterations. The default is True.
         """
         return jnp.asarray(True)
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """The number of eigenvectors in each iteration; empty if the refiner always uses all of them."""
+        """The number of eigenvectors in each iteration; empty if every iteration uses all eigenvectors."""
         return ()
 
     @property
     def convention(self) -> Convention:
-        """The direction of the functional map: `"pullback"` or `"pushforward"`."""
+        """The direction of the functional map, `"pullback"` (the default) or `"pushforward"`.
+
+        A pullback (k_X, k_Y) takes functions on Y to functions on X. A pushforward (k_Y, k_X) takes functions
+        on X to functions on Y.
+        """
         return "pullback"

@@ -1,4 +1,4 @@
-"""The outcomes of computations, as values that work under jit and vmap, with a sentence for each outcome."""
+"""The status codes of computations, which work under `jax.jit` and `jax.vmap`, with a sentence for each code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ from jaxtyping import Array, Bool
 
 
 class RESULTS(eqx.Enumeration):
-    """The outcome of a refinement. `RESULTS[result]` is a sentence for the user."""
+    """The status code of a refinement, as a value that compiled code can return.
+
+    Compare a status code `result` with a member: `result == RESULTS.successful`. `RESULTS[result]` is a
+    sentence that explains the status and suggests remedies. The members are `successful`,
+    `nonfinite_spectrum`, `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`,
+    `singular_system`, `fixed_point_not_reached` and `solver_not_converged`.
+    """
 
     successful = "The refinement succeeded: all numbers are finite."
     nonfinite_spectrum = (
@@ -16,40 +22,40 @@ class RESULTS(eqx.Enumeration):
     )
     invalid_initial_map = (
         "The initial map contains vertices of Y that do not exist or are masked, so no map was refined. Give "
-        "one index from 0 to n - 1 for each vertex of X."
+        "one index from 0 to n - 1 for each vertex of X, where n is the number of vertices of Y."
     )
     nonfinite_functional_map = (
         "The functional map became NaN or infinite. Check the responses of the filter bank, the weights, the "
-        "descriptors, and the temperature of soft maps, which must be positive. In float32 numbers can "
-        "overflow: scale the surfaces to area 1, or use float64. The least-squares pseudo-inverse needs at "
-        "least as many samples as eigenvectors, at vertices where the eigenvectors are linearly independent."
+        "descriptors, and the temperature of soft maps, which must be positive. Numbers can overflow in "
+        "float32: scale the surfaces to area 1, or use float64. With samples, use at least as many samples as "
+        "eigenvectors, and spread the samples so that the eigenvectors are linearly independent on them."
     )
     undetermined_functional_map = (
-        "A part of the functional map is undetermined to working precision. With wavelets, the frame "
-        "function of the filter bank vanishes at an eigenvalue: use a filter bank that covers the whole "
-        "spectrum (usually the lowest band is missing, which a low-pass filter adds, or the highest band). "
-        "Without wavelets, the descriptors do not determine the map: use descriptors of zero mean and "
-        "similar size. In both cases fewer eigenvectors, float64 or solution=Filtering(), which solves no "
-        "system, may help."
+        "A part of the functional map is undetermined to working precision. If the solution uses wavelets, "
+        "all filters of the bank vanish at some eigenvalue: use a filter bank that covers the whole spectrum. "
+        "Usually the lowest band is missing, which a low-pass filter adds, or the highest band. If the "
+        "solution uses only descriptors, the descriptors do not determine the map: use descriptors of zero "
+        "mean and similar size. In both cases it may help to use fewer eigenvectors, float64, or "
+        "solution=Filtering(), which solves no linear system."
     )
     singular_system = (
         "The least-squares problem for the functional map is singular to working precision: the pointwise "
-        "map reaches too few vertices of Y to tell the eigenvectors apart. Use a better initial map, more "
-        "samples, fewer eigenvectors, float64, or solution=Filtering(), which solves no system."
+        "map reaches too few vertices of Y to distinguish all eigenvectors. Use a better initial map, more "
+        "samples, fewer eigenvectors, float64, or solution=Filtering(), which solves no linear system."
     )
     fixed_point_not_reached = (
         "The soft refinement did not reach a fixed point, so its implicit derivatives are unreliable. Use "
         "more iterations, a larger tolerance or a higher temperature, or differentiate through the "
-        "iterations."
+        "iterations instead."
     )
     solver_not_converged = (
-        "The iterative solver for the functional map did not reach its tolerance. Use more max_steps, a "
+        "The iterative solver for the functional map did not reach its tolerance. Use a larger max_steps, a "
         "larger tolerance, float64, or smaller weights for orthogonality and commutativity."
     )
 
 
 def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
-    """Returns one of two results, depending on a condition.
+    """Returns the status code `if_true` where the condition is True, and `if_false` where it is False.
 
     The annotations include `str` because type checkers treat the members of an Enumeration as strings.
     """
@@ -57,5 +63,5 @@ def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: R
 
 
 def sentence(result: RESULTS) -> str:
-    """Returns the sentence that explains a result to the user."""
+    """Returns the sentence that explains a status code to the user."""
     return RESULTS[result]  # type: ignore[misc]

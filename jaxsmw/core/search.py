@@ -1,4 +1,8 @@
-"""Exact nearest-neighbour search, exhaustive or by patches. Most patches can be skipped."""
+"""Exact nearest-neighbour search.
+
+An exhaustive search compares all queries with all database points. A search in patches skips most patches of
+the database.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +20,18 @@ from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
 from jaxsmw.core.products import product
 
-# The number of queries per block, and the number of database rows per chunk, measured on two CPU cores with
-# scripts/benchmark_speed.py. The scores of a block must fit into the cache. A maximum over a chunk is
-# vectorised, but an argmax is not.
+# BLOCK is the number of queries per block, and _CHUNK is the number of database rows per chunk. Both sizes
+# were chosen by measurements with scripts/benchmark_speed.py on two CPU cores. The scores of a block must fit
+# into the cache. Chunks are useful because XLA vectorises a maximum over a chunk, but not an argmax.
 BLOCK = 128
 _CHUNK = 64
-# Maxima over chunks are computed in runs of the first length, and maxima over boxes in the second number of
-# parts.
+# A maximum over a chunk is computed from runs of _RUN rows. A minimum over all boxes is computed from _PARTS
+# parts. Both computations use `_maximum`.
 _RUN, _PARTS = 8, 16
-# The number of coordinates in which patches are compact, and the number of power iterations after which the
-# `variations` of patches have nearly converged.
+# Patches are compact in the first _COORDINATES coordinates of the points. The `variations` of patches have
+# nearly converged after _POWER_ITERATIONS power iterations.
 _COORDINATES, _POWER_ITERATIONS = 6, 4
-# The number of patches that one step of the search compares with a block, by one matrix product.
+# One step of the search compares a block of queries with _GROUP patches, by one matrix product.
 _GROUP = 4
 
 
@@ -37,22 +41,25 @@ def nearest_neighbor(
     *,
     database_mask: Bool[Array, " n"] | None = None,
 ) -> Int32[Array, " m"]:
-    """Returns the index of the database row that is nearest to each query, exactly, in Euclidean distance.
+    """Returns the index of the database row that is nearest to each query in Euclidean distance.
 
-    Ties go to the lowest index. The queries are processed in blocks, so no array of size m x n is stored.
-    Within a block, the search first finds the best score in every chunk of database rows. Then it finds the
-    best row in each of the two best chunks. The true distances decide between these two rows. The search
-    takes little longer than the matrix product that computes the scores. (The scores `q·b - |b|²/2` lose
-    digits if `|b|` is large compared to the distance. In float32 the second candidate makes the result agree
-    with an exact search.)
+    The search is exhaustive and exact. If several rows are equally near, the result is the lowest index. The
+    queries are processed in blocks, so no array of size m x n is stored.
+
+    The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the nearest row. The
+    search first finds the best score in every chunk of database rows. Then it finds the best row in each of
+    the two best chunks. Finally, the distances from the query decide between these two rows. The search takes
+    little longer than the matrix product that computes the scores. Scores lose digits if `|b|` is large
+    compared to the distance. In float32 the comparison of two rows makes the result agree with an exact
+    search.
 
     **Arguments:**
 
-    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
-    - `database_mask`: False for rows that are never chosen (n,). If all entries are False, the result is
-      meaningless.
+    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
+    - `database_mask`: a Boolean array (n,), False for rows that are never chosen. None allows all rows. If
+      all entries are False, the result is meaningless.
 
-    **Returns:** One index from 0 to n - 1 per query, (m,).
+    **Returns:** One index from 0 to n - 1 per query, an int32 array (m,).
     """
     n = database.shape[0]
     chunks = -(-n // _CHUNK)
@@ -64,7 +71,8 @@ def nearest_neighbor(
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         products = product(rows, block.T)
-        # With the queries last, maxima over chunks are computed for several neighbouring queries at once.
+        # The queries are on the last axis, so XLA computes maxima over chunks for several neighbouring
+        # queries at once.
         scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, BLOCK)
         chunk_scores = _maximum(scores, 1, _CHUNK // _RUN)
         best_chunks = _two_best(chunk_scores)
@@ -83,8 +91,8 @@ def in_blocks(
 ) -> Shaped[Array, "m ..."]:
     """Returns the results of `search` for all queries, one row per query (m, ...).
 
-    The function `search` gets blocks (size, d) of queries, one after another. The last block is padded with
-    zeros.
+    The function `search` is called for one block (size, d) of queries after another. The last block is padded
+    with rows of zeros.
     """
     m, d = queries.shape
     blocks = -(-m // size)
@@ -96,7 +104,8 @@ def in_blocks(
 def _maximum(values: Array, axis: int, parts: int) -> Array:
     """Returns the maximum along an axis.
 
-    The axis is first folded into parts, which may overlap. Folding saves a tenth of the time on CPUs.
+    The axis is first divided into parts, which may overlap. The elementwise maximum of the parts is then
+    reduced to one number. This order of operations reduces the time of a search on CPUs by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -119,7 +128,11 @@ def _nearest(
     masked: Bool[Array, "c block"],
     n: int,
 ) -> Int[Array, " block"]:
-    """Returns the row of the candidate nearest to each query: the lowest row in a tie, n if all are NaN."""
+    """Returns the database row of the candidate that is nearest to each query.
+
+    If several candidates are equally near, the result is the lowest row. If all distances are NaN, the result
+    is n.
+    """
     distances = jnp.sum((queries[None, :, :] - candidates) ** 2, axis=2)
     distances = jnp.where(masked, jnp.inf, distances)
     nearest = jnp.min(distances, axis=0, keepdims=True)
@@ -129,15 +142,17 @@ def _nearest(
 class Patches(eqx.Module):
     """Groups of nearby points. All groups have the same size.
 
-    In the spectral embedding of a surface, a patch of neighbouring vertices varies along few directions. The
-    reason is that eigenfunctions are smooth, and that the patch is small compared to their wavelengths.
+    In the spectral embedding of a surface, a patch of neighbouring vertices varies mainly along a few
+    directions. The reason is that eigenfunctions are smooth, and that the patch is small compared to their
+    wavelengths.
 
     **Attributes:**
 
-    - `rows`: (p, s), the indices of the points of each patch, ascending, with padding at the end.
-    - `mask`: (p, s), False for padding and for masked points.
-    - `variations`: (p, r, s), linear combinations of the points of a patch. They give the r directions in
-      which the patch varies most.
+    - `rows`: (p, s), the indices of the s points of each of the p patches, in ascending order, with padding
+      at the end.
+    - `mask`: (p, s), False for padding and for masked points, True for all other points.
+    - `variations`: (p, r, s), the coefficients of r linear combinations of the points of each patch. These
+      combinations are the r directions in which the patch varies most.
     """
 
     rows: Int32[Array, "p s"]
@@ -146,19 +161,22 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Divides points into patches by repeatedly halving all groups along the coordinate of largest variance.
+    """Divides points into patches of equal size by repeatedly halving all groups of points.
 
-    Only the first 6 coordinates of the points are used.
+    Each group is divided along its coordinate of largest variance. Only the first 6 coordinates of the points
+    are used.
 
     **Arguments:**
 
-    - `points`: the points (n, d). For surfaces these are the eigenvectors, whose first columns are
-      coordinates along the body.
-    - `mask`: False for points to be ignored (n,).
-    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times this number.
-    - `rank`: the number r of `variations`. Patches of queries need no variations, so their rank is 0.
+    - `points`: the points (n, d). For a surface, they are the rows of its eigenvectors, whose first columns
+      are coordinates along the body.
+    - `mask`: a Boolean array (n,), False for points that are ignored.
+    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times the desired
+      number.
+    - `rank`: the number r of `variations` per patch. Patches of queries need no variations, so their rank is
+      0.
 
-    **Returns:** The `Patches`, as many as a power of two.
+    **Returns:** The `Patches`. The number of patches is a power of two.
     """
     n = points.shape[0]
     levels = max(0, round(math.log2(n / size)))
@@ -168,7 +186,8 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
         jnp.pad(points[:, :_COORDINATES], ((0, total - n), (0, 0))), jnp.pad(mask, (0, total - n)), levels
     )
     valid = jnp.pad(mask, (0, total - n))[rows]
-    # With ascending rows, the first of several equal candidates has the lowest index. Padding comes last.
+    # The rows of a patch are sorted, so the first of several equally near candidates has the lowest index.
+    # Padding comes last.
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     if rank == 0:
@@ -179,7 +198,10 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
 def _halved(
     coordinates: Float[Array, "total c"], mask: Bool[Array, " total"], levels: int
 ) -> Int32[Array, " total"]:
-    """Returns an order of the points. Each of its 2^levels equal parts is a patch."""
+    """Returns the indices of all points, ordered by patch.
+
+    Each of the 2^levels equal parts of this array contains the points of one patch.
+    """
     total, dtype = coordinates.shape[0], coordinates.dtype
 
     def halve(level: Int[Array, ""], rows: Int32[Array, " total"]) -> Int32[Array, " total"]:
@@ -196,19 +218,20 @@ def _halved(
         _, _, ordered = lax.sort([group, jnp.where(valid, along, jnp.inf), rows], num_keys=2)
         return ordered
 
-    # The loop compiles one sort for any number of levels.
+    # A `fori_loop` compiles only one sort, whatever the number of levels.
     return lax.fori_loop(0, levels, halve, jnp.arange(total, dtype=jnp.int32))
 
 
 def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: int) -> Float[Array, "p r s"]:
-    """Returns the `variations` of patches by power iteration."""
+    """Returns the `variations` (p, r, s) of patches, by power iteration."""
     _, deviations = _centered(points, mask)
     products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 
     def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The first eigenvector of a surface is constant and does not distinguish points, so it comes last.
+    # The first eigenvector of a surface is constant and does not distinguish points. Its column is therefore
+    # the last choice for the start of the power iteration.
     _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
     return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)
@@ -217,14 +240,17 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
 def _centered(
     points: Float[Array, "p s d"], mask: Bool[Array, "p s"]
 ) -> tuple[Float[Array, "p d"], Float[Array, "p s d"]]:
-    """Returns the mean of each group, and the deviations of its points from the mean, zero where masked."""
+    """Returns the mean of the points of each group, and the deviations of the points from this mean.
+
+    The deviations of masked points are zero.
+    """
     counts = jnp.maximum(jnp.sum(mask, axis=1), 1).astype(points.dtype)
     center = jnp.sum(jnp.where(mask[..., None], points, 0), axis=1) / counts[:, None]
     return center, jnp.where(mask[..., None], points - center[:, None, :], 0)
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """Returns orthonormal vectors for each group, whose span contains the given vectors."""
+    """Returns orthonormal vectors for each group. Their span contains the given vectors of the group."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -234,20 +260,21 @@ def nearest_neighbor_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> Int32[Array, " m"]:
-    """Returns the same rows as `nearest_neighbor`, in less time if patches describe the points well.
+    """Returns the same indices as `nearest_neighbor`, but skips patches that are too far away.
 
-    Each patch of the database has a bounding box: r axes through the centre of the patch, and the largest
-    distance of its points from the space that the axes span. The box gives a lower bound on the distance from
-    a query to all points of the patch, at the cost of r + 1 products. The patch with the smallest bound gives
-    a first candidate. Then the search skips all patches that cannot contain a nearer point for any query of a
-    patch of queries. The bounds allow for rounding, so the result is exact. If the points are spread evenly
-    in all dimensions, no patch is skipped, and `nearest_neighbor` is faster.
+    Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
+    has a radius: the largest distance of the patch's points from the space that the axes span. The box gives
+    a lower bound on the distance from a query to all points of the patch, at the cost of r + 1 scalar
+    products. For each query, the patch with the nearest box gives a first candidate. The search then skips a
+    patch if it cannot contain a nearer point for any query in a patch of queries. The bounds allow for
+    rounding, so the search is exact. If the points are spread evenly in all dimensions, the search skips no
+    patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
-    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
-    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points from
-      which these points follow by a linear map. Masked points of the database are never chosen. The results
+    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
+    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points of
+      which these points are a linear function. Masked points of the database are never chosen. The results
       for masked queries are meaningless.
 
     **Returns:** One index from 0 to n - 1 per query, (m,).
@@ -264,7 +291,8 @@ def search_in_patches(
 ) -> tuple[Int32[Array, " m"], Int32[Array, " p"]]:
     """Returns the result of `nearest_neighbor_in_patches` (m,), and the numbers of searched patches (p,).
 
-    There is one number of searched patches of the database for each patch of queries.
+    For each of the p patches of queries, the second array contains the number of database patches that were
+    searched.
     """
     queries, database = lax.stop_gradient((queries, database))  # indices have no derivatives
     boxes = _boxes(database, database_patches)
@@ -294,10 +322,11 @@ def nearest_vertices(
     database_mask: Bool[Array, " n"],
     patches: tuple[Patches, Patches] | None,
 ) -> Int32[Array, " m"]:
-    """Returns the database row nearest to each query, (m,).
+    """Returns the index of the database row that is nearest to each query, (m,).
 
-    The search uses `patches`, the `make_patches` of the queries and of the database. If they are None, the
-    search is exhaustive. `database_mask` (n,) is False for rows that an exhaustive search never chooses.
+    `patches` contains the patches of the queries and the patches of the database, as returned by
+    `make_patches`. If `patches` is None, the search is exhaustive. An exhaustive search never chooses rows
+    for which `database_mask` (n,) is False.
     """
     if patches is None:
         return nearest_neighbor(queries, database, database_mask=database_mask)
@@ -305,10 +334,11 @@ def nearest_vertices(
 
 
 class _Boxes(NamedTuple):
-    """The location of each patch: within `radius` of a box along orthonormal `axes` through its `center`.
+    """The bounding boxes of all patches.
 
-    `local` holds the coordinates of the points along the axes; `low` and `high` are the ranges of these
-    coordinates. `counts` is False for patches without points.
+    The points of a patch are within `radius` of a box with orthonormal `axes` through the `center` of the
+    patch. `local` contains the coordinates of the points along the axes. `low` and `high` are the smallest
+    and the largest of these coordinates along each axis. `counts` is False for patches without points.
     """
 
     points: Float[Array, "p s d"]
@@ -338,7 +368,8 @@ def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
 class _BoundTables(NamedTuple):
     """The boxes of all patches, arranged so that one matrix product gives all bounds.
 
-    `axes` holds the first axes of all patches, then their second axes and so on, and the centers last.
+    `axes` contains the first axes of all patches, then the second axes of all patches, and so on. Its last
+    rows are the centres of the patches.
     """
 
     axes: Float[Array, "rows d"]
@@ -357,7 +388,8 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
     center_norms = jnp.sum(boxes.center**2, axis=1)
     low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # A bound consists of sums of d products and about a dozen further operations. Each operation rounds.
+    # The computation of a bound contains sums of d products and about 12 further operations. Each operation
+    # rounds its result.
     precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
     return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
 
@@ -365,17 +397,19 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
 def _bounds(
     tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Returns the distances from each query of a block to each patch.
+    """Returns squared distances to boxes, lower bounds on distances, and coordinates of queries.
 
-    **Returns:** The squared distances to the boxes without their radius, lower bounds on the distances to the
-    points, and the coordinates of the queries along each axis.
+    **Returns:** Three values for all patches and all queries of a block. The first value is an array of the
+    squared distances from the queries to the boxes without their radii. The second value is an array of lower
+    bounds on the distances from the queries to the points of the patches. The third value is a list of the
+    coordinates of the queries along each axis.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
     norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
     squared = norms - 2 * products[rank * patches :]
     along = []
-    for i in range(rank):  # XLA does not vectorise a sum over an axis of an array
+    for i in range(rank):  # XLA would not vectorise a sum over an axis of an array
         along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
         outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
         squared = squared + (outside**2 - along[i] ** 2)
@@ -390,12 +424,12 @@ def _distance_to_promising_patch(
     squared: Float[Array, "p block"],
     along: list[Float[Array, "p block"]],
 ) -> Float[Array, " block"]:
-    """Returns the distance from each query to one point of the nearest box.
+    """Returns the distance from each query to one point of the patch with the nearest box.
 
-    The point is nearest in the coordinates along the axes of the box.
+    Among the points of this patch, the chosen point has the nearest coordinates along the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
-    # Finding the smallest value and then its position takes a third of the time of argmin.
+    # Finding the smallest value first and its position second takes a third of the time that argmin takes.
     smallest = -_maximum(-squared, 0, _PARTS)
     is_smallest = squared == smallest[None, :]
     promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)
@@ -407,7 +441,11 @@ def _distance_to_promising_patch(
 
 
 class _Found(NamedTuple):
-    """The two best candidates so far, from different patches: scores, and rows of the flattened patches."""
+    """The two best candidates found so far for each query, which are in different patches.
+
+    `rows` contains the indices of the candidates in the flattened points of all patches. `scores` contains
+    their scores.
+    """
 
     step: Int32[Array, ""]
     scores: Float[Array, "2 block"]
@@ -417,9 +455,12 @@ class _Found(NamedTuple):
 def _two_best_rows(
     boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
-    """Searches the needed patches, a few at a time, for two candidates per query from different patches.
+    """Searches the needed patches for the two best candidates of each query, in different patches.
 
-    **Returns:** Rows of the flattened patches, and whether a candidate is masked or missing.
+    Each step of the search compares the queries with a few patches.
+
+    **Returns:** The indices of the candidates in the flattened points of all patches, and a Boolean array
+    that is True for masked or missing candidates.
     """
     patches, size, d = boxes.points.shape
     each = jnp.arange(block.shape[0])

@@ -1,8 +1,8 @@
-"""Soft maps: each point corresponds to several points, with differentiable shares of its area.
+"""Soft maps, which match each query point to several database points with differentiable shares.
 
-A `Recovery` computes a soft map from two point sets. `Softmax` uses the distances alone. `NearestFew` uses
-the distances to the nearest points only. With `Sinkhorn`, every point also receives the share that its area
-implies.
+A `Recovery` computes a soft map from two point sets. `Softmax` computes the shares of a query from its
+distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` also
+ensures that every database point receives as much area as it has.
 """
 
 from __future__ import annotations
@@ -21,29 +21,35 @@ from jaxsmw.core.checks import as_parameter, check_between
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
-# The number of queries per block. Distances from one block to all database rows are in memory at once.
+# Queries are processed in blocks of this size. The distances from one block to all database rows are in
+# memory at the same time.
 _BLOCK = 128
 
 
 class SoftMap(eqx.Module):
-    """A transport plan between two point sets: the part of each query's area that goes to each database row.
+    """A soft map from m query points to n database points, in the form of a transport plan.
 
-    The plan is `P_ij = a_i w_ij / sum_j w_ij` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. The
-    matrix P is never stored as a whole. Its rows sum to the areas of the queries exactly. Its columns sum to
-    the areas of the database rows up to the `residual`.
+    The plan P (m, n) contains the part of each query's area that is sent to each database row. For query i
+    and database row j, `P_ij = a_i w_ij / sum_k w_ik` with `w_ij = b_j exp(g_j - |q_i - y_j|² /
+    temperature)`. The share of row j in query i is `w_ij / sum_k w_ik`. The matrix P is never stored as a
+    whole. Its rows sum to the areas of the queries exactly. Its columns sum to the areas of the database rows
+    up to the `residual`.
+
+    `refine_softly`, `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps. For maps between shapes, the
+    queries are the vertices of X, and the database rows are the vertices of Y.
 
     **Attributes:**
 
-    - `queries`, `database`: the points q (m, d) and y (n, d), up to a common shift.
-    - `query_areas`, `database_areas`: a (m,) and b (n,), each with sum 1, zero for ignored points. A query of
-      zero area still gets the shares that its position implies.
-    - `potentials`: g (n,), without unit. A high potential raises the share of a row. Zero for rows of zero
-      area.
-    - `temperature`: the temperature, in squared units of the points.
-    - `residual`: the share of the total area, from 0 to 1, that rows receive in excess of their own area. NaN
-      if the residual was not computed (`Softmax`).
-    - `converged`: whether the residual is at most the tolerance. False if the residual is NaN.
-    - `iterations`: the number of iterations of `sinkhorn` that were done.
+    - `queries`, `database`: the points q (m, d) and y (n, d). Both point sets are shifted by the same vector.
+    - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. The area is zero for
+      ignored points. A query of zero area still gets the shares that its position implies.
+    - `potentials`: g (n,), without unit. A higher potential increases the share of a row. The potentials are
+      zero for rows of zero area, and for all rows of a map from `Softmax`.
+    - `temperature`: the temperature, a scalar array in squared units of the points.
+    - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
+      areas. It is NaN for a map from `Softmax`, which does not compute the residual.
+    - `converged`: whether the residual is at most the tolerance of `sinkhorn`; False if the residual is NaN.
+    - `iterations`: the number of iterations that `sinkhorn` ran; 0 for a map from `Softmax`.
     """
 
     queries: Float[Array, "m d"]
@@ -58,7 +64,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y, such as colours, over the shares of each query.
+        """Returns the mean of functions on Y, such as colours, weighted with the shares of each query.
 
         **Arguments:**
 
@@ -66,12 +72,13 @@ class SoftMap(eqx.Module):
 
         **Returns:** The values of the p functions at the queries (m, p), in the same unit.
 
-        **Raises:** `ValueError` if the values are not of shape (n, p).
+        **Raises:** `ValueError` if the values do not have shape (n, p).
         """
         functions = jnp.asarray(functions_on_y, self.database.dtype)
         if functions.ndim != 2 or functions.shape[0] != self.database.shape[0]:
             raise ValueError(
-                f"functions on Y have shape {functions.shape}, where ({self.database.shape[0]}, p) is needed"
+                f"functions on Y have shape {functions.shape}, but ({self.database.shape[0]}, p) is needed: give "
+                "one row for each vertex of Y"
             )
         weights = _log(self.database_areas) + self.potentials
 
@@ -83,9 +90,10 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the most probable database row of each query (m,): the row with the largest share per area.
+        """Returns the database row with the largest share per area for each query, (m,).
 
-        (The largest share itself would favour the larger of two neighbouring vertices.)
+        The share of a row is divided by the area of the row. Otherwise the result would favour the larger of
+        two neighbouring vertices.
         """
         everywhere = jnp.where(self.database_areas > 0, self.potentials, -jnp.inf)
 
@@ -97,11 +105,13 @@ class SoftMap(eqx.Module):
 
 
 class SparseSoftMap(eqx.Module):
-    """A soft map with a few database rows per query.
+    """A soft map from m query points to n database points, with t database rows per query.
+
+    All other database rows have share zero. `NearestFew` returns such maps.
 
     **Attributes:**
 
-    - `rows`: (m, t), the t database rows of each query, nearest first.
+    - `rows`: (m, t), the indices of the t database rows of each query, nearest first.
     - `shares`: (m, t), the shares of these database rows. The shares of each query sum to 1.
     """
 
@@ -109,7 +119,7 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y, such as colours, over the shares of each query.
+        """Returns the mean of functions on Y, such as colours, weighted with the shares of each query.
 
         **Arguments:**
 
@@ -121,8 +131,12 @@ class SparseSoftMap(eqx.Module):
         """
         functions = jnp.asarray(functions_on_y, self.shares.dtype)
         if functions.ndim != 2:
-            raise ValueError(f"functions on Y have shape {functions.shape}, where (n, p) is needed")
-        # The rows are processed one by one, because all rows at once would need t times the memory.
+            raise ValueError(
+                f"functions on Y have shape {functions.shape}, but (n, p) is needed: give one row for each "
+                "vertex of Y"
+            )
+        # The t rows of a query are processed one after another, because all t rows together would need t times
+        # the memory.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
@@ -132,18 +146,41 @@ class SparseSoftMap(eqx.Module):
 
 
 PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
-"""T: X -> Y, one vertex of Y per vertex of X, or a soft map from X to Y."""
+"""A map T: X -> Y: either one vertex of Y per vertex of X, an integer array (m,), or a soft map."""
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Returns functions on Y (n, p) as functions on X (m, p), `P f`, without storing the matrix P (m, n)."""
+    """Returns functions on Y as functions on X, by a pointwise map or a soft map from X to Y.
+
+    A pointwise map assigns to each vertex of X the value at its match. A soft map assigns the mean of the
+    values, weighted with the shares of the vertex. In matrix form the result is `P f`, but the matrix P (m,
+    n) is not stored.
+
+    **Arguments:**
+
+    - `pointwise_map`: an integer array (m,) with one vertex of Y per vertex of X, or a `SoftMap`, or a
+      `SparseSoftMap`.
+    - `functions_on_y`: the values of p functions at the vertices of Y (n, p), in any unit.
+
+    **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
+
+    **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
+    """
     if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):
         return pointwise_map.pull_back(functions_on_y)
     return functions_on_y[pointwise_map]
 
 
 class Recovery(eqx.Module):
-    """A way to compute a soft map from the distances between two point sets."""
+    """A method that computes a soft map from the distances between two point sets.
+
+    This class is the abstract base class of recoveries, which `refine_softly` uses to compute soft maps from
+    functional maps. Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
+
+    A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
+    The arguments are query points (m, d), database points (n, d), and the areas of both, (m,) and (n,). The
+    result is a `SoftMap` or a `SparseSoftMap` from the queries to the database.
+    """
 
     @abc.abstractmethod
     def __call__(
@@ -153,23 +190,29 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """Returns the soft map from the queries to the database. Rows of zero area get no share.
+        """Returns the soft map from the queries to the database. Database rows of zero area get no share.
 
         **Arguments:**
 
-        - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
+        - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same
+          unit.
         - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit.
         """
 
 
 class Softmax(Recovery):
-    """Soft maps with shares proportional to the area of a row times `exp(-distance² / temperature)`.
+    """A recovery in which all database rows get shares, and nearer rows get larger shares.
+
+    The share of a database row is proportional to its area times `exp(-distance² / temperature)`. Here
+    `distance` is the distance between the query and the row. The soft map is a `SoftMap`.
 
     **Arguments:**
 
-    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
+    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
+      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
+      sharper maps.
 
-    **Raises:** `ValueError` if the temperature is not one positive, finite number.
+    **Raises:** `ValueError` if the temperature is not a single positive, finite number.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -184,7 +227,7 @@ class Softmax(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """See `Recovery`."""
+        """Returns the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
@@ -192,17 +235,22 @@ class Softmax(Recovery):
 
 
 class NearestFew(Recovery):
-    """`Softmax` restricted to the nearest rows of each query. The choice of these rows is not differentiated.
+    """A recovery like `Softmax`, in which only the nearest database rows of each query get shares.
 
-    `NearestFew` is fast in float32. In float64, sorting takes most of the time on CPUs.
+    The share of each of these rows is proportional to its area times `exp(-distance² / temperature)`. The
+    shares are differentiable, but derivatives treat the choice of the rows as constant. The soft map is a
+    `SparseSoftMap`. `NearestFew` is fast in float32. In float64, sorting takes most of the time on CPUs.
 
     **Arguments:**
 
-    - `number`: the number of rows per query, at least 1. If fewer rows have positive area, the other shares
-      are zero.
-    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
+    - `number`: the number of database rows per query, an integer of at least 1. If fewer rows have positive
+      area, the other shares are zero.
+    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
+      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
+      sharper maps.
 
-    **Raises:** `ValueError` if the number is below 1, or the temperature is not one positive, finite number.
+    **Raises:** `ValueError` if the number is below 1, or if the temperature is not a single positive, finite
+    number.
     """
 
     number: int = eqx.field(static=True, default=10)
@@ -220,7 +268,7 @@ class NearestFew(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
-        """See `Recovery`."""
+        """Returns the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
@@ -231,21 +279,30 @@ class NearestFew(Recovery):
             return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
 
         rows = in_blocks(nearest, settled_queries, _BLOCK)
-        # The rows are processed one by one, because all differences at once would need t times the memory.
+        # The t rows of a query are processed one after another, because all differences together would need t
+        # times the memory.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
         exponents = -jnp.stack(squares, axis=1) / temperature
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
 
 
 class Sinkhorn(Recovery):
-    """Soft maps by `sinkhorn`: every database row gets the share that its area implies.
+    """A recovery by entropy-regularised optimal transport, in which every row receives its own area.
+
+    The function `sinkhorn` computes the shares. Together, the queries send to each database row as much area
+    as the row has, up to the tolerance. The soft map is a `SoftMap`.
 
     **Arguments:**
 
-    - `temperature`: a positive number, in the unit that `sinkhorn` describes.
-    - `iterations`, `tolerance`: see `sinkhorn`.
+    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
+      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
+      sharper maps and need more iterations.
+    - `iterations`: the largest number of iterations of `sinkhorn`, an integer of at least 1.
+    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
+      is at most the tolerance.
 
-    **Raises:** `ValueError` for fewer than 1 iteration, or a temperature or tolerance that is not positive.
+    **Raises:** `ValueError` if the temperature is not a single positive, finite number, `iterations` is below
+    1, or `tolerance` is not positive.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -267,7 +324,7 @@ class Sinkhorn(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """See `Recovery`."""
+        """Returns the soft map from the queries to the database; see `Recovery`."""
         return sinkhorn(
             queries,
             database,
@@ -291,33 +348,36 @@ def sinkhorn(
 ) -> SoftMap:
     """Returns the entropy-regularised optimal transport between two point sets, by Sinkhorn's iterations.
 
-    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. A plan spreads
-    the areas of the queries over the areas of the database. The returned plan minimises the mean squared
-    distance minus `temperature` times the entropy. Nearest-neighbour maps crowd onto some rows and leave out
-    other rows, but this plan gives every row its share.
+    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. A transport plan
+    distributes the areas of the queries over the areas of the database rows. The returned plan minimises the
+    mean squared distance minus `temperature` times the entropy. Nearest-neighbour maps send many queries to
+    some rows and no query to other rows, but this plan gives every row as much area as it has.
 
-    The iterations update the logarithms of Sinkhorn's factors. Each iteration recomputes the distances in
-    blocks of queries, so no array of size m x n is stored. Derivatives go through all iterations and need no
-    such array either.
+    The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
+    distances in blocks of queries, so no array of size m x n is stored. Derivatives are computed through all
+    iterations, also without such an array.
 
     **Arguments:**
 
-    - `queries`, `database`: points (m, d) and (n, d) in d dimensions, in the same unit.
-    - `query_areas`, `database_areas`: areas (m,) and (n,), in any unit. Both sides are scaled to sum 1.
-      Points of zero area neither give nor receive area, and do not affect other points.
-    - `temperature`: a positive number. Its unit is the area-weighted mean squared distance from queries to
-      their nearest database rows. The unit is at least `sqrt(eps)` times the area-weighted variance of the
-      queries, where eps is the precision of the float type. Lower temperatures give sharper maps and need
-      more iterations. Temperatures below the rounding error of squared distances, eps times the variance, are
-      raised to this value and have derivative zero.
-    - `iterations`: the largest number of iterations. Iterations after convergence are skipped; under `vmap`
-      they run but change nothing.
-    - `tolerance`: the tolerance of `SoftMap.residual`, a share of the total area.
+    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
+    - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. The areas of each
+      point set are scaled to sum 1. Points of zero area neither give nor receive area, and do not affect
+      other points.
+    - `temperature`: a positive number, or a positive array of shape (). Its unit is the area-weighted mean
+      squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
+      area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
+      temperatures give sharper maps and need more iterations. A temperature below the rounding error of
+      squared distances, eps times the variance, is raised to this error and has derivative zero. A
+      temperature that is not positive makes the result NaN.
+    - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
+      are skipped. Under `vmap` they run but change nothing.
+    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
+      is at most the tolerance.
 
-    **Returns:** A `SoftMap`. Numbers that are not finite and missing convergence raise no error: check its
-    attribute `converged`.
+    **Returns:** A `SoftMap` from the queries to the database. Results that are not finite and missing
+    convergence raise no error, so check the attribute `converged` of the map.
 
-    **Raises:** `ValueError` for fewer than one iteration.
+    **Raises:** `ValueError` if `iterations` is below 1.
     """
     if iterations < 1:
         raise ValueError(f"sinkhorn needs at least 1 iteration, not {iterations}")
@@ -328,7 +388,11 @@ def sinkhorn(
 
 
 class _SinkhornState(NamedTuple):
-    """Potentials, their residual, the potentials of the next iteration, and the number of iterations."""
+    """The variables of Sinkhorn's iterations.
+
+    `residual` is the residual of `potentials`, `following` contains the potentials of the next iteration, and
+    `iterations` is the number of iterations so far.
+    """
 
     potentials: Float[Array, " n"]
     following: Float[Array, " n"]
@@ -356,7 +420,8 @@ def _sinkhorn_potentials(
             return arrived + product(jax.nn.softmax(log_shares, axis=0), block[1]), None
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
-        # The arriving area can underflow to zero. Then the potential rises over several iterations.
+        # The area that arrives at a row can underflow to zero. With this lower limit, the potential of the
+        # row then rises over several iterations.
         least = jnp.finfo(dtype).tiny
         correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2
@@ -375,17 +440,20 @@ def _sinkhorn_potentials(
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the logarithms of areas: -inf for a zero area, with derivative zero instead of infinity."""
+    """Returns the logarithms of areas.
+
+    The logarithm of a zero area is -inf, and its derivative is zero instead of infinity.
+    """
     return jnp.where(areas > 0, jnp.log(jnp.where(areas > 0, areas, 1)), -jnp.inf)
 
 
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Returns `-distance² / temperature` up to a constant per query.
+    """Returns `-distance² / temperature`, apart from a constant for each query.
 
-    The queries are on the last axis. So sums over the database are computed for several neighbouring queries
-    at once, which halves the time.
+    The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
+    at once. This layout halves the time.
     """
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
@@ -393,8 +461,8 @@ def _log_kernel(
 class _Transport(NamedTuple):
     """Two point sets with areas, and a temperature, in the form that all recoveries use.
 
-    The points have a common origin near their centre. The areas sum to 1. The temperature is in squared units
-    of the points.
+    The origin of the points is near their centre. The areas of each point set sum to 1. The temperature is in
+    squared units of the points.
     """
 
     queries: Float[Array, "m d"]
@@ -422,12 +490,13 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Returns the `_Transport` between two point sets, from a temperature in the units of `sinkhorn`.
+    """Returns the `_Transport` between two point sets, from a temperature in the unit of `sinkhorn`.
 
-    The points are shifted to their centre, because rounding would falsify distances between points far from
-    the origin. A temperature that is not positive, which a training step can produce, becomes NaN and makes
-    the result NaN. A temperature below the rounding error of squared distances is raised to this error.
-    Otherwise exponents would consist of rounding errors, and derivatives would overflow.
+    The centre of the database becomes the origin, because rounding would falsify distances between points far
+    from the origin. A training step can produce a temperature that is not positive. Such a temperature
+    becomes NaN and makes the result NaN. A temperature below the rounding error of squared distances is
+    raised to this error. A lower temperature would give exponents that consist of rounding errors, and
+    derivatives that overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
@@ -437,7 +506,7 @@ def _normalized(
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     eps = jnp.finfo(queries.dtype).eps
     unit = jnp.maximum(unit, eps**0.5 * spread)
-    unit = jnp.where(unit > 0, unit, 1)  # any unit suffices if all points coincide
+    unit = jnp.where(unit > 0, unit, 1)  # any unit is valid if all points coincide
     relative = temperature.astype(queries.dtype)
     absolute = jnp.maximum(relative * unit, eps * spread)
     return _Transport(queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan))

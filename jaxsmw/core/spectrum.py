@@ -1,4 +1,4 @@
-"""The spectrum of a shape, the only form in which the traced core receives the shape."""
+"""The spectrum of a shape, which is the only form in which the traced code of `jaxsmw.core` receives a shape."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class Spectrum(eqx.Module):
-    """The first k eigenpairs of a shape's Laplace–Beltrami operator, as a pytree of arrays.
+    """A shape in spectral form: the first k eigenpairs of its Laplace–Beltrami operator, as a pytree of arrays.
 
-    The eigenpairs solve `W phi = lambda A phi`. W is the positive semi-definite cotangent stiffness matrix
-    and A holds the lumped vertex areas. The eigenvectors are orthonormal with respect to A: `Phi^T A Phi =
-    I`.
+    `compute_spectrum` computes the spectrum of a mesh. The eigenpairs solve `W phi = lambda A phi`. W is the
+    positive semi-definite cotangent stiffness matrix, and the diagonal matrix A contains the vertex areas.
+    The eigenvectors are orthonormal with respect to A: `Phi^T A Phi = I`.
 
-    A `Spectrum` describes one shape. For `jax.vmap`, shapes of equal size are stacked: every leaf gets a
-    leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero eigenvectors.
-    Unreferenced vertices (vertices that no face references) are also masked.
+    A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks several shapes, which gives every
+    array a leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero
+    eigenvectors. Unreferenced vertices (vertices that no face references) are also masked.
 
     **Attributes:**
 
@@ -28,7 +28,7 @@ class Spectrum(eqx.Module):
     - `vertex_areas`: (n,), in units of length², zero for masked vertices.
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
     - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
-      or None. The documentation of a refiner says whether it uses descriptors.
+      or None. Only some refiners use descriptors.
     - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Only some
       refiners use positions.
     - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Only some refiners use
@@ -77,7 +77,7 @@ class Spectrum(eqx.Module):
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
         """Returns the shape with the given vertex positions (n, 3) and unit normals (n, 3).
 
-        Positions are in the unit of length of the spectrum, which is the square root of its unit of area.
+        The unit of the positions must match the vertex areas, which are in units of length².
 
         **Raises:** `ValueError` if the arrays do not have one row of 3 numbers per vertex.
         """
@@ -105,11 +105,12 @@ class Spectrum(eqx.Module):
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
         """Returns the shape with only some of its vertices, the samples. All samples get equal areas.
 
-        The eigenvectors are not orthonormal on samples. Use the least-squares pseudo-inverse for samples.
+        The eigenvectors are not orthonormal on samples, so the pseudo-inverse of the eigenvectors must be
+        computed by least squares.
 
         **Arguments:**
 
-        - `vertices`: the samples (s,), as indices of evenly spread vertices.
+        - `vertices`: (s,), the indices of the samples, which should be evenly spread over the surface.
         """
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
         sampled = self._map_vertex_arrays(lambda field: field[vertices])
@@ -121,7 +122,7 @@ class Spectrum(eqx.Module):
         n, shape = self.mask.shape[0], jnp.shape(rows)
         if len(shape) != 2 or shape[0] != n or columns not in (None, shape[1]):
             needed = f"({n}, {'d' if columns is None else columns})"
-            raise ValueError(f"the {name} have shape {shape}; one row per vertex is needed: {needed}")
+            raise ValueError(f"the {name} have shape {shape}; one row per vertex is needed: give {needed}")
 
     def _map_vertex_arrays(self, change: Callable[[Array], Array]) -> Spectrum:
         """Returns the shape with a function applied to all arrays that have one row per vertex."""

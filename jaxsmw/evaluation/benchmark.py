@@ -1,6 +1,7 @@
-"""Measures several methods on the pairs of a data set, and stores every result on disk.
+"""Measures the errors and times of several methods on the pairs of a data set, and stores the results.
 
-If a benchmark was interrupted, the same call continues it. Finished shapes and pairs are not measured again.
+If a benchmark was interrupted, a second call with the same arguments continues the benchmark. Finished shapes
+and pairs are stored on disk and not measured again.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versio
 
 
 class Results(NamedTuple):
-    """The results of a benchmark; every value is text.
+    """The results of a benchmark. All values in the rows are text.
 
     **Attributes:**
 
-    - `rows`: one row with `RESULT_COLUMNS` for each measured pair and method.
-    - `shapes`: one row with `SHAPE_COLUMNS` for each measured shape, by name.
-    - `failures`: the cause for each shape or pair that could not be measured, by name.
+    - `rows`: one row with `RESULT_COLUMNS` for each method and each pair that all methods have finished.
+    - `shapes`: a dictionary from the name of each measured shape to its row with `SHAPE_COLUMNS`.
+    - `failures`: a dictionary from the name of each shape or pair that could not be measured to the error
+      message.
     """
 
     rows: list[Row]
@@ -47,9 +49,10 @@ class Results(NamedTuple):
     failures: dict[str, str]
 
     def check(self) -> None:
-        """Checks that everything was measured.
+        """Checks that every shape and every pair was measured.
 
-        **Raises:** `InputError` with every cause of a failure and the shapes and pairs that failed.
+        **Raises:** `InputError` if a measurement failed. The message contains every error message, each with
+        the first shapes or pairs for which it occurred.
         """
         if not self.failures:
             return
@@ -60,8 +63,8 @@ class Results(NamedTuple):
         raise InputError(
             "\n".join(
                 [
-                    "some shapes or pairs could not be measured; correct these faults and start again (all "
-                    "other results are kept):",
+                    "some shapes or pairs could not be measured: correct these faults, and run the same "
+                    "benchmark again (all other results are kept):",
                     *lines,
                 ]
             )
@@ -69,12 +72,12 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Returns the first few names, followed by the number of remaining names."""
+    """Returns the first few names as text, with the number of the names that are left out."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
 
-# The largest number of names in a message. All listed shapes or pairs have the same fault.
+# The largest number of shapes or pairs that a message names for the same fault.
 _NAMED_FAILURES = 3
 
 
@@ -86,25 +89,28 @@ def run_benchmark(
     settings: Settings,
     executor: Executor,
 ) -> Results:
-    """Measures every method on every pair, except for results that `output` already contains.
+    """Measures every method on every pair, and skips measurements whose results `output` already contains.
 
-    Each result is stored as soon as it is available. A shape or pair that cannot be measured is skipped.
+    Each result is stored as soon as it is available. If a shape or pair cannot be measured, the benchmark
+    continues with the remaining shapes and pairs.
 
     **Arguments:**
 
-    - `data_set`: the data set.
-    - `pairs`: pairs of the data set.
+    - `data_set`: the data set that contains the pairs.
+    - `pairs`: the pairs to match.
     - `output`: an existing directory, to which `results.csv`, `shapes.csv` and `provenance.json` are written.
-    - `methods`: the methods by their names in tables, for example `METHODS`.
-    - `settings`: the settings. They must equal the settings of any results that `output` already contains.
-    - `executor`: runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
+    - `methods`: a dictionary from the names of methods in result tables to the methods, for example
+      `METHODS`.
+    - `settings`: the settings of the benchmark. Results that `output` already contains must have been
+      measured with the same settings.
+    - `executor`: the executor that runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
 
-    **Returns:** The results of these pairs and methods. Their method `check` raises an error if there were
-    failures.
+    **Returns:** The `Results` of these pairs and methods. `Results.check` raises an error if a shape or pair
+    could not be measured.
 
-    **Raises:** `InputError` if `output` contains damaged results or results of another origin, if another
-    process is adding results to it, if a method is undefined on a pair, or if a file with a published map is
-    missing.
+    **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
+    data, settings or software versions; if another process is adding results to `output`; if a method is
+    undefined on a pair; or if a file with a published map is missing.
     """
     for method in methods.values():
         method.check(pairs)
@@ -122,15 +128,16 @@ def run_benchmark(
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
-    The number is the same for most choices of methods. The time of the precomputation depends on it, so
-    equal numbers let later runs add methods to existing results.
+    The number is the same for most choices of methods. Stored results include the time of the precomputation,
+    which depends on this number. With the same number, a later run can add methods to existing results.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
     """Returns the contents of `provenance.json`."""
-    # Only the name of the directory with initial maps counts, because a moved copy contains the same maps.
+    # Only the name of the directory with initial maps is stored, not its whole path, because a moved copy of
+    # the directory contains the same maps.
     chosen = asdict(settings) | {"init": Path(settings.init).name}
     return {
         "settings": chosen | {"number_of_eigenvectors": number_of_eigenvectors},
@@ -139,7 +146,7 @@ def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[s
 
 
 class _Store:
-    """The result files of some pairs of a data set.
+    """The result files of a benchmark, `results.csv` and `shapes.csv`.
 
     **Raises:** `InputError` if the files are damaged or belong to another data set, or if a mesh file has
     changed since it was measured.
@@ -165,11 +172,11 @@ class _Store:
                 )
 
     def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Returns the name and the mesh file of each shape that is not measured yet, by name."""
+        """Returns the shapes that are not measured yet, as a dictionary from names to (name, mesh file)."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns a task for each pair on which a method is not measured yet, by name of the pair."""
+        """Returns the pairs that lack a result of some method, as a dictionary from their names to tasks."""
         tasks = {}
         for pair in self.pairs:
             missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
@@ -179,7 +186,8 @@ class _Store:
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
         """Returns the results of all pairs on which all methods are measured."""
-        # The other pairs are left out, so that all methods are compared on the same pairs.
+        # Pairs without results of some method are left out, so that all methods are compared on the same
+        # pairs.
         known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
         by_pair = [[(*pair.names, name) for name in methods] for pair in known]
         finished = [keys for keys in by_pair if all(key in self.results for key in keys)]
@@ -197,9 +205,9 @@ def _measure_all(
     executor: Executor,
     journal: Journal,
 ) -> dict[str, BaseException]:
-    """Measures all tasks with a progress bar, and appends their rows to a journal.
+    """Runs all tasks, shows a progress bar, and appends the rows of each finished task to a journal.
 
-    **Returns:** The exceptions of the tasks that failed, by name.
+    **Returns:** A dictionary from the name of each failed task to its exception.
     """
     if not tasks:
         return {}

@@ -1,7 +1,7 @@
-"""Data sets in their published layouts: shapes, pairs and ground truth.
+"""Readers for data sets in their published directory layouts: shapes, pairs and ground truth.
 
-This library contains no data set, because the licences do not allow copies. `docs/datasets.md` says where to
-obtain each data set.
+This library contains no data set, because the licences of the data sets do not allow copies.
+`docs/datasets.md` says where to obtain each data set.
 """
 
 from __future__ import annotations
@@ -24,16 +24,21 @@ from jaxsmw.io.mesh_files import MESH_SUFFIXES
 
 @dataclass(frozen=True)
 class DataPair:
-    """Two shapes of a data set, with the files of their ground truth.
+    """A pair of shapes in a data set: their names, their mesh files, and the files of their ground truth.
+
+    `open_data_set` creates the pairs of a data set. The method `ground_truth` reads the ground truth.
 
     **Attributes:**
 
-    - `source`, `target`: the names of X and Y.
+    - `source`, `target`: the names of the source X and the target Y.
     - `source_file`, `target_file`: the mesh files of X and Y.
-    - `truth`: the files for `read_ground_truth`; empty if vertex i of X corresponds to vertex i of Y.
-    - `mirrored_truth`: the files of the left-right mirrored ground truth; None if there are none.
-    - `index_base`: the index of the first vertex in these files; None for the default of their format.
-    - `partial`: whether the source is a partial shape of the target, in the same unit of length.
+    - `truth`: the ground-truth files, as `read_ground_truth` accepts them. The tuple is empty if vertex i of
+      X corresponds to vertex i of Y.
+    - `mirrored_truth`: the files of the left-right mirrored ground truth, as `read_ground_truth` accepts
+      them; None if the data set has no mirrored ground truth.
+    - `index_base`: the index of the first vertex in these files, 0 or 1; None for the default of their
+      format.
+    - `partial`: whether X is a partial shape of Y. Both meshes then have the same unit of length.
     """
 
     source: str
@@ -52,29 +57,32 @@ class DataPair:
 
     @property
     def names(self) -> tuple[str, str]:
-        """The names of source and target."""
+        """The names of the source and the target."""
         return self.source, self.target
 
     @property
     def meshes(self) -> tuple[Path, Path]:
-        """The mesh files of source and target."""
+        """The mesh files of the source and the target."""
         return self.source_file, self.target_file
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
-        """Returns the ground truth of the pair, or the mirrored ground truth.
+        """Reads and returns the direct or the mirrored ground truth of the pair.
 
         **Arguments:**
 
-        - `mesh_x`, `mesh_y`: X and Y, as read from `source_file` and `target_file`.
-        - `mirrored`: whether to return the mirrored ground truth.
+        - `mesh_x`, `mesh_y`: the meshes of X and Y, as read from `source_file` and `target_file`.
+        - `mirrored`: whether to return the mirrored ground truth instead of the direct ground truth.
 
-        **Raises:** `InputError` if a file cannot be used, if there is no mirrored ground truth, or if vertex
-        i of X should correspond to vertex i of Y, but the numbers of vertices differ.
+        **Returns:** A `GroundTruth`, with the true points on Y of vertices of X.
+
+        **Raises:** `InputError` if a ground-truth file cannot be read or does not fit the meshes; if
+        `mirrored` is True, but `mirrored_truth` is None; or if `truth` is empty, but X and Y have different
+        numbers of vertices.
         """
         files = self.mirrored_truth if mirrored else self.truth
         if files is None:
             raise InputError(
-                f"{self.name}: its data set has no mirrored ground truth: use the direct ground truth."
+                f"{self.name}: the data set has no mirrored ground truth: use the direct ground truth."
             )
         if files:
             return read_ground_truth(files, mesh_x, mesh_y, index_base=self.index_base)
@@ -82,21 +90,26 @@ class DataPair:
         if m != n:
             raise InputError(
                 f"{self.target_file}: has {n} vertices where {self.source_file} has {m}, but in this data "
-                "set vertex i of one shape corresponds to vertex i of the other: give the original files."
+                "set vertex i of one shape corresponds to vertex i of the other: use the original mesh files."
             )
         return GroundTruth.of_all_vertices(np.arange(m))
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """The shapes and pairs in a directory.
+    """A data set: the shapes and pairs in a directory, as `open_data_set` returns them.
+
+    The property `name` is the name of the directory. The property `shapes` is a dictionary from the names of
+    all shapes to their mesh files.
 
     **Attributes:**
 
     - `directory`: the directory that contains the files.
-    - `layout`: the name of the recognised layout.
-    - `pairs`: the pairs to match, in the order of the data set's own list if there is one.
-    - `others`: further pairs with ground truth.
+    - `layout`: the name of the recognised layout: `"a remeshed set"`, `"SHREC'19 humans"`,
+      `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"FAUST registrations"`, `"SCAPE"` or `"TOSCA"`.
+    - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
+      tuple has the order of the list.
+    - `others`: further pairs with ground truth, which are not in `pairs`.
     """
 
     directory: Path
@@ -111,7 +124,7 @@ class DataSet:
 
     @property
     def shapes(self) -> dict[str, Path]:
-        """The mesh files of all shapes that occur in pairs, by name."""
+        """The mesh files of all shapes that occur in pairs, as a dictionary by name of the shape."""
         found = {}
         for pair in (*self.pairs, *self.others):
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
@@ -121,21 +134,26 @@ class DataSet:
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     """Opens a data set, and recognises its layout from its files.
 
-    - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): the meshes in one folder (`off/`,
-      `shapes/`, …), and for each mesh a `corres/NAME.vts` and optionally a `corres/NAME.sym.vts`.
-    - **SHREC'19 humans** (Melzi et al. 2019): meshes `1.obj`, …, and for each pair a file `I_J.txt` in a
-      folder `FARMgt_txt`. The remeshed version has a file `I_J.map` in `corres/` instead.
-    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` with the full shapes, and `cuts/` or `holes/` with the
-      partial shapes. Each pair has a partial shape as source and its full shape as target.
-    - **SHREC'16 topology** (Lähner et al. 2016): `kid00`, and `kidNN` with `kidNN_ref.txt`. Each pair has
-      `kidNN` as source and `kid00` as target.
-    - **FAUST registrations** `tr_reg_NNN`, **SCAPE** `meshNNN`, **TOSCA** (`cat0`, …): meshes only, in the
-      directory or in one folder. Vertex i of one shape corresponds to vertex i of the other; in TOSCA, within
-      a class only.
+    The function recognises the following layouts. NAME, I, J and NNN are parts of file names.
 
-    If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line),
-    `pairs` is this list. Otherwise the pairs are all ordered pairs of different shapes with ground truth,
-    within a class if the names have one (`cat0`, `cat1`).
+    - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): one folder (`off/`, `shapes/`, …)
+      contains the meshes. For each mesh, `corres/` contains a file `NAME.vts` and optionally `NAME.sym.vts`.
+    - **SHREC'19 humans** (Melzi et al. 2019): the meshes are `1.obj`, …, and a folder `FARMgt_txt` contains a
+      file `I_J.txt` for each pair. The remeshed version has files `I_J.map` in `corres/` instead.
+    - **SHREC'16 partial** (Cosmo et al. 2016): `null/` contains the full shapes, and `cuts/` or `holes/`
+      contain the partial shapes. In each pair a partial shape is the source, and its full shape is the
+      target.
+    - **SHREC'16 topology** (Lähner et al. 2016): the mesh `kid00` is the target of all pairs. The sources are
+      the other meshes `kidNN`, each with a file `kidNN_ref.txt`.
+    - **FAUST registrations** (`tr_reg_NNN`), **SCAPE** (`meshNNN`) and **TOSCA** (`cat0`, …): the directory
+      or one of its folders contains the meshes, and there is no ground-truth file. Vertex i of one shape
+      corresponds to vertex i of every other shape. In TOSCA this holds only for shapes of the same class,
+      such as `cat0` and `cat1`.
+
+    If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line), the
+    attribute `pairs` of the result contains the listed pairs. Otherwise `pairs` contains all ordered pairs of
+    different shapes with ground truth. If the names of shapes contain a class (`cat0`, `cat1`), both shapes
+    of such a pair belong to the same class.
 
     **Arguments:**
 
@@ -143,10 +161,10 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
     **Returns:** A `DataSet`.
 
-    **Raises:** `InputError` if the directory has no known layout, lacks a file, cannot be read, or contains
-    several data sets.
+    **Raises:** `InputError` if the directory does not exist, has no known layout, lacks a file, cannot be
+    read, or contains several data sets.
     """
-    # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+    # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
     if not os.path.isdir(directory):
         raise InputError(f"{directory}: is not a directory: give the directory of an unpacked data set.")
     directory = Path(directory)
@@ -170,8 +188,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     layout, (pairs, others) = found
     if not pairs:
         raise InputError(
-            f"{directory}: has the layout of {layout}, but no two of its shapes form a pair: complete "
-            "the copy."
+            f"{directory}: has the layout of {layout}, but no two of its shapes form a pair: add the missing "
+            "shapes."
         )
     return DataSet(directory, layout, tuple(pairs), tuple(others))
 
@@ -208,13 +226,13 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _meshes(directory: Path) -> dict[str, Path]:
-    """Returns the mesh files in a directory, by name and in natural order."""
+    """Returns the mesh files in a directory, as a dictionary by name, in the order of `_natural`."""
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
     found: dict[str, Path] = {}
     for file in sorted(files, key=lambda file: MESH_SUFFIXES.index(file.suffix.lower())):
-        # If a shape has files in two formats, the first suffix in MESH_SUFFIXES counts.
+        # If a shape has files in several formats, the file whose suffix comes first in MESH_SUFFIXES is used.
         found.setdefault(file.stem, file)
     return {name: found[name] for name in sorted(found, key=_natural)}
 
@@ -224,9 +242,10 @@ _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Returns the meshes whose names match a pattern, by name.
+    """Returns the mesh files whose names match a pattern, as a dictionary by name.
 
-    The meshes are those in the directory itself, or else those in its first folder that contains any.
+    All files come from the same folder: the directory itself if it contains such a mesh, or otherwise the
+    first folder below it that contains such a mesh.
     """
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
@@ -237,7 +256,7 @@ def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """Returns the pairs of the list that comes with a data set; None without a list."""
+    """Returns the pairs in the list that a data set contains, or None if it contains no list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
     if not lists:
         return None
@@ -247,15 +266,15 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
     """Reads a list of pairs of shapes.
 
-    Each line has the names of source and target, separated by spaces, a comma or a semicolon. The rest of a
-    line after `#` is a comment.
+    Each line has the names of the source and the target, separated by spaces, a comma or a semicolon. Text
+    after `#` is a comment.
 
     **Arguments:**
 
     - `path`: the text file.
     - `shapes`: the names of all shapes of the data set.
 
-    **Returns:** The names of source and target of each pair, in the order of the file.
+    **Returns:** The names of the source and the target of each pair, in the order of the file.
 
     **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if the
     file names no pair.
@@ -264,7 +283,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     try:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}): give a list of pairs.") from error
+        raise InputError(f"{path}: cannot be read as text ({error}): give a text file of pairs.") from error
     for number, line in enumerate(lines, start=1):
         names = re.split(r"[,;\s]+", line.partition("#")[0].strip())
         if names == [""]:
@@ -285,10 +304,10 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     **Arguments:**
 
     - `data_set`: the data set.
-    - `wanted`: one of three choices. A number, as text, draws this many pairs without replacement, or all
-      pairs if there are fewer. A path names a list of pairs with ground truth (see `read_pairs`); repeated
-      pairs count once. None chooses all pairs of the data set.
-    - `seed`: the seed of the draw.
+    - `wanted`: the choice, in one of three forms. A number, as text, draws this many pairs at random without
+      replacement, or all pairs if the data set has fewer. A path chooses the pairs that a text file lists
+      (see `read_pairs`); repeated pairs are used once. None chooses all pairs of the data set.
+    - `seed`: the seed of the random draw.
 
     **Returns:** The pairs, in the order of the data set or of the list.
 
@@ -315,7 +334,7 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
 
 def class_of(name: str) -> str:
-    """Returns the class of a shape, given its name: the name without the number at its end."""
+    """Returns the class of a shape: its name without the number at the end."""
     return re.sub(r"[_-]?\d+$", "", name)
 
 
@@ -328,9 +347,10 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Returns the pairs of a list and all other pairs with ground truth.
+    """Returns the listed pairs, and the remaining pairs with ground truth.
 
-    Without a list, the first are all pairs with ground truth, and there are no others.
+    If there is no list, the first result contains all pairs with ground truth, and the second result is
+    empty.
     """
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)
@@ -352,12 +372,12 @@ def _remeshed(directory: Path) -> _Pairs | None:
         )
     if missing := [name for name in shapes if name not in plain]:
         raise InputError(
-            f"{truths / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: complete the "
-            "copy, or remove the mesh."
+            f"{truths / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: add this file, "
+            "or remove the mesh."
         )
     if missing := [name for name in plain if name not in shapes]:
         raise InputError(
-            f"{directory}: has no mesh for {plain[missing[0]]}: complete the copy, or remove the .vts file."
+            f"{directory}: has no mesh for {plain[missing[0]]}: add the mesh, or remove the .vts file."
         )
 
     def pair(x: str, y: str) -> DataPair:
@@ -400,18 +420,19 @@ def _partial(directory: Path) -> _Pairs | None:
         return None
     if not full or not partial:
         found = "cuts/ or holes/ but no null/" if partial else "null/ but no cuts/ or holes/"
-        raise InputError(f"{directory}: has {found}: complete the copy.")
+        raise InputError(f"{directory}: has {found}: add the missing folder.")
     pairs = []
     for name, file in partial.items():
         match = re.fullmatch(r"(?:cuts|holes)_(.+)_shape_\d+", name)
         if match is None or match[1] not in full:
             raise InputError(
-                f"{file}: the full shape of this partial shape is not in {directory / 'null'}: name partial "
-                "shapes cuts_FULL_shape_N or holes_FULL_shape_N, or complete the copy."
+                f"{file}: the full shape of this partial shape is not in {directory / 'null'}: add the full "
+                "shape, or rename the partial shape to cuts_FULL_shape_N or holes_FULL_shape_N, where FULL "
+                "is the name of its full shape and N is a number."
             )
         truth, mirrored = (file.with_suffix(suffix) for suffix in (".baryc_gt", ".baryc_gt_sym"))
         if not truth.is_file():
-            raise InputError(f"{truth}: the ground truth of {file} is missing: complete the copy.")
+            raise InputError(f"{truth}: the ground truth of {file} is missing: add this file.")
         target, sides = match[1], (mirrored,) if mirrored.is_file() else None
         pairs.append(DataPair(name, target, file, full[target], (truth,), sides, partial=True))
     return pairs, []
@@ -422,19 +443,22 @@ def _topology(directory: Path) -> _Pairs | None:
     if not shapes:
         return None
     if "kid00" not in shapes:
-        raise InputError(f"{directory}: has no kid00, the target of all pairs: complete the copy.")
+        raise InputError(f"{directory}: has no kid00, the target of all pairs: add this mesh.")
     full = shapes.pop("kid00")
     pairs = []
     for name, file in shapes.items():
         truth = file.with_name(f"{name}_ref.txt")
         if not truth.is_file():
-            raise InputError(f"{truth}: the ground truth of {file} is missing: complete the copy.")
+            raise InputError(f"{truth}: the ground truth of {file} is missing: add this file.")
         pairs.append(DataPair(name, "kid00", file, full, (truth,)))
     return pairs, []
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Returns the layout of meshes whose names match a pattern, where vertex i corresponds to vertex i."""
+    """Returns a function that opens data sets without ground-truth files, given a pattern of mesh names.
+
+    In these data sets vertex i of one shape corresponds to vertex i of the other shapes of its class.
+    """
     pattern = re.compile(names)
 
     def open_layout(directory: Path) -> _Pairs | None:

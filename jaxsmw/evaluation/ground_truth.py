@@ -1,6 +1,7 @@
-"""Ground truth, and its readers for all common file formats.
+"""Ground truth, and a reader for its common file formats.
 
-The files are parsed by `jaxsmw.io.map_files`. Each format has its usual index base.
+`jaxsmw.io.map_files` parses the files. By default, the format of a file determines whether its vertices are
+counted from 0 or from 1.
 """
 
 from __future__ import annotations
@@ -22,21 +23,25 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
-# The amount by which weights in a file may be below 0, and their sum may differ from 1. Files print weights
-# with few digits.
+# Files contain barycentric weights with few digits. A weight may be below 0 by at most this number, and the
+# sum of the weights of a point may differ from 1 by at most this number.
 _WEIGHT_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """The true points on Y of some vertices of X.
+    """The ground truth of a pair: the true points on Y of some or all vertices of X.
+
+    `read_ground_truth` reads a ground truth from files. `GroundTruth.of_all_vertices` creates the ground
+    truth of all vertices of X.
 
     **Attributes:**
 
-    - `source_vertices`: 0-based vertices of X (p,); a vertex may occur several times, or never.
-    - `targets`: the true point of each source vertex (p,), as 0-based vertices of Y or as `SurfacePoints`.
+    - `source_vertices`: 0-based vertices of X (p,), as int64. A vertex may occur several times or not at all.
+    - `targets`: the true point of each source vertex, as p vertices of Y (0-based, int64) or as p
+      `SurfacePoints` on Y. A surface point consists of a triangle and three barycentric weights.
 
-    **Raises:** `InputError` if the numbers of source vertices and targets differ.
+    **Raises:** `InputError` if the number of source vertices differs from the number of targets.
     """
 
     source_vertices: Int64[np.ndarray, " p"]
@@ -51,7 +56,7 @@ class GroundTruth:
 
     @classmethod
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
-        """Returns the ground truth of all vertices of X. Entry i of `targets` (m,) belongs to vertex i.
+        """Returns the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X.
 
         The targets are 0-based vertices of Y or `SurfacePoints` on Y.
         """
@@ -60,13 +65,13 @@ class GroundTruth:
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
         """Returns a map X -> Y (m,): each vertex takes the target of the nearest vertex with ground truth.
 
-        The nearest vertex is the nearest in Euclidean distance on `mesh_x`. The map contains 0-based vertices
-        of Y.
+        Nearest vertices are found by the Euclidean distance between vertices of `mesh_x`. The map contains
+        0-based vertices of Y.
 
-        **Raises:** `InputError` if the targets are not vertices.
+        **Raises:** `InputError` if the targets are `SurfacePoints` and not vertices.
         """
         if not isinstance(self.targets, np.ndarray):
-            raise InputError("ground truth: its targets are points on triangles: give vertices as targets.")
+            raise InputError("ground truth: the targets are points on triangles: give vertices as targets.")
         _, nearest = KDTree(mesh_x.vertices[self.source_vertices]).query(mesh_x.vertices)
         return self.targets[nearest]
 
@@ -80,27 +85,29 @@ def read_ground_truth(
 ) -> GroundTruth:
     """Reads the ground truth of a pair of meshes.
 
-    The suffix and the number of columns determine the format:
+    The number of files, their suffix and their number of columns determine the format:
 
-    - Two `.vts` files, the file of the source first: each has one vertex per line, and line i of both files
-      is the same point. Vertices are 1-based. Two files with other suffixes have the same format, but are
-      0-based.
-    - `.baryc_gt` or `.baryc_gt_sym`: line i has a face of the target and three barycentric weights for source
-      vertex i. Faces are 1-based.
-    - Two columns: a source vertex and its target vertex, 1-based.
-    - One column: line i has the target vertex of source vertex i. Vertices are 0-based, or 1-based in `.mat`
-      files, as `write_pointwise_map` writes them.
+    - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
+      line contains one vertex, counted from 1. Line i of both files describes the same point. Two files with
+      other suffixes have the same format, but their vertices are counted from 0 (from 1 in `.mat` files).
+    - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
+      source, as a face of the target and three barycentric weights. Faces are counted from 1.
+    - One file with two columns: each line contains a vertex of the source and its target vertex, both counted
+      from 1.
+    - One file with one column: line i contains the target vertex of the i-th vertex of the source. Target
+      vertices are counted from 0 (from 1 in `.mat` files). `write_pointwise_map` writes this format.
 
     Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) are read in the same way.
 
     **Arguments:**
 
-    - `paths`: one file, or the two files of a pair.
-    - `mesh_x`, `mesh_y`: source X and target Y.
-    - `index_base`: the number of the first vertex and face in the files; by default the base of the format.
+    - `paths`: one file, or a sequence of two files.
+    - `mesh_x`, `mesh_y`: the meshes of the source X and the target Y.
+    - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
+      default), the index base of the format is used, as listed above.
 
-    **Returns:** A `GroundTruth` without unreferenced vertices of X. If vertices are left out, a warning gives
-    their number.
+    **Returns:** A `GroundTruth` without the vertices of X that no face references. If such vertices are left
+    out, a warning gives their number.
 
     **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
     message names the file, the line and the fault.
@@ -112,8 +119,8 @@ def read_ground_truth(
         return truth
     if not used.any():
         raise InputError(
-            f"{files[0]}: has only vertices that no face of {mesh_x.name} references: give the ground truth "
-            "of this mesh."
+            f"{files[0]}: lists only vertices that no face of {mesh_x.name} references: give the ground "
+            "truth of this mesh."
         )
     warnings.warn(
         f"{files[0]}: {(~used).sum()} of {len(used)} points are vertices that no face of {mesh_x.name} "
@@ -125,14 +132,14 @@ def read_ground_truth(
 
 def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None) -> GroundTruth:
     if len(files) not in (1, 2):
-        raise InputError(f"ground truth: {len(files)} files were given: give one file, or the two of a pair.")
+        raise InputError(f"ground truth: {len(files)} files were given: give one or two files.")
 
     if len(files) == 2:
         tables = [Table(file, columns=1) for file in files]
         if tables[0].rows != tables[1].rows:
             raise InputError(
                 f"{files[1]}: has {tables[1].rows} lines where {files[0]} has {tables[0].rows}, "
-                "but line i of both must be the same point: give two files of one data set."
+                "but line i of both files must describe the same point: give two files of one data set."
             )
         bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
         sides = zip(tables, (mesh_x, mesh_y), bases, strict=True)
@@ -140,7 +147,7 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
 
     (file,) = files
     if file.suffix == ".vts":
-        raise InputError(f"{file}: is one half of a pair: give the source's .vts file and the target's.")
+        raise InputError(f"{file}: is one half of a pair: give the .vts files of both source and target.")
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
         table = Table(file, columns=4)
         table.require_rows(mesh_x)
@@ -152,8 +159,9 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         return GroundTruth(table.vertices(0, mesh_x, base), table.vertices(1, mesh_y, base))
     if table.columns != 1:
         raise InputError(
-            f"{file}, line 1: has {table.columns} numbers: give a file with one per line (target vertex), "
-            "with two (source and target vertex), or a .baryc_gt file with four (face and weights)."
+            f"{file}, line 1: has {table.columns} numbers: give a file with one per line (the target vertex) "
+            "or two per line (the source and the target vertex), or a .baryc_gt file with four per line (a "
+            "face and three weights)."
         )
     table.require_rows(mesh_x)
     return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.index_base(index_base)))
@@ -166,9 +174,11 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
     **Arguments:**
 
-    - `path`: the file to create or to replace; `read_ground_truth` needs the suffix `.baryc_gt`.
+    - `path`: the file to create or to replace. `read_ground_truth` recognises its format by the suffix
+      `.baryc_gt`.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-    - `mesh_y`: the target Y. Faces are numbered as in its file, including faces that were dropped on reading.
+    - `mesh_y`: the target Y. The written faces are numbered as in the mesh file of Y, which also counts faces
+      that were dropped when the mesh was read.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.
@@ -188,7 +198,10 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-    """Returns a column as 0-based faces of a mesh. The numbers in the file also count dropped faces."""
+    """Returns a column of a table as 0-based faces of a mesh.
+
+    The file also counts faces that were dropped when the mesh was read.
+    """
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)
     faces = np.searchsorted(mesh.face_numbers, given)
@@ -203,7 +216,7 @@ def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.n
 
 
 def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
-    """Returns three columns as barycentric weights: not negative, with sum 1."""
+    """Returns three columns of a table as barycentric weights, which are at least 0 and sum to 1."""
     weights = table.values[:, column : column + 3]
     good = (weights >= -_WEIGHT_TOLERANCE).all(axis=1)
     good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE
@@ -212,7 +225,7 @@ def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
         written = " ".join(table.word(row, at) for at in range(column, table.columns))
         raise InputError(
             f"{table.place(row)}: {written[:80]} are not barycentric weights, "
-            "which are at least 0 and sum to 1: correct the line."
+            "which must be at least 0 and sum to 1: correct the line."
         )
     weights = np.maximum(weights, 0)
     return weights / weights.sum(axis=1, keepdims=True)

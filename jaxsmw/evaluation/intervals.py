@@ -15,7 +15,7 @@ RESAMPLES = 9999
 class Interval(NamedTuple):
     """A mean with the lower and upper end of its bootstrap confidence interval, in the unit of the sample.
 
-    The ends are NaN if there is no interval.
+    If the sample has fewer than three values, both ends are NaN.
     """
 
     mean: float
@@ -23,7 +23,10 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        """The mean and the ends of the interval, with signs and one decimal; a dash if the mean is NaN."""
+        """The mean and, if they exist, the ends of the interval as text with signs and one decimal.
+
+        If the mean is NaN, the text is a dash.
+        """
         if np.isnan(self.mean):
             return "—"
         if np.isnan(self.low):
@@ -37,17 +40,18 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
     **Arguments:**
 
     - `values`: the sample (p,).
-    - `seed`: the seed of the resampling.
+    - `seed`: the seed of the random resampling.
 
-    **Returns:** The mean and its interval with confidence level `CONFIDENCE`, from `RESAMPLES` resamples. The
-    ends of the interval are NaN for fewer than three values. The mean is also NaN for an empty sample.
+    **Returns:** The mean and its interval with confidence level 0.95 (`CONFIDENCE`), computed from 9999
+    resamples (`RESAMPLES`). The ends of the interval are NaN if the sample has fewer than three values. The
+    mean is also NaN if the sample is empty.
     """
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
-    if len(values) < 3:  # too few for a bootstrap
+    if len(values) < 3:  # a sample of one or two values is too small for a bootstrap interval
         return Interval(mean, np.nan, np.nan)
-    if np.ptp(values) == 0:  # the BCa interval of equal values is undefined
+    if np.ptp(values) == 0:  # the bootstrap interval of equal values is undefined
         return Interval(mean, mean, mean)
     found = bootstrap(
         (values,),

@@ -1,4 +1,7 @@
-"""Result files that survive interruptions at any time, and never mix results of different origin."""
+"""Result files that remain usable after an interruption at any time.
+
+A directory never mixes results that were measured with different settings or software versions.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +21,32 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
-"""One row of a journal: values by the names of their columns. A row that was read contains text only."""
+"""A row of a journal: a dictionary from column names to values. Values from a file are text."""
 
 Columns = Mapping[str, Callable[[str], Any]]
-"""The columns of a journal in order. Each has a function that parses its text or raises a `ValueError`."""
+"""The columns of a journal in order: a mapping from their names to functions that parse their values.
+
+Such a function takes the text of a value, and raises `ValueError` if the text is invalid.
+"""
 
 
 class Journal:
     """A CSV file to which whole rows are appended.
 
-    `key in journal` checks whether there is a row with a key, and `journal[key]` returns the row. The values
-    of a key are compared as text. If a process was killed while it wrote a line, the unfinished line is
-    removed when the file is opened again.
+    `key in journal` checks whether the journal has a row with this key, and `journal[key]` returns the row.
+    The values of keys are compared as text. If a process was killed while it wrote a line, the unfinished
+    line is removed when the file is opened again.
 
     **Arguments:**
 
     - `path`: the file, which need not exist yet.
-    - `key`: the columns that identify a row. If two rows have the same key, the first row counts.
-    - `columns`: the columns that the file must have, each with the function that checks its values. By
-      default the file may have any columns that include the key.
+    - `key`: the names of the columns that identify a row. If two rows have the same key, the second row is
+      ignored.
+    - `columns`: the columns that the file must have, each with the function that checks its values. If None,
+      the file may have any columns that include the columns of `key`.
 
-    **Raises:** `InputError` if the file cannot be read or is not such a table. The file is then not changed.
+    **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. The
+    file is then not changed.
     """
 
     def __init__(self, path: Path, key: Sequence[str], columns: Columns | None = None):
@@ -62,7 +70,7 @@ class Journal:
 
     @property
     def rows(self) -> list[Row]:
-        """All rows, in the order in which their keys first appeared; every value is text."""
+        """All rows, in the order in which their keys first appeared. All values are text."""
         return list(self._rows.values())
 
     def __contains__(self, key: Sequence[Any]) -> bool:
@@ -72,13 +80,15 @@ class Journal:
         return self._rows[tuple(map(str, key))]
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Appends rows to the file, and returns when the rows are on disk.
+        """Appends rows to the file, and returns after the rows have been written to disk.
 
         **Arguments:**
 
-        - `rows`: rows with the columns of the file. If the file has no columns yet, the first row sets them.
+        - `rows`: rows with the columns of the file. If the file has no columns yet, the first row defines the
+          columns.
 
-        **Raises:** `InputError` if a row has other columns than the file, or if the file cannot be written.
+        **Raises:** `InputError` if the columns of a row differ from the columns of the file, or if the file
+        cannot be written.
         """
         if not rows:
             return
@@ -100,18 +110,19 @@ class Journal:
                 os.fsync(file.fileno())
         except OSError as error:
             raise InputError(
-                f"{self.path}: cannot be written ({error.strerror}): make room there, or give another "
-                "--output."
+                f"{self.path}: cannot be written ({error.strerror}): check the directory and its free space, "
+                "or give another --output."
             ) from error
         self._fields = fields
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrites the file with the rows of `keys`, in this order, and drops all other rows.
+        """Rewrites the file with one row for each of `keys`, in the order of `keys`, and removes other rows.
 
-        Workers finish in an arbitrary order, so rows are appended in an arbitrary order.
+        The order of appended rows is arbitrary, because workers finish their tasks in an arbitrary order.
 
-        **Raises:** `KeyError` if no row has one of the keys; `InputError` if the file cannot be written.
+        **Raises:** `KeyError` if the journal has no row for a key; `InputError` if the file cannot be
+        written.
         """
         self._rows = {tuple(map(str, key)): self._rows[tuple(map(str, key))] for key in keys}
         with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
@@ -120,7 +131,7 @@ class Journal:
             writer.writerows(self.rows)
 
     def _read(self, contents: bytes, columns: Columns) -> None:
-        """Parses whole lines, checks their values, and keeps their rows.
+        """Parses complete lines, checks their values, and stores their rows in memory.
 
         **Raises:** `InputError` if the contents are not a table with these columns.
         """
@@ -142,7 +153,9 @@ class Journal:
                 try:
                     columns.get(name, str)(value)
                 except ValueError:
-                    raise self._fault(number, f"has {value[:40]!a} in the column {name}") from None
+                    raise self._fault(
+                        number, f"has {value[:40]!a} in the column {name}, which is not a valid value"
+                    ) from None
         self._remember(dict(zip(header, fields, strict=True)) for _, fields in lines[1:])
 
     def _fault(self, line: int, what: str) -> InputError:
@@ -171,17 +184,18 @@ def claimed_directory(
 ) -> Iterator[None]:
     """Locks a directory against other processes while results are added.
 
-    The function is a context manager; the lock ends with the `with` block. The first call writes the origin
-    of the results to `provenance.json`. Later calls check that their origin is the same.
+    The function is a context manager, and releases the lock at the end of the `with` block. The first call
+    for a directory writes `provenance` to the file `provenance.json`. Later calls check that their
+    `provenance` has the same contents.
 
     **Arguments:**
 
     - `directory`: an existing directory.
-    - `provenance`: groups of settings that all results in the directory must share.
-    - `noted`: facts that the first call also writes, and that may differ in later calls.
+    - `provenance`: groups of settings and versions that must be the same for all results in the directory.
+    - `noted`: further information that the first call writes to the file. It may differ in later calls.
 
-    **Raises:** `InputError` if the directory contains results of another origin, if `provenance.json` is
-    damaged, or if another process is adding results.
+    **Raises:** `InputError` if the directory contains results with another `provenance` or without
+    `provenance.json`, if `provenance.json` is damaged, or if another process is adding results.
     """
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)
@@ -221,7 +235,10 @@ def _check_origin(
                         "directory."
                     )
     elif any(directory.glob("*.csv")):
-        raise InputError(f"{directory}: contains results of unknown origin: give another --output.")
+        raise InputError(
+            f"{directory}: contains results of unknown origin, because provenance.json is missing: give "
+            "another --output."
+        )
     else:
         contents = {**wanted, "noted": dict(noted)} if noted else wanted
         with atomic_write(path) as temporary:

@@ -1,4 +1,4 @@
-"""The two kinds of tasks of a benchmark: precompute one shape, and match and evaluate one pair."""
+"""The two kinds of tasks of a benchmark: the precomputation of a shape, and the measurement of a pair."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from jaxsmw.runtime.provenance import machine
 from jaxsmw.runtime.threads import one_blas_thread
 
 CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
-"""The thresholds of stored correspondence quality curves, in square roots of the target's area."""
+"""The thresholds of stored correspondence quality curves, in units of the square root of the area of Y."""
 
 FIGURES = (
     "mean",
@@ -43,19 +43,22 @@ FIGURES = (
     "unreachable",
     "coverage",
 )
-"""The figures of each map in addition to its curve. Lengths are in square roots of the target's area."""
+"""The statistics of a map that are stored in addition to its correspondence quality curve.
+
+Geodesic errors and thresholds are in units of the square root of the area of Y.
+"""
 
 
 def read_curve(text: str) -> list[float]:
-    """Parses a stored curve: the share of points with an error of at most each threshold of `CURVE`.
+    """Parses a correspondence quality curve: for each threshold in `CURVE`, the share of errors up to it.
 
     **Arguments:**
 
     - `text`: the shares, separated by spaces.
 
-    **Returns:** The shares, one per threshold.
+    **Returns:** The shares, one for each threshold.
 
-    **Raises:** `ValueError` if the text does not contain one number per threshold.
+    **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """
     shares = [float(share) for share in text.split()]
     if len(shares) != len(CURVE):
@@ -76,8 +79,8 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
 }
 """The columns of `results.csv`, each with the function that parses its text.
 
-The file has one row per pair and method. `seconds` is the time from the initial map to the result, without
-compilation. `truth` is the ground truth that was used, `direct` or `mirrored`.
+The file has one row for each pair and method. `seconds` is the wall time from the initial map to the final
+map, without compilation. `truth` names the ground truth that was used, `direct` or `mirrored`.
 """
 
 SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
@@ -89,23 +92,24 @@ SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
 }
 """The columns of `shapes.csv`, each with the function that parses its text.
 
-The file has one row per shape. `digest` is a hash of the mesh file.
+The file has one row for each shape. `digest` is a hash of the mesh file.
 """
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a benchmark. Results depend on these settings, the data and the code only.
+    """The settings of a benchmark. Results depend only on these settings, the data and the code.
 
     **Attributes:**
 
-    - `init`: the initial map of all methods: the name of an initial map (see `jaxsmw.match`), or a directory
-      with maps `X_Y.map`.
-    - `mirrored`: whether to use the mirrored ground truth for a map that is closer to it than to the direct
-      ground truth. This setting is for methods and initial maps that cannot tell left from right.
-    - `evaluated_points`: the number of evaluated rows of each ground truth, the same rows for all methods;
-      all rows if None.
-    - `seed`: the seed with which these rows are drawn.
+    - `init`: the initial map from which all methods start: the name of an initial map (see `jaxsmw.match`),
+      or a directory with initial maps in files `X_Y.map`.
+    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. The errors
+      are then stored for the ground truth with the smaller mean error. This setting is for methods and
+      initial maps that cannot tell left from right.
+    - `evaluated_points`: the number of rows of each ground truth that are evaluated. The rows are the same
+      for all methods. If None, all rows are evaluated.
+    - `seed`: the seed of the random draw of these rows.
 
     **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
     """
@@ -116,7 +120,7 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+        # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not self.is_descriptor and not os.path.isdir(self.init):
             raise InputError(
                 f"{self.init!r} is not an initial map: choose from {', '.join(INITIAL_MAPS)}, or give a "
@@ -125,11 +129,11 @@ class Settings:
 
     @property
     def is_descriptor(self) -> bool:
-        """Whether the initial maps are computed from a descriptor."""
+        """Whether the initial maps are computed, and not read from a directory."""
         return self.init in INITIAL_MAPS
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Checks that every pair has an initial map.
+        """Checks that the directory with initial maps, if there is one, has a map for every pair.
 
         **Raises:** `InputError` if a file with an initial map is missing.
         """
@@ -139,7 +143,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Task:
-    """A pair, and the methods to measure on that pair, by name."""
+    """A pair, and the methods to run on this pair, as a dictionary from names to methods."""
 
     pair: DataPair
     methods: dict[str, Method]
@@ -159,12 +163,12 @@ def file_digest(file: Path) -> str:
 
 
 def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures the wall times.
+    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures both wall times.
 
     **Arguments:**
 
     - `shape`: the name of the shape and its mesh file.
-    - `number_of_eigenvectors`: k of the spectrum.
+    - `number_of_eigenvectors`: the number of eigenvectors of the spectrum.
 
     **Returns:** One row with `SHAPE_COLUMNS`; times are in seconds.
 
@@ -184,15 +188,17 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 
 
 def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
-    """Matches a pair with every method, and evaluates the maps.
+    """Matches a pair with every method of a task, and measures the errors of the maps.
 
     **Arguments:**
 
     - `task`: the pair and the methods.
-    - `settings`: the initial map and the evaluation.
-    - `number_of_eigenvectors`: k of the spectra, at least the number that any method uses.
+    - `settings`: the settings of the benchmark.
+    - `number_of_eigenvectors`: the number of eigenvectors of the spectra, at least the largest number that a
+      method uses.
 
-    **Returns:** One row with `RESULT_COLUMNS` for each method. All figures of a failed map are NaN.
+    **Returns:** One row with `RESULT_COLUMNS` for each method. If a method failed, all statistics of its map
+    are NaN.
 
     **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
@@ -223,9 +229,9 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
 
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
-    """Runs a method, and returns its map, its result and its time.
+    """Runs a method, and returns its map, its status code (`RESULTS`) and its wall time in seconds.
 
-    The time is in seconds and leaves out compilation. The time of published maps is NaN.
+    The time does not include compilation. For published maps the time is NaN.
     """
     for _ in range(2):
         with _CompilationClock() as compilation, one_blas_thread():
@@ -234,8 +240,8 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
             seconds = time.perf_counter() - began - compilation.seconds
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
-        # A first run takes longer than later runs, for example because of imports. In a long run the
-        # difference is negligible.
+        # The first run of a method takes longer than later runs, for example because of imports, so the
+        # method runs a second time. If the first run is long, the difference is negligible.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
@@ -248,7 +254,7 @@ _warm: set[str] = set()
 
 
 class _CompilationClock:
-    """Adds up the seconds that XLA spends compiling in this process during its `with` block."""
+    """A context manager that adds up the seconds that XLA spends on compilation in this process."""
 
     def __enter__(self) -> _CompilationClock:
         self.seconds = 0.0
@@ -269,9 +275,9 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Returns the figures of a map, measured with the ground truth that is closest to the map.
+    """Returns the statistics of a map, for the ground truth with the smallest mean error.
 
-    If the method failed, all figures are NaN.
+    If the method failed, all statistics are NaN.
     """
     if (pointwise_map < 0).any():
         return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}

@@ -1,4 +1,4 @@
-"""The quality of a pointwise map: geodesic errors, their statistics, and coverage."""
+"""Measures of the quality of a pointwise map: geodesic errors, their statistics, and coverage."""
 
 from __future__ import annotations
 
@@ -20,21 +20,26 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# The thresholds of reported shares and the end of reported curves, in square roots of the target's area.
+# Reports contain the share of points with an error of at most each of `THRESHOLDS`. Reported correspondence
+# quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the target's area.
 THRESHOLDS = (0.02, 0.05, 0.1)
 LARGEST_THRESHOLD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class GeodesicError:
-    """The geodesic errors of a map at some points, in square roots of the target's area.
+    """The geodesic errors of a pointwise map X -> Y, as `geodesic_error` returns them.
+
+    All errors and thresholds are in units of the square root of the area of Y. The properties `mean`,
+    `median`, `within` and `unreachable` and the methods `correspondence_quality_curve` and `area_under_curve`
+    compute statistics of the errors. `as_dictionary` returns all statistics for JSON.
 
     **Attributes:**
 
-    - `errors`: the error of each evaluated row of the ground truth (p,); inf where the match and the true
-      point are on different connected components of the target.
-    - `source_vertices`: the vertex of X for each error (p,).
-    - `method`: the method that computed the geodesic distances.
+    - `errors`: the error of each evaluated row of the ground truth (p,). An error is inf if the match and the
+      true point are on different connected components of Y.
+    - `source_vertices`: the 0-based vertex of X to which each error belongs (p,).
+    - `method`: the method that computed the geodesic distances, `"strips"` or `"exact"`.
     """
 
     errors: Float64[np.ndarray, " p"]
@@ -43,31 +48,32 @@ class GeodesicError:
 
     @property
     def unreachable(self) -> float:
-        """The share of points whose match is on another connected component than the true point."""
+        """The share of points whose match and true point are on different connected components of Y."""
         return float(np.isinf(self.errors).mean())
 
     @property
     def mean(self) -> float:
-        """The mean error of all points but those that `unreachable` counts; inf if no point is left.
+        """The mean of all finite errors; inf if no error is finite.
 
-        Report `unreachable` together with this mean.
+        An error is infinite if the match and the true point are on different connected components of Y.
+        Report the share of infinite errors, `unreachable`, together with this mean.
         """
         reachable = self.errors[np.isfinite(self.errors)]
         return float(reachable.mean()) if len(reachable) else np.inf
 
     @property
     def median(self) -> float:
-        """The median over all points. Unreachable points count with an infinite error."""
+        """The median of all errors, including the infinite errors that `mean` leaves out."""
         return float(np.median(self.errors))
 
     @property
     def within(self) -> dict[float, float]:
-        """The share of points with an error of at most 0.02, 0.05 and 0.1, by threshold."""
+        """The shares of points with an error of at most 0.02, 0.05 and 0.1, as a dictionary by threshold."""
         shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
         return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
 
     def __str__(self) -> str:
-        """The main figures in one line."""
+        """The main statistics of the errors, as one line of text."""
         within = ", ".join(f"{share:.1%} within {threshold}" for threshold, share in self.within.items())
         elsewhere = f"; {self.unreachable:.2%} on another component" if self.unreachable else ""
         return (
@@ -76,9 +82,9 @@ class GeodesicError:
         )
 
     def as_dictionary(self) -> dict[str, Any]:
-        """Returns the main figures and the correspondence quality curve as a dictionary for JSON.
+        """Returns the main statistics and the correspondence quality curve as a dictionary for JSON.
 
-        A mean or median that is infinite becomes None. The curve has 251 thresholds from 0 to 0.25.
+        An infinite mean or median becomes None. The curve has 251 equally spaced thresholds from 0 to 0.25.
         """
         thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
@@ -96,11 +102,11 @@ class GeodesicError:
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
-        """Returns the share of points with an error of at most each threshold (Kim et al. 2011).
+        """Returns, for each threshold, the share of points with at most this error (Kim et al. 2011).
 
         **Arguments:**
 
-        - `thresholds`: the thresholds (t,), in square roots of the target's area, in any order.
+        - `thresholds`: the thresholds (t,) in any order, in units of the square root of the area of Y.
 
         **Returns:** The shares (t,), in [0, 1].
         """
@@ -111,13 +117,13 @@ class GeodesicError:
         """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
 
         The curve has a step at each error e, so its mean height is exactly the mean of
-        `max(0, 1 - e/largest)`. The value is in [0, 1]; a perfect map has 1.
+        `max(0, 1 - e/largest)` over all errors. The value is in [0, 1]. It is 1 if all errors are zero.
 
         **Arguments:**
 
-        - `largest`: the largest threshold, in square roots of the target's area.
+        - `largest`: the largest threshold, a positive number in units of the square root of the area of Y.
 
-        **Raises:** `InputError` if the threshold is not positive.
+        **Raises:** `InputError` if `largest` is not positive.
         """
         if not largest > 0:
             raise InputError(f"the largest threshold is {largest}: give a positive number.")
@@ -133,34 +139,37 @@ def geodesic_error(
     number_of_samples: int | None = None,
     seed: int = 0,
 ) -> GeodesicError:
-    """Computes the geodesic error of each match: its geodesic distance on Y to the true point.
+    """Computes the geodesic error of each match: the geodesic distance on Y from the match to the true point.
 
-    Distances are divided by the square root of the target's area (Kim, Lipman and Funkhouser 2011), so errors
-    do not depend on the unit of length or the size of a shape.
+    Distances are divided by the square root of the area of Y (Kim, Lipman and Funkhouser 2011). Errors
+    therefore do not depend on the unit of length or on the size of a shape.
 
     **Arguments:**
 
     - `mesh_y`: the target Y.
     - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y or as `SurfacePoints` on Y.
-    - `ground_truth`: the true points on Y of some vertices of X.
-    - `method`: the method for distances; see `jaxsmw.geometry.geodesics.geodesic_distances`.
-    - `number_of_samples`: the number of rows of the ground truth to evaluate, drawn without replacement. By
-      default, and if there are fewer rows, all rows are evaluated.
-    - `seed`: the seed of the draw.
+    - `ground_truth`: the `GroundTruth` of X and Y, with the true points on Y of some or all vertices of X.
+    - `method`: the method that computes geodesic distances. `"strips"` (the default) finds shortest paths
+      along edges and straight shortcuts, which on bodies are 0.03 to 0.07 % too long on average. `"exact"`
+      takes about 100 times as long, and works only between vertices of a manifold mesh.
+    - `number_of_samples`: the number of rows of the ground truth to evaluate, drawn at random without
+      replacement. If None (the default), or if the ground truth has fewer rows, all rows are evaluated.
+    - `seed`: the seed of the random draw.
 
-    **Returns:** A `GeodesicError`.
+    **Returns:** A `GeodesicError` with one error for each evaluated row of the ground truth.
 
-    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other, if the ground
-    truth is empty, if `number_of_samples` is less than 1, or if the method `"exact"` is not available.
+    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other; if the ground
+    truth is empty; if `number_of_samples` is less than 1; or if `"exact"` cannot be used (see
+    `jaxsmw.geodesic_distances`).
     """
     images = check_points(pointwise_map, mesh_y, "pointwise map")
     targets = check_points(ground_truth.targets, mesh_y, "ground truth")
     sources = ground_truth.source_vertices
     if len(sources) == 0:
-        raise InputError("ground truth: it has no rows: give the true point of at least one source vertex.")
+        raise InputError("the ground truth has no rows: give the true point of at least one source vertex.")
     if not 0 <= sources.min() <= sources.max() < len(images):
         raise InputError(
-            f"ground truth: its source vertices are numbered {sources.min()} to {sources.max()}, but the "
+            f"ground truth: the source vertices are numbered {sources.min()} to {sources.max()}, but the "
             f"pointwise map has {len(images)} entries: give the map and the ground truth of the same source "
             "mesh."
         )
@@ -176,14 +185,15 @@ def geodesic_error(
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Returns the coverage of a map: the share of the target's area that belongs to matched vertices.
 
-    The coverage is in [0, 1] and needs no ground truth.
+    Each matched vertex of Y contributes its vertex area, a third of the area of the triangles around it. The
+    coverage is in [0, 1]. Its computation needs no ground truth.
 
     **Arguments:**
 
     - `mesh_y`: the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
 
-    **Raises:** `InputError` if the map does not fit the mesh.
+    **Raises:** `InputError` if an entry of the map is not a vertex of Y.
     """
     image = np.unique(
         check_indices(pointwise_map, len(mesh_y.vertices), f"pointwise map on {mesh_y.name}: vertex")

@@ -1,4 +1,4 @@
-"""Prepares a pair for the compared methods, with the preparation of `jaxsmw.match`."""
+"""Prepares a pair of shapes for the compared methods, in the same way as `jaxsmw.match`."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ def prepare_pair(
     number_of_descriptors: int = 0,
     both_directions: bool = False,
 ) -> MethodInput:
-    """Computes the input that all methods share: spectra, descriptors, initial maps and samples.
+    """Computes the input that all compared methods share: spectra, descriptors, initial maps and samples.
 
     **Arguments:**
 
-    - `data`: the names of the two shapes, and whether X is a partial shape.
+    - `data`: the pair in its data set. Only its `names` and its flag `partial` are used.
     - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
-    - `init`: the name of an initial map (see `jaxsmw.match`), or a directory with initial maps `X_Y.map`.
-    - `number_of_eigenvectors`: k of both spectra.
+    - `init`: the name of an initial map (see `jaxsmw.match`), or a directory with initial maps in files
+      `X_Y.map`.
+    - `number_of_eigenvectors`: the number k of eigenvectors of both spectra.
     - `number_of_descriptors`: the number of principal components of SHOT; 0 for no descriptors.
     - `both_directions`: whether to compute the initial map Y -> X as well.
 
-    **Returns:** A `MethodInput`, with arrays padded as `jaxsmw.match` pads them.
+    **Returns:** A `MethodInput`, with arrays padded to the same sizes as in `jaxsmw.match`.
 
     **Raises:** `InputError` if a spectrum or an initial map cannot be computed, or if the directory has no
     usable initial map X -> Y; `ArithmeticError` if the computation of an initial map fails numerically.
@@ -60,15 +61,15 @@ def prepare_pair(
 
 
 def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:
-    """Returns the argument `init` of `prepare`: the name of an initial map, or the map from a directory."""
+    """Returns the argument `init` of `prepare`: the name of an initial map, or a map from a directory."""
     return init if init in INITIAL_MAPS else read_published_map(Path(init), names, pair.meshes)
 
 
 def _reverse_initial_map(data: DataPair, prepared: PreparedPair, init: str) -> Int64[np.ndarray, " n"]:
-    """Returns the initial map Y -> X, found in the same way as the initial map X -> Y.
+    """Returns the initial map Y -> X, which is computed or read in the same way as the initial map X -> Y.
 
-    If a directory with initial maps contains no map Y -> X, the map is computed from the functional map of
-    the initial map X -> Y.
+    If a directory with initial maps contains no map Y -> X, the initial map X -> Y is converted to a
+    functional map, from which the map Y -> X is computed.
     """
     names, reversed_ = (data.target, data.source), prepared.pair.reversed()
     if init in INITIAL_MAPS or published_file(Path(init), names).is_file():

@@ -1,7 +1,7 @@
-"""Runs tasks in worker processes: on this machine, or on a Dask cluster.
+"""Runs tasks in worker processes on this machine or on a Dask cluster.
 
-The settings that limit a process to one core apply to the workers only. The environment, the JAX caches and
-the other child processes of the calling process stay unchanged.
+Each worker process on this machine is limited to one core. This limit does not affect the calling process:
+its environment variables, its JAX caches and its other child processes stay unchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from jaxsmw.runtime.compilation import release_programs
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# One core per process: thread pools that share cores wait for each other in busy loops.
+# The environment variables that limit a process to one core. If several processes share cores, their threads
+# wait for each other in busy loops.
 _ONE_CORE = {
     "JAX_PLATFORMS": "cpu",
     "PJRT_NPROC": "1",
@@ -35,9 +36,10 @@ _ONE_THREAD_FLAG = "--xla_cpu_multi_thread_eigen=false"
 
 
 class Workers(ProcessPoolExecutor):
-    """Worker processes on this machine with one core each. JAX runs on the CPU, even if there is a GPU.
+    """An executor with worker processes on this machine, each limited to one core.
 
-    If an exception ends the `with` block, the processes are terminated at once.
+    In the workers JAX runs on the CPU, even if there is a GPU. If an exception ends the `with` block, the
+    processes are terminated immediately.
 
     **Arguments:**
 
@@ -62,9 +64,9 @@ class Workers(ProcessPoolExecutor):
 class _OneCoreProcess(SpawnProcess):
     """A process that is limited to one core.
 
-    The environment variables must be set before the process starts. NumPy and JAX read these variables only
-    once, on import. A worker imports the main module of the calling program, and perhaps NumPy and JAX with
-    it, before it runs any function of this library.
+    The environment variables that set this limit must exist before the process starts, because NumPy and JAX
+    read them only once, on import. A worker imports the main module of the calling program before it runs any
+    function of this library. This main module may import NumPy and JAX.
     """
 
     def start(self) -> None:
@@ -73,7 +75,7 @@ class _OneCoreProcess(SpawnProcess):
 
 
 class _OneCoreContext(SpawnContext):
-    """Starts processes with one core each, and keeps a list of them."""
+    """Creates processes that are limited to one core each, and keeps a list of these processes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -92,7 +94,7 @@ def _one_thread_flags() -> str:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables for the milliseconds in which a process starts, then restores them."""
+    """Sets environment variables while a process starts, which takes milliseconds, then restores them."""
     with _starting:
         before = {name: os.environ.get(name) for name in variables}
         os.environ.update(variables)
@@ -111,9 +113,9 @@ _starting = threading.Lock()
 
 
 def _start_worker() -> None:
-    """Makes a worker ignore Ctrl-C, and makes it exit when the calling process exits.
+    """Makes a worker ignore Ctrl-C, and makes the worker exit when the calling process exits.
 
-    The calling process handles Ctrl-C.
+    Only the calling process handles Ctrl-C.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -127,7 +129,7 @@ def _start_worker() -> None:
 
 
 def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Calls a function in a worker, after releasing compiled programs if they take too much memory.
+    """Calls a function in a worker, after the release of compiled programs if they use too much memory.
 
     A worker processes many pairs of different sizes, and each size needs its own compiled programs.
     """
@@ -136,7 +138,7 @@ def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options:
 
 
 class _DaskWorkers(Executor):
-    """The workers of a Dask cluster. Like local workers, they release compiled programs between tasks."""
+    """An executor for the workers of a Dask cluster. Compiled programs are released between tasks."""
 
     def __init__(self, executor: Executor):
         self._executor = executor
@@ -150,7 +152,8 @@ class _DaskWorkers(Executor):
 def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Executor]:
     """Starts local worker processes, or connects to the workers of a Dask cluster.
 
-    The function is a context manager. The local processes or the connection end with the `with` block.
+    The function is a context manager. When the `with` block ends, the local processes end or the connection
+    is closed.
 
     **Arguments:**
 
@@ -169,17 +172,18 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
         from distributed import Client
     except ImportError:
         raise InputError(
-            "--scheduler needs Dask's package distributed: install it with pip install 'jaxsmw[cluster]'."
+            "--scheduler needs the package distributed of Dask: run pip install 'jaxsmw[cluster]'."
         ) from None
     try:
-        # Checked first, because a client that fails for lack of a port leaves threads that log errors later.
+        # The port is checked before the client is created, because a client that fails without a port leaves
+        # threads that log errors later.
         if urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}").port is None:
             raise ValueError("the address has no port")
         client = Client(scheduler, timeout=5, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"{scheduler}: no Dask scheduler answers at this address ({error}): start a scheduler, or give "
-            "its address."
+            f"{scheduler}: no Dask scheduler answers at this address ({error}): start a scheduler there, or "
+            "give the address of a running scheduler."
         ) from error
     with client:
         yield _DaskWorkers(client.get_executor(pure=False, retries=2))
@@ -192,16 +196,18 @@ def run_tasks(
 
     **Arguments:**
 
-    - `function`: called once with each task. The function and the tasks must be picklable.
-    - `tasks`: the tasks by name.
-    - `executor`: runs the calls; see `open_executor`.
+    - `function`: the function that is called once with each task. The function and the tasks must be
+      picklable.
+    - `tasks`: a dictionary from names to tasks.
+    - `executor`: the executor that runs the calls; see `open_executor`.
 
     **Yields:** The name of a task and its result, in the order in which the tasks end. If a task raised an
     exception, the exception takes the place of the result.
     """
     futures = {executor.submit(function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
-        # Removed from the dictionary, so that the memory of a result is freed after the result is yielded.
+        # The future is removed from the dictionary, so that the memory of its result is freed after the
+        # result is yielded.
         name = futures.pop(future)
         error = future.exception()
         yield name, future.result() if error is None else error

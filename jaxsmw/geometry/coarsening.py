@@ -21,12 +21,15 @@ class Coarsening(NamedTuple):
 
     **Attributes:**
 
-    - `prolongation`: P (n, c), from coefficients to values at vertices. Its rows sum to one.
-    - `stiffness`, `mass`: P^T W P and P^T A P, (c, c).
-    - `smooth`: a low-pass filter for values (n, j). It keeps the frequencies that the cells can represent,
-      and slightly higher frequencies.
+    - `prolongation`: the matrix P (n, c), which takes c coefficients to values at n vertices. Each row of P
+      sums to one.
+    - `stiffness`, `mass`: P^T W P and P^T A P, (c, c), where W and A are the matrices of the original
+      eigenproblem.
+    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter keeps the
+      frequencies that the subspace can represent, and slightly higher frequencies.
 
-    Prolongation and smoothing are in single precision, whose errors are far below those of the subspace.
+    Prolongation and smoothing use single precision. Their rounding errors are far smaller than the errors
+    that the projection onto the subspace causes.
     """
 
     prolongation: sp.csr_matrix
@@ -39,26 +42,30 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     """Coarsen an eigenproblem by smoothed aggregation of vertices into cells.
 
     The cells surround evenly spread seeds. The smoothed indicator functions of the cells span the subspace.
-    Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-    problems", Computing 1996. Here a single step suffices for cells of any size. The reason is the degree of
-    the smoothing Chebyshev polynomial, which is one and a half times the radius of the cells in edges. (With
-    a degree equal to the radius, coarsening takes a fifth less time, but the errors of eigenvalues are ten
-    times as large.)
+    The method follows Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and
+    fourth order elliptic problems", Computing 1996.
+
+    In contrast to that method, a single coarsening step suffices for cells of any size. The indicator
+    functions are smoothed by a Chebyshev polynomial. Its degree is 1.5 times the radius of the cells,
+    measured in edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of
+    the eigenvalues are ten times as large.)
 
     **Arguments:**
 
-    - `stiffness`: W (n, n), symmetric, of one connected component. Its entries are the edges of the mesh.
-    - `mass`: A (n, n).
+    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. Its entries off the
+      diagonal correspond to the edges of the mesh.
+    - `mass`: the mass matrix A (n, n).
     - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 
-    **Returns:** The projected eigenproblem.
+    **Returns:** The projected eigenproblem as a `Coarsening`.
 
-    **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbors that
-    smoothed indicators would overlap everywhere, or if large cells cover more than a tenth of the area.
+    **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbours that
+    the smoothed indicator functions would overlap everywhere, or if large cells cover more than 10 % of the
+    area.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
-        raise RuntimeError(f"a vertex has {most - 1} neighbors")
+        raise RuntimeError(f"a vertex has {most - 1} neighbours")
     # If seeds are more than r edges apart, a cell has about 1.25 (r + 1)² vertices on average.
     radius = max(1, round((n / (1.25 * dimensions)) ** 0.5) - 1)
     stiffness = stiffness.tocsr()
@@ -69,7 +76,7 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     areas = cells.T @ mass.diagonal()
     share = areas[areas > _LARGE * areas.sum() / min(dimensions, len(areas))].sum() / areas.sum()
     if share > _MOST_IN_LARGE:
-        raise RuntimeError(f"{share:.0%} of the area is in triangles much larger than the others")
+        raise RuntimeError(f"{share:.0%} of the area is in triangles that are much larger than the rest")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
     degree = (3 * (radius + 1) + 1) // 2
     prolongation = smoother(cells, degree)
@@ -83,14 +90,15 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
 
 _MOST_NEIGHBORS = 100
-# A cell is large if its area is four times the mean or more. Large cells may cover this share of the area.
+# A cell is large if its area is more than `_LARGE` times the mean area of a cell. Large cells may cover at
+# most the share `_MOST_IN_LARGE` of the total area.
 _LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
     """Return the indicator functions (n, c) of the cells. Each cell has one seed.
 
-    Each vertex joins the cell whose seed is the smallest number of edges away.
+    Each vertex joins the cell of the nearest seed. Distances are counted in edges.
     """
     n = graph.shape[0]
     seeds = maximal_independent_set(graph, radius)
@@ -100,17 +108,18 @@ def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
 
 
 class _Smoother:
-    """Chebyshev polynomials of D^-1 W, with D the diagonal of W, as low-pass filters that keep constants.
+    """A low-pass filter for functions on a mesh, which leaves constant functions unchanged.
 
-    High frequencies are those that cells of a given number of vertices cannot represent: eigenvalues of D^-1
-    W above 1.5 times the largest eigenvalue divided by that number. (Factors from 1 to 3 give about the same
-    accuracy on bodies.)
+    The filter is a Chebyshev polynomial of D^-1 W, where W is the stiffness matrix and D is the diagonal of
+    W. The filter damps the frequencies that cells of `size` vertices cannot represent. These frequencies are
+    the eigenvalues of D^-1 W above 1.5 / `size` times the largest eigenvalue. (Factors from 1 to 3 instead of
+    1.5 give about the same accuracy on bodies.)
     """
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):
         diagonal = stiffness.diagonal()
         if not (diagonal > 0).all():
-            raise RuntimeError("the stiffness matrix has no positive diagonal")
+            raise RuntimeError("the diagonal of the stiffness matrix is not positive")
         root = sp.diags(1 / np.sqrt(diagonal))
         start = np.random.default_rng(0).standard_normal(len(diagonal))
         found = eigsh(root @ stiffness @ root, 1, v0=start, tol=1e-2, return_eigenvectors=False)
@@ -126,14 +135,14 @@ class _Smoother:
         return other
 
     def __call__(self, vectors: Matrix, degree: int) -> Matrix:
-        """Apply p(D^-1 W), with p of the given degree, to vectors, by the three-term recurrence."""
+        """Apply the Chebyshev polynomial of the given degree to vectors (n, j) by a three-term recurrence."""
         slope = self.center / self.half
         ratio = 1 / slope
         step = (self.operator @ vectors) * (-1 / self.center)
         vectors = vectors + step
         for _ in range(degree - 1):
             previous, ratio = ratio, 1 / (2 * slope - ratio)
-            # Dense vectors are updated in place, because they are the largest arrays of all.
+            # Dense vectors are updated in place, because they take more memory than all other arrays.
             step *= ratio * previous
             change = self.operator @ vectors
             change *= 2 * ratio / self.half

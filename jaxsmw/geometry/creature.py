@@ -1,10 +1,10 @@
-"""Procedural creatures: synthetic shapes with exact ground truth, generated from a seed.
+"""Procedural creatures, which are synthetic shapes with exact ground truth.
 
-A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. In the rest pose it is
-exactly mirror symmetric. Marching cubes, decimation and relaxation on the surface give well-shaped
-triangles. Joints deform the surface by smooth functions that depend only on the rest position. So two
-triangulations of one creature in two poses sample two smooth surfaces. Points with the same rest position
-correspond.
+A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. The surface is exactly
+mirror symmetric in the rest pose. Marching cubes, decimation and relaxation on the surface give well-shaped
+triangles. The joints move each point by a smooth function of the point's position in the rest pose. So two
+triangulations of one creature in two poses are samples of two smooth surfaces. Points of these surfaces
+correspond if they have the same position in the rest pose.
 """
 
 from __future__ import annotations
@@ -27,20 +27,22 @@ from jaxsmw.geometry.mesh import Mesh
 _Vector = tuple[float, float, float]
 
 _MINIMUM_VERTICES = 500
-_REACH = 0.25  # the field is a distance up to this value; above this value only its sign is meaningful
-_STIFFNESS = 4.0  # the sharpness of the division of the skin between bones
+_REACH = 0.25  # up to this value, the implicit function is a distance; above it, only the sign is meaningful
+_STIFFNESS = 4.0  # a larger value divides the skin more sharply between the bones
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class CreaturePair:
-    """One creature in two poses with independent triangulations, and the corresponding points.
+    """Two meshes of one creature in two poses, with the ground truth. The triangulations are independent.
+
+    `creature_pair` makes such pairs.
 
     **Attributes:**
 
-    - `source`: the source mesh with m vertices.
-    - `target`: the target mesh with n vertices.
-    - `truth`: the point on the target that corresponds to each source vertex, m `SurfacePoints`.
+    - `source`: the source, a `Mesh` with m vertices.
+    - `target`: the target, a `Mesh` with n vertices.
+    - `truth`: the ground truth as m `SurfacePoints` on the target, one for each source vertex.
     """
 
     source: Mesh
@@ -49,7 +51,11 @@ class CreaturePair:
 
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
-        """The ground truth as a pointwise map (m,): the nearest corner of the triangle of each true point."""
+        """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
+
+        The match of a source vertex is a corner of the triangle that contains the true point. Of the three
+        corners, the corner nearest to the true point is chosen.
+        """
         return self.truth.nearest_corners(self.target)
 
 
@@ -58,12 +64,15 @@ class CreaturePair:
 
 @dataclass(frozen=True)
 class _Tube:
-    """A chain of tapered capsules (hulls of two balls), or of plates (capsules of limited thickness)."""
+    """A chain of tapered capsules. A capsule is the convex hull of two balls.
+
+    If `normal` is given, the chain is a plate: the thickness of its capsules is limited.
+    """
 
     centers: np.ndarray  # (p, 3)
     radii: np.ndarray  # (p,)
     blend: float  # the width of the smooth transition to the rest of the body
-    carved: bool  # whether the tube is subtracted instead of added
+    carved: bool  # whether the tube is subtracted from the body instead of added to it
     normal: np.ndarray | None  # (3,), the unit normal of a plate; None for tubes
     thickness: float  # half the thickness of a plate
 
@@ -99,18 +108,18 @@ def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 
 class _Body:
-    """One individual in the rest pose: an implicit surface around a skeleton.
+    """The body of one individual in the rest pose, as an implicit surface around a skeleton.
 
-    The x axis points to its left, y up and z forward. Parts away from the plane x = 0 are added on both
-    sides, and their joints are called left_… and right_…. Random numbers warp all proportions smoothly, so
-    that eyes stay in the head and toes on the feet.
+    The x axis points to the body's left, the y axis up and the z axis forward. Parts away from the plane
+    x = 0 are added on both sides, and their joints are called left_… and right_…. A random function warps all
+    proportions. The function is smooth, so eyes stay in the head and toes stay on the feet.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
         self.joints: dict[str, int] = {}
         self.parents: list[int] = []
         self._pivots: list[np.ndarray] = []
-        self._guides: list[tuple[int, np.ndarray]] = []  # a joint, and two balls (2, 4) whose hull it moves
+        self._guides: list[tuple[int, np.ndarray]] = []  # joints, each with two balls whose hull it moves
         self._tubes: list[_Tube] = []
         self._scale = np.exp(0.05 * random.normal(size=4))
         self._frequencies = 1.5 * random.normal(size=(3, 4))
@@ -123,7 +132,7 @@ class _Body:
         across, up, ahead = (
             chain[:, i, None] * self._frequencies[i] + (i > 0) * self._phases for i in range(3)
         )
-        # An even function of x makes both sides equal.
+        # The warp is an even function of x, so both sides of the body are equal.
         waves = np.cos(across) * np.sin(up + ahead) @ self._amplitudes
         chain[:, [0, 3]] *= np.exp(waves[:, [0, 3]])
         chain[:, [1, 2]] += waves[:, [1, 2]]
@@ -139,16 +148,17 @@ class _Body:
         thickness: float = 0.0,
         joint: str = "",
     ) -> None:
-        """Add or carve a tube, or a plate, through the balls.
+        """Add a tube or a plate through the balls to the body, or carve it out of the body.
 
-        If the tube projects far from the body, `joint` is the name of the joint that moves the tube.
+        `joint` is the name of the joint that moves the tube. The name is only needed for a tube that projects
+        far from the body.
         """
         chain = self._individual(balls)
         if joint:
             for prefix, side in self._sides(chain):
                 owner = self.joints[prefix + joint if prefix + joint in self.joints else joint]
                 self._guides += [(owner, hull) for hull in _hulls(side)]
-        if len(chain) > 2:  # interpolation rounds the corners
+        if len(chain) > 2:  # interpolation rounds the corners of the chain
             knots = np.r_[0, np.linalg.norm(np.diff(chain[:, :3], axis=0), axis=1).cumsum()]
             fine = np.interp(np.linspace(0, len(chain) - 1, 3 * len(chain) - 2), np.arange(len(chain)), knots)
             chain = PchipInterpolator(knots, chain)(fine)
@@ -173,7 +183,11 @@ class _Body:
         return [("", chain)]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the field (p,), which is 0 on the skin, negative inside, and a distance up to `_REACH`."""
+        """Return the values (p,) of the implicit function at points (p, 3).
+
+        The implicit function is 0 on the skin and negative inside the body. Values up to `_REACH` are
+        distances to the skin.
+        """
         folded = np.stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]])
         result = np.full(len(points), 2 * _REACH)
         for tube in self._tubes:
@@ -209,10 +223,12 @@ class _Body:
         return points - np.clip(value / length, -0.03, 0.03)[:, None] * normals, normals
 
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
-        """Return the rotation vectors (j, 3) of the joints in radians, with variations of this individual.
+        """Return the rotation vectors (j, 3) of the joints in radians, with small random changes.
 
-        `pose` lists joints with three angles in degrees, which turn the nose down, turn the nose to the left,
-        and raise the left side. A joint name without a side applies to both sides, mirrored.
+        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. On
+        the head, for example, a positive first angle turns the nose down. A positive second angle turns the
+        nose to the left, and a positive third angle raises the left side. A name without `left_` or `right_`
+        applies to the joints on both sides, with mirrored rotations.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -226,8 +242,8 @@ class _Body:
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """Return the positions of points (p, 3) after the rotations of the joints.
 
-        Every point rotates by its share of each joint's angle. Unlike averages of matrices, shares of an
-        angle neither shrink a flexed joint nor collapse a twisted joint.
+        Each joint rotates a point by the point's share of the joint's angle. Averages of rotation matrices
+        would shrink the skin around a flexed joint and collapse it around a twisted joint.
         """
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:
@@ -237,7 +253,7 @@ class _Body:
             depth = np.linalg.norm(points - nearest[:, :3], axis=1) / nearest[:, 3]
             shares[:, joint] += np.exp(-_STIFFNESS * depth)
         shares /= shares.sum(axis=1, keepdims=True)
-        for joint in range(len(angles) - 1, 0, -1):  # a joint moves everything beyond it
+        for joint in range(len(angles) - 1, 0, -1):  # a joint also moves the parts of all its descendants
             shares[:, self.parents[joint]] += shares[:, joint]
         for joint in range(len(angles) - 1, -1, -1):
             turn = Rotation.from_rotvec(shares[:, joint, None] * angles[joint])
@@ -254,12 +270,16 @@ def _hulls(chain: np.ndarray) -> np.ndarray:
 
 
 def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes on a randomly rotated and shifted grid that is refined only near the skin."""
+    """Triangulate the skin by marching cubes on a randomly rotated and shifted grid.
+
+    The grid is refined only near the skin.
+    """
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     corners = np.array([(*corner, top) for top in (0, 1) for corner in square])
-    # A cell may contain skin if the field at its center is less than 1.3 times its width. Half the diagonal
-    # is 0.87 times the width, and the field can overestimate distances.
+    # A cell can contain skin only if the absolute value of the implicit function at the cell's centre is less
+    # than 1.3 times the cell's width. Half the diagonal of a cell is only 0.87 times the width, but the
+    # implicit function can overestimate distances.
     level = int(np.log2(_REACH / (1.3 * spacing)))
     extent = int(np.ceil(body.extent / spacing / 2**level)) + 1
     cells = np.stack(np.meshgrid(*[np.arange(-extent, extent)] * 3), axis=-1).reshape(-1, 3)
@@ -279,9 +299,9 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
 
 
 def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Flip edges whose opposite angles sum to more than 180 degrees.
+    """Flip edges whose opposite angles sum to more than 180 degrees, in several rounds.
 
-    The edges that one round flips have no common faces.
+    No two edges that are flipped in the same round share a face.
     """
     faces = faces.copy()
     for _ in range(20):
@@ -314,22 +334,25 @@ def _unit_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return well-shaped triangles, with `count` vertices, of the body in the rest pose."""
+    """Triangulate the body in the rest pose by well-shaped triangles with exactly `count` vertices.
+
+    **Returns:** Vertices (count, 3) and faces (f, 3).
+    """
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per grid square. The spacing gives four times the wanted number of
-    # vertices.
+    # Marching cubes give 1.5 vertices per square of the grid's spacing. With this spacing, they give four
+    # times the wanted number of vertices.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
         is_sphere = igl.facet_components(faces)[0] == 1 and 2 * len(vertices) - len(faces) == 4
-        if is_sphere:  # in topology
+        if is_sphere:  # topologically
             break
-        spacing *= 0.8  # a grid can break or bridge parts thinner than its cells
+        spacing *= 0.8  # a coarse grid can break thin parts, and can bridge narrow gaps between parts
     else:
         raise InputError("The creature of this seed has parts that touch each other: choose another seed.")
-    # Decimation collapses the shortest edges. Lengths are measured in positions and, with a small weight, in
-    # normals, so curved regions stay denser.
+    # Decimation collapses the shortest edges. The length of an edge includes the difference of the normals at
+    # its ends, with a small weight. Therefore curved regions keep more vertices.
     features = np.hstack([vertices, 0.07 * body.project(vertices)[1]])
     features, faces, _, _ = igl.decimate(
         np.asfortranarray(features), np.asfortranarray(faces, dtype=np.int32), 2 * count - 4
@@ -348,11 +371,11 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     return vertices, _flipped_to_delaunay(vertices, faces)
 
 
-# ------------------------------------------------------------------------------------------------- the kinds
+# ---------------------------------------------------------------------------------------- kinds of creatures
 
 
 def _quadruped(body: _Body) -> None:
-    """A fox."""
+    """Build a fox."""
     add, limb = body.add, body.limb
     limb("hips chest", "", "0 .8 -.4 .165, 0 .8 -.08 .15, 0 .8 .26 .185", blend=0.08)
     add("0 .71 .1 .14, 0 .76 .28 .14", blend=0.08)  # deep chest
@@ -377,11 +400,12 @@ def _quadruped(body: _Body) -> None:
     hindleg = ".11 .76 -.4 .15, .165 .5 -.26 .1, .15 .25 -.5 .045, .15 .07 -.45 .055"
     limb("hip knee hock", "hips", hindleg, blend=0.07)
     limb("foot", "hock", ".15 .055 -.45 .056, .15 .05 -.35 .055", blend=0.03)
-    add(".17 .5 .15 .05, .175 .37 .17 .04", blend=0.04)  # muscles outside distinguish left from right
+    # Muscles on the outer side of each leg distinguish the left leg from the right leg.
+    add(".17 .5 .15 .05, .175 .37 .17 .04", blend=0.04)
     add(".18 .46 -.28 .06, .18 .36 -.4 .045", blend=0.04)
     add(".12 .13 .23 .032, .1 .12 .27 .024", blend=0.015)  # dewclaw
     add(".165 .26 -.51 .034, .175 .28 -.55 .024", blend=0.015)  # heel
-    for z in (0.32, -0.35):  # toes, the outer ones longer
+    for z in (0.32, -0.35):  # toes; the outer toes are longer
         add(f".106 .05 {z - 0.01} .034, .088 .035 {z + 0.03} .026", blend=0.02)
         add(f".148 .05 {z} .034, .148 .035 {z + 0.07} .027", blend=0.02)
         add(f".192 .05 {z} .036, .213 .035 {z + 0.065} .03", blend=0.02)
@@ -408,7 +432,7 @@ _QUADRUPED_POSES = {
 
 
 def _biped(body: _Body) -> None:
-    """A goblin."""
+    """Build a goblin."""
     add, limb = body.add, body.limb
     limb("hips chest", "", "0 .8 0 .17, 0 .98 .005 .155, 0 1.16 -.01 .185", blend=0.06)
     add("0 .92 .05 .12, 0 .99 .05 .11", blend=0.08)  # belly
@@ -438,12 +462,13 @@ def _biped(body: _Body) -> None:
         add(finger, blend=0.01, joint="fingers")
     add(".62 .83 .04 .036, .635 .82 .11 .031, .655 .8 .165 .024", blend=0.02, joint="wrist")  # thumb
     limb("hip knee", "hips", ".105 .76 0 .12, .14 .44 .02 .075, .15 .09 -.03 .05", blend=0.06)
-    add(".165 .38 -.03 .06, .16 .26 -.05 .045", blend=0.04)  # calf, outside: distinguishes left from right
+    # The calf muscle is on the outer side of the leg, so it distinguishes the left leg from the right leg.
+    add(".165 .38 -.03 .06, .16 .26 -.05 .045", blend=0.04)
     add(".13 .47 .07 .045, .13 .43 .075 .04", blend=0.03)  # kneecap
     add(".115 .13 -.03 .032, .11 .12 -.03 .03", blend=0.02)  # ankle
     limb("foot", "knee", ".15 .07 -.02 .055, .16 .055 .14 .055", blend=0.05)
     add(".15 .055 -.06 .055, .155 .055 0 .055", blend=0.03)  # heel
-    add(".12 .055 .14 .048, .1 .05 .225 .042", blend=0.02)  # toes, the inner one big
+    add(".12 .055 .14 .048, .1 .05 .225 .042", blend=0.02)  # toes; the inner toe is the largest
     add(".175 .05 .14 .04, .182 .04 .2 .033", blend=0.02)
     add(".218 .045 .115 .034, .244 .035 .15 .027", blend=0.02)
     tail = "0 .8 -.12 .06, 0 .68 -.32 .042, 0 .62 -.55 .036, 0 .72 -.76 .034, 0 .9 -.84 .04"
@@ -470,7 +495,7 @@ _BIPED_POSES = {
 
 
 def _dragon(body: _Body) -> None:
-    """Six limbs: legs and wings."""
+    """Build a dragon with four legs and two wings."""
     add, limb = body.add, body.limb
     limb("hips chest", "", "0 .56 -.4 .17, 0 .58 -.08 .185, 0 .6 .24 .18", blend=0.08)
     add("0 .5 -.18 .17, 0 .5 .1 .15", blend=0.08)  # belly
@@ -510,7 +535,7 @@ def _dragon(body: _Body) -> None:
     limb("wrist", "elbow", ".22 .075 .17 .065, .22 .065 .26 .06", blend=0.05)
     limb("hip knee", "hips", ".15 .52 -.36 .155, .24 .32 -.26 .115, .22 .09 -.42 .065", blend=0.06)
     limb("foot", "knee", ".22 .075 -.4 .065, .22 .065 -.29 .065", blend=0.05)
-    for z in (0.26, -0.3):  # claws, an inner one turned in, and a spur outside
+    for z in (0.26, -0.3):  # claws, of which the inner claw turns inward, and a spur on the outer side
         add(f".17 .06 {z - 0.05} .04, .12 .035 {z - 0.01} .026", blend=0.02)
         add(f".2 .055 {z} .042, .187 .03 {z + 0.085} .026", blend=0.02)
         add(f".265 .055 {z} .042, .29 .03 {z + 0.07} .026", blend=0.02)
@@ -558,31 +583,32 @@ _KINDS: dict[str, tuple[Callable[[_Body], None], dict[str, str]]] = {
 }
 
 CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_, poses) in _KINDS.items()}
-"""The kinds of creature and their poses."""
+"""The kinds of creatures, each with the names of its poses."""
 
 
 # ------------------------------------------------------------------------------------------ public functions
 
 
 def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest", seed: int = 0) -> Mesh:
-    """Make a creature: a closed mesh without handles, with well-shaped triangles oriented outward.
+    """Make the mesh of a creature.
 
-    The same kind, number of vertices and seed give the same triangles in every pose, so vertex i is always
-    the same point of the body. In the rest pose the body is mirror symmetric in x, but its triangulation is
-    not symmetric.
+    The mesh is closed and has no handles. Its triangles are well shaped and oriented outward. The same kind,
+    number of vertices and seed give the same triangles in every pose, so vertex i is always the same point of
+    the body. In the rest pose the body is mirror symmetric in x, but its triangulation is not symmetric.
 
     **Arguments:**
 
-    - `kind`, `pose`: one of `CREATURES` and one of its poses.
+    - `kind`: `"quadruped"`, `"biped"` or `"dragon"`.
     - `vertices`: the number of vertices, at least 500.
-    - `seed`: the number of the individual, at least 0. It determines the proportions, the variation of a
-      pose, and the triangulation.
+    - `pose`: `"rest"` or another pose of this kind. `CREATURES` lists the poses of each kind.
+    - `seed`: a random seed, an integer of at least 0. It determines the proportions, the triangulation, and
+      the small random changes of the pose.
 
     **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. The x axis points to the
-    creature's left, y up and z forward.
+    creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
-    whose body intersects itself (rare: none of the first 250 seeds).
+    whose body intersects itself. The last error is rare and occurs for none of the seeds below 250.
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
@@ -593,23 +619,26 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
 
 def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 0) -> CreaturePair:
-    """Make one creature in two poses, nearly isometric, with exact ground truth.
+    """Make two meshes of one synthetic creature in two poses, with exact ground truth.
 
-    The two meshes are triangulated independently. The source is `creature` with the same arguments in the
-    pose "stand". The target is the same individual in another pose, with 1 to 5 % fewer vertices. The ground
-    truth is exact up to discretization: in the rest pose, source vertices are projected onto the triangles
-    of the target.
+    The two shapes are nearly isometric and are triangulated independently. The source is in the pose
+    `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
+    vertices. For the ground truth, both meshes are taken in the same rest pose, and the source vertices are
+    projected onto the triangles of the target. The ground truth is therefore exact up to discretization.
 
     **Arguments:**
 
-    - `kind`: one of `CREATURES`.
-    - `vertices`: the number of source vertices, at least 500.
-    - `seed`: a number, at least 0, that determines the individual, the poses and the triangulations.
+    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin) or `"dragon"`.
+    - `vertices`: the number m of source vertices, at least 500.
+    - `seed`: a random seed, an integer of at least 0. It determines the individual, the poses and the
+      triangulations.
 
-    **Returns:** The `CreaturePair`. Both meshes have the unit and the axes of `creature`.
+    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` (m
+    `SurfacePoints` on the target) and `true_map` (m target vertices). Both bodies are about 1.5 units high.
+    The x axis points to the creature's left, the y axis up and the z axis forward.
 
-    **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or a seed whose
-    body intersects itself (rare).
+    **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or (rarely) a seed
+    whose body intersects itself.
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")

@@ -24,9 +24,10 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
 
-# For a surface of area 1. The first non-zero eigenvalue of a body is then between 1 and 30.
+# The shift for ARPACK on a surface of area 1. There, the first non-zero eigenvalue of a body is from 1 to 30.
 _SHIFT = -1e-2
-# Limits for an accurate eigenbasis: residuals relative to the largest eigenvalue, and |Phi^T A Phi - I|.
+# In an accurate eigenbasis, the residuals relative to the largest eigenvalue and the entries of
+# |Phi^T A Phi - I| do not exceed these tolerances.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
@@ -40,32 +41,44 @@ def compute_spectrum(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> Spectrum:
-    """Compute the Spectrum of a mesh, scaled to area 1 to cancel the unit of the file.
+    """Compute the spectrum of a mesh: the first k eigenpairs of its Laplacian, and its vertex areas.
 
-    The computation is in float64 on the host, from fixed seeds, so the same mesh gives the same Spectrum. The
-    largest entry of each eigenvector is positive. Connected components are solved one by one and merged.
+    The mesh is scaled to area 1, so the unit of the file has no effect. The computation uses float64 on the
+    CPU and fixed random seeds, so the same mesh gives the same spectrum. The sign of each eigenvector is
+    chosen so that its entry of largest absolute value is positive. The eigenpairs of each connected component
+    are computed separately and then merged.
 
-    The exact solver is a shift-invert Lanczos method. It counts eigenvalues and checks residuals and
-    orthonormality; if it does not converge, ARPACK takes over. The approximate solver is the Rayleigh–Ritz
-    method in a smooth subspace of far fewer dimensions (`jaxsmw.geometry.coarsening`). Its eigenvectors are
-    also orthonormal up to rounding, and its time is nearly proportional to the number of vertices. It
-    requires triangles of similar size and shape. If the triangles prove to be too different, the exact solver
-    takes over with a warning. Results are cached on disk (`jaxsmw.runtime.cache`).
+    The exact solver is a shift-invert Lanczos method. It counts the eigenvalues, and its residuals and
+    orthonormality are checked. If the method fails, the eigenpairs are computed by ARPACK.
+
+    The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
+    (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal up to rounding. The time
+    is nearly proportional to the number of vertices. The method requires triangles of similar size and shape.
+    If the triangles are too different, the function warns and uses the exact solver. Results are cached on
+    disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
-    - `mesh`: the surface with n vertices.
-    - `number_of_eigenvectors`: k, at least 1 and less than the number of referenced vertices.
-    - `laplacian`: the discretization; see `assemble_laplacian`.
-    - `eigensolver`: `"exact"`; `"approximate"`, which is exact for connected components with fewer than 400
-      vertices or fewer than 30 vertices per eigenvector; or `"auto"`, approximate from 50 000 vertices.
+    - `mesh`: the surface with n vertices, a `Mesh`.
+    - `number_of_eigenvectors`: the number k of eigenvectors, at least 1 and less than the number of
+      referenced vertices.
+    - `laplacian`: the discretization of the Laplacian.
+        - `"cotangent"`: linear finite elements with barycentric vertex areas.
+        - `"robust"`: the tufted intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles
+          non-manifold and badly shaped meshes.
+        - `"auto"`: robust if a triangle is degenerate or an edge has more than two faces, else cotangent.
+    - `eigensolver`: the solver of the eigenproblem.
+        - `"exact"`: the exact solver.
+        - `"approximate"`: the approximate solver. Connected components with fewer than 400 vertices, or fewer
+          than 30 vertices per eigenvector, are still solved exactly.
+        - `"auto"`: approximate if the mesh has at least 50 000 referenced vertices, else exact.
 
-    **Returns:** A `Spectrum` with n vertices and k eigenvectors, in units in which the area of the surface is
-    1, with positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
-    Unreferenced vertices are masked.
+    **Returns:** A `Spectrum` with eigenvalues (k,), eigenvectors (n, k), vertex areas (n,), positions (n, 3)
+    and normals (n, 3), in units in which the area of the surface is 1. The spectrum has no descriptors. Its
+    float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are masked.
 
-    **Raises:** `InputError` if k does not fit the mesh, the Laplacian or the eigensolver is unknown, or the
-    eigenproblem cannot be solved accurately; `TypeError` if `mesh` is not a `Mesh`.
+    **Raises:** `InputError` if k is not an integer or does not fit the mesh, the Laplacian or the eigensolver
+    is unknown, or the eigenproblem cannot be solved accurately; `TypeError` if `mesh` is not a `Mesh`.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return as_spectrum(mesh, *pairs)
@@ -88,11 +101,12 @@ def as_spectrum(
     - `eigenvalues`, `eigenvectors`, `vertex_areas`: the result of `eigenpairs`.
     """
     referenced = mesh.referenced_vertices
-    # Relative to the centroid, single precision suffices for a mesh at any distance from the origin.
+    # Positions are relative to the centroid, because they are stored in single precision. Otherwise the
+    # positions of a mesh far from the origin would be inaccurate.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
-    # Unlike `device_put`, `jnp.asarray` would compile a program for every size.
+    # Unlike `device_put`, `jnp.asarray` would compile a program anew for each array size.
     arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, referenced))
     return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
 
@@ -104,7 +118,7 @@ def eigenpairs(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
-    """Compute the arrays of `compute_spectrum`, in NumPy float64.
+    """Compute the eigenpairs and the vertex areas of a mesh as NumPy arrays in float64.
 
     The arguments and the errors are those of `compute_spectrum`.
 
@@ -139,7 +153,7 @@ def eigenpairs(
             local = stiffness[referenced][:, referenced], areas[referenced]
         with one_blas_thread():
             values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
-        # In place, because further copies could fill the memory for a large mesh.
+        # Signs are changed in place, because a further copy could fill the memory for a large mesh.
         for column in vectors.T:
             column *= np.sign(column[np.argmax(np.abs(column))])
         if not all_referenced:
@@ -154,7 +168,9 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """Resolve `"auto"` for meshes that will be compared. All meshes get the solver of the largest mesh.
+    """Choose the eigensolver that the setting `"auto"` means for meshes whose spectra will be compared.
+
+    All meshes get the same eigensolver, which depends on the mesh with the most vertices.
 
     **Returns:** `"approximate"` if a mesh has 50 000 referenced vertices or more, else `"exact"`.
     """
@@ -193,9 +209,9 @@ def _solve_component(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the k smallest eigenpairs of one connected component, after checks of their accuracy."""
     n = len(areas)
-    # Renumbering stores neighbors close to each other, for the processor's cache. Besides, for some
-    # numberings, such as those of subdivided meshes, the ordering that keeps factors sparse is several times
-    # worse.
+    # Renumbering stores neighbouring vertices close to each other, which suits the processor's cache. Without
+    # renumbering, the ordering that keeps factors sparse would be several times worse for some meshes, such
+    # as subdivided meshes.
     order = reverse_cuthill_mckee(stiffness, symmetric_mode=True)
     stiffness, areas = stiffness[order][:, order], areas[order]
     mass = sp.diags(areas).tocsc()
@@ -239,7 +255,7 @@ def _dense(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.nd
 
 def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> SuperLU:
     """Return the LU factors of W - shift A."""
-    # Without symmetric mode, this ordering would be slower by orders of magnitude.
+    # Without symmetric mode, the factorization with this ordering would take orders of magnitude longer.
     return splu(
         (stiffness - shift * mass).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -249,15 +265,18 @@ def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> 
 
 
 def _number_below(factors: SuperLU) -> int:
-    """Return the number of eigenvalues below the shift: the number of negative pivots (Sylvester's law)."""
+    """Return the number of eigenvalues below the shift.
+
+    By Sylvester's law of inertia, it equals the number of negative pivots.
+    """
     return int((factors.U.diagonal() < 0).sum())
 
 
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
     """Return a shift in the middle of the first k eigenvalues, and the factors of W - shift A.
 
-    Weyl's law predicts a shift above k/2 eigenvalues. If the prediction is wrong, as on a thin tube, the
-    number of eigenvalues below the shift leads to a better shift.
+    The first shift comes from Weyl's law, by which k/2 eigenvalues should be smaller than the shift. If this
+    prediction is wrong, as on a thin tube, the true number of smaller eigenvalues leads to a better shift.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -271,7 +290,10 @@ def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) ->
 
 
 def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.ndarray) -> bool:
-    """Return whether eigenvalues below the last one are missing. Copies of the last one are not counted."""
+    """Return whether eigenvalues are missing that are smaller than the largest given eigenvalue.
+
+    Missing copies of the largest given eigenvalue are not detected.
+    """
     if len(eigenvalues) == 1:
         return False
     shift = float(eigenvalues[-1]) * (1 - 1e-6)
@@ -284,11 +306,12 @@ def _lanczos(
     """Return the k smallest eigenpairs by the block Lanczos method for (W - shift A)^-1 A, without restarts.
 
     The shift is in the middle of the wanted eigenvalues, so the wanted eigenpairs are at both ends of the
-    spectrum of the inverse. Two products per eigenpair then suffice. Keeping every vector A-orthogonal to all
-    earlier vectors costs less than ARPACK's restarts. A block of b vectors finds at most b copies of a
-    multiple eigenvalue. So eigenvalues are counted, and if some eigenvalues are missing, larger blocks are
-    tried. An eigenpair has converged when its residual for the inverse, relative to the eigenvalue, is below
-    the tolerance.
+    spectrum of the inverse. Then two products with the inverse per eigenpair suffice. Keeping every vector
+    A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
+
+    Blocks of b vectors find at most b copies of a multiple eigenvalue. Therefore the eigenvalues are counted.
+    If some eigenvalues are missing, the method is repeated with larger blocks. An eigenpair has converged
+    when its residual for the inverse, relative to the inverse's eigenvalue, is at most the tolerance.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """
@@ -300,16 +323,16 @@ def _lanczos(
     raise RuntimeError("not all copies of a multiple eigenvalue were found")
 
 
-# The number of vectors in a block. Several vectors per solve are faster, because SuperLU holds Python's
-# global lock while it manages memory, and two threads then wait for each other. Larger blocks need more
-# products to converge.
+# The number of vectors in a block. Solving for several vectors together saves time, because SuperLU holds
+# Python's global lock while it manages memory, and two threads then wait for each other. Larger blocks need
+# more products to converge.
 _BLOCK = 4
 
 
 def _converged(
     inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first k eigenpairs that blocks of `size` vectors find.
+    """Return the first k eigenpairs, computed with blocks of `size` vectors.
 
     **Raises:** `RuntimeError` if the eigenpairs do not converge.
     """
@@ -326,8 +349,8 @@ def _converged(
     vectors = np.empty((2 * k + 100 + size, n))
     # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
-    # The initial block is smoothed, because eigenvectors are smooth: rounding errors in the weights of rough
-    # vectors would affect derivatives of the eigenvectors.
+    # The initial block is smoothed, because eigenvectors are smooth combinations of the vectors. Rounding
+    # errors in the weights of rough vectors would affect the derivatives of the eigenvectors.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -351,9 +374,11 @@ def _converged(
         if end < look:
             continue
         look = end + max(5, k // 20)
-        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])  # SciPy's `eigh` holds the GIL
+        # SciPy's `eigh` would hold Python's global lock.
+        inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])
         eigenvalues = shift + 1 / inverted
-        # Negative values correspond to eigenvalues beyond all wanted eigenvalues.
+        # Negative values stem from inverted values near zero, which belong to eigenvalues above all wanted
+        # eigenvalues.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -385,14 +410,14 @@ def _orthonormal(
     **Raises:** `LinAlgError` if the vectors are linearly dependent.
     """
     lower = np.eye(len(vectors))
-    for _ in range(2):  # the second pass removes the rounding errors of the first
+    for _ in range(2):  # the second pass removes the rounding errors of the first pass
         factor = np.linalg.cholesky(weighted(vectors) @ vectors.T)
         vectors, lower = np.linalg.inv(factor) @ vectors, lower @ factor
     return vectors, lower
 
 
 def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k smallest eigenpairs to machine precision, by ARPACK, which uses restarts."""
+    """Return the k smallest eigenpairs to machine precision, by ARPACK's Lanczos method with restarts."""
     n = stiffness.shape[0]
     inverse = LinearOperator((n, n), matvec=_factorized(stiffness, mass, _SHIFT).solve, dtype=float)
     start = np.random.default_rng(0).standard_normal(n)
@@ -402,12 +427,13 @@ def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.n
 def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k smallest eigenpairs by the Rayleigh–Ritz method in a coarse subspace.
 
-    The method is applied again in the smoothed span of the resulting eigenvectors. A few more than k
-    eigenvectors are computed, because the last eigenvectors of a subspace are the least accurate.
+    The resulting eigenvectors are smoothed, and the Rayleigh–Ritz method is applied again in their span. A
+    few more than k eigenvectors are computed, because the last eigenvectors of a subspace are the least
+    accurate.
 
-    **Raises:** `RuntimeError` if the subspace does not suit the mesh: if it is too small, or if another
-    smoothing would still lower eigenvalues considerably. (Missing eigenvalues are not detected, because
-    counting them requires the factors of W.)
+    **Raises:** `RuntimeError` if the subspace is too small, or if one more smoothing step would lower
+    eigenvalues considerably. (Missing eigenvalues are not detected, because a count of eigenvalues requires
+    the factors of W - shift A.)
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -419,7 +445,7 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
         _, combinations = _arpack(coarse.stiffness, coarse.mass, taken)
     n, single = stiffness.shape[0], combinations.astype(np.float32)
     basis, eigenvectors = np.empty((n, taken)), np.empty((n, k))
-    grams = np.zeros((2, taken, taken))  # only the upper triangles are filled
+    grams = np.zeros((2, taken, taken))  # only the upper triangles of these matrices are filled
     for columns in _slices(taken):
         basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
     for columns in _slices(taken):
@@ -428,8 +454,8 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
-    # If all triangles are bad, the last eigenvectors are the least accurate. If only a region is bad, any
-    # eigenvectors can be the least accurate.
+    # If all triangles are badly shaped, the last eigenvectors are the least accurate. If only one region has
+    # badly shaped triangles, any eigenvectors can be the least accurate. Therefore both kinds are checked.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
@@ -441,20 +467,24 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
 
 # The number of dimensions of the subspace per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
-# The limit for the relative decrease of eigenvalues by another smoothing. Errors are up to three times as
-# large.
+# The largest accepted relative decrease of an eigenvalue by one more smoothing step. The relative errors of
+# eigenvalues are up to three times as large as this decrease.
 _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Return groups of columns, because a further copy of all columns may not fit into the memory."""
+    """Return slices of at most 32 columns. A copy of more columns at a time may not fit into the memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
 def _check(
     stiffness: sp.csc_matrix, areas: np.ndarray, eigenvalues: np.ndarray, eigenvectors: np.ndarray
 ) -> tuple[float, float]:
-    """Return two errors: max |A^-1 W phi - lambda phi|_A / lambda_max, and max |Phi^T A Phi - I|."""
+    """Return two error measures of eigenpairs.
+
+    The first is the largest relative residual, max |A^-1 W phi - lambda phi|_A / lambda_max. The second is
+    the largest deviation from orthonormality, max |Phi^T A Phi - I|.
+    """
     deviation, highest = 0.0, 0.0
     for columns in _slices(len(eigenvalues)):
         weighted = areas[:, None] * eigenvectors[:, columns]
@@ -462,7 +492,8 @@ def _check(
         gram[columns] -= np.eye(gram.shape[1])
         residuals = stiffness @ eigenvectors[:, columns] - weighted * eigenvalues[columns]
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
-        # `np.maximum` keeps NaN.
+        # Unlike `max`, `np.maximum` returns NaN if one of the numbers is NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # If zero is the only eigenvalue, the residual is compared with 1, which suits a surface of area 1.
+    # The divisor is at least 1, because zero may be the only eigenvalue. A value of 1 suits a surface of
+    # area 1.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

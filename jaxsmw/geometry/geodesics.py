@@ -2,12 +2,13 @@
 
 Evaluation measures the distance between a match and the true point, which is short for good matches. For
 short distances the heat method has errors of several percent. Exact window propagation takes about 100 times
-longer than the method of this module.
+as long as the method of this module.
 
 The method is Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of triangles around each
-vertex are unfolded into the plane. Each vertex that a straight line within a strip reaches becomes a
-neighbor, at the exact length of the line. Paths in this graph are paths on the surface, so distances are
-never too short. On bodies they are too long by 0.03 to 0.07 % on average.
+vertex are unfolded into the plane. If a straight line within a strip leads from one vertex to another, the
+graph connects these vertices by an edge with the exact length of the line. Paths in this graph are paths on
+the surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03 to
+0.07 % on average.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from jaxsmw.runtime.cache import cached
 # The number of edges that a straight line of the graph may cross.
 _DEPTH = 10
 
-# The number of sides from which strips are unfolded at once, and the number of distances stored at once. Both
-# numbers are small enough for the processor's cache.
+# The number of sides from which strips are unfolded together, and the number of distances that are stored
+# together. With these numbers, the arrays fit into the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
-# The radii, in square roots of the area, of the searches for partners before the search of the whole surface.
-# Each search takes a small fraction of the time of the next search.
+# The search for partners covers these radii one after the other, and finally the whole surface. The radii are
+# in units of the square root of the area. Each search takes a small fraction of the time of the next search.
 _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
@@ -46,12 +47,16 @@ _EXACT_HEIGHT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on the faces of a mesh.
+    """p points on the faces of a mesh.
+
+    `len(points)` is p. `points[rows]` contains only the points that an integer array selects. The functions
+    that receive surface points check them; the class itself checks nothing.
 
     **Attributes:**
 
-    - `faces`: the face of each point (p,), 0-based.
-    - `weights`: the barycentric weights (p, 3) of the corners of the face; not negative, with sum 1.
+    - `faces`: the face of each point, as indices (p,) into `Mesh.faces`.
+    - `weights`: the barycentric weights (p, 3) of the three corners of the face, in the order of the corners.
+      Weights are not negative, and each row sums to 1.
     """
 
     faces: Int64[np.ndarray, " p"]
@@ -68,7 +73,7 @@ class SurfacePoints:
         return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
 
     def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """Return the corner of its face that is nearest to each point, as a vertex of the mesh (p,)."""
+        """Return for each point the nearest of the three corners of its face, as vertices of the mesh (p,)."""
         corners = mesh.faces[self.faces]
         distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
         return corners[np.arange(len(corners)), distances.argmin(axis=1)]
@@ -78,18 +83,20 @@ class _Sides(NamedTuple):
     """The 6 f sides of all triangles and of their mirror images.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. So when a line crosses from one face into
-    another, the sides by which it leaves and enters have opposite directions. This rule holds for any
-    orientation of the faces, and for any number of faces at the edge.
+    images: the faces 0 … f - 1 with reversed order of corners. When a line crosses from one face into
+    another, it leaves by one side and enters by another side with the opposite direction. This rule holds for
+    any orientation of the faces, and for any number of faces at an edge.
     """
 
     tail: Int64[np.ndarray, " s"]
     head: Int64[np.ndarray, " s"]
     apex: Int64[np.ndarray, " s"]
     length: Float64[np.ndarray, " s"]
-    # The position of the apex in the complex plane if the side leads from 0 to 1; never below the real axis.
+    # The position of the apex in the complex plane if the side leads from 0 to 1. The apex is never below the
+    # real axis.
     shape: Complex128[np.ndarray, " s"]
-    # Lines that leave by side i enter by the sides across[first[i]], …, across[first[i + 1] - 1].
+    # A line that leaves a triangle by side i enters other triangles by the sides across[first[i]], …,
+    # across[first[i + 1] - 1].
     first: Int64[np.ndarray, " s1"]
     across: Int64[np.ndarray, " c"]
 
@@ -101,7 +108,7 @@ def _sides(mesh: Mesh) -> _Sides:
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
-    # Nothing crosses a side of length zero, so its zeros have no effect.
+    # No line crosses a side of length zero, so the zeros that describe such a side have no effect.
     direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
     shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
@@ -118,17 +125,17 @@ def _sides(mesh: Mesh) -> _Sides:
 
 
 def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of i and start[i] + j with 0 <= j < count[i]."""
+    """Return all pairs of i and start[i] + j with 0 <= j < count[i], as two arrays."""
     row = np.repeat(np.arange(len(count)), count)
     return row, np.arange(len(row)) + np.repeat(start - (np.cumsum(count) - count), count)
 
 
 class _Beams(NamedTuple):
-    """Cones of straight lines from points, each within a strip of triangles unfolded into the plane.
+    """Beams, which are cones of straight lines from a point within a strip of unfolded triangles.
 
-    The plane is the complex plane, and the point is at 0. The side by which a beam enters or leaves a
-    triangle has its ends at `right` and `left`. The lines that pass through all sides so far have directions
-    between `rightmost` and `leftmost`.
+    The triangles are unfolded into the complex plane, and the point of a beam is at 0. The side by which a
+    beam enters or leaves a triangle has its ends at `right` and `left`. The lines that pass through all sides
+    crossed so far have directions between `rightmost` and `leftmost`.
     """
 
     origin: Int64[np.ndarray, " b"]
@@ -148,7 +155,7 @@ def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Return whether a line of each beam reaches a position in the triangle that the beam enters."""
+    """Return for each beam whether one of its lines reaches a position in the triangle that it enters."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -179,8 +186,8 @@ def _unfold(
         beams = beams.at(beam)._replace(side=sides.across[entry])
         corner = beams.left + sides.shape[beams.side] * (beams.right - beams.left)
         yield beams, corner
-        # Lines to the right of the corner leave by the side from the right end to the corner. Lines to its
-        # left leave by the side from the corner to the left end.
+        # Lines to the right of the corner leave by the side from the right end to the corner. Lines to the
+        # left of the corner leave by the side from the corner to the left end.
         triangle, k = np.divmod(beams.side, 3)
         visible = _visible(beams, corner)
         to_right = beams._replace(
@@ -205,7 +212,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """Return the straight lines to the vertices that `_unfold` finds."""
+    """Return the straight lines from points to all vertices that `_unfold` reaches."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)
@@ -214,7 +221,7 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """Return the lengths of lines as a square matrix, with the shortest line between any two nodes."""
+    """Return the lengths of lines as a square matrix. Of several lines between two nodes, the shortest counts."""
     origins, ends, lengths = (np.concatenate(part) for part in zip(*lines, strict=True))
     key = origins.astype(np.int64) * size + ends
     order = np.lexsort([lengths, key])
@@ -228,19 +235,20 @@ def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
 def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     """Return the graph of the edges of a mesh and of straight lines through strips of triangles.
 
-    Graphs are cached on disk (`jaxsmw.runtime.cache`), and for the last four meshes in memory.
+    Graphs are cached on disk (`jaxsmw.runtime.cache`). The last four graphs are also kept in memory.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
-    - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, shortest paths are
-        too long by 0.1 to 0.2 % on average for a depth of 6, and by 0.03 to 0.07 % for a depth of 10. A
-        search with depth 10 takes 1.4 times as long as a search with depth 6.
+    - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, the shortest paths
+        in a graph of depth 6 are too long by 0.1 to 0.2 % on average. In a graph of depth 10, they are too
+        long by 0.03 to 0.07 %. A search in a graph of depth 10 takes 1.4 times as long as in a graph of
+        depth 6.
 
     **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
-    mesh. A stored zero is a line between two vertices at the same position. All callers share the matrix and
-    must not change it.
+    mesh. A stored zero is the length of a line between two vertices at the same position. All callers share
+    the matrix and must not change it.
     """
     n, s = len(mesh.vertices), 3 * len(mesh.faces)
 
@@ -249,8 +257,8 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
         smaller, larger = mesh.edges.T
         edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
         lines = [_Lines(smaller, larger, edge_lengths)]
-        # The first half of the sides suffices, because mirrored triangles give the mirror images of these
-        # lines.
+        # The first half of the sides suffices, because the sides of the mirrored triangles give only the
+        # mirror images of these lines.
         for start in range(0, s, _SIDES_AT_ONCE):
             side = np.arange(start, min(start + _SIDES_AT_ONCE, s))
             origins, ends, lengths = _lines(sides, sides.apex[side], side, sides.shape[side], depth)
@@ -277,19 +285,22 @@ def geodesic_distances(
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `sources`: s vertex indices, or `SurfacePoints`. The result contains s x n numbers, so divide very
-        many sources into several calls. For distances between given pairs, use `geodesic_distances_between`.
-    - `method`: `"strips"` searches `geodesic_graph`. `"exact"` propagates windows (Mitchell, Mount and
-        Papadimitriou 1987, in libigl). `"exact"` works only between vertices of manifold meshes, and takes
-        about 100 times as long as `"strips"`.
-    - `limit`: a distance in the unit of the mesh. Larger distances become inf. With `"strips"`, a limit saves
-        time.
+    - `sources`: the s sources, as 0-based vertex indices (s,) or as `SurfacePoints`. The result contains s
+        times n numbers, so divide very many sources into several calls. For distances between given pairs of
+        points, use `geodesic_distances_between`.
+    - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
+        lines across faces. Its distances are too long by 0.03 to 0.07 % on average on bodies. `"exact"`
+        propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl). `"exact"` works
+        only between vertices of manifold meshes, and takes about 100 times as long as `"strips"`.
+    - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
+        `"strips"`, a limit saves time.
 
-    **Returns:** Distances (s, n) in the unit of the mesh; inf where there is no path.
+    **Returns:** Distances (s, n), float64, in the unit of the mesh. A distance is inf if no path connects the
+    source and the vertex, or if the distance is above the limit.
 
     **Raises:** `InputError` for sources that are not on the mesh. With `"exact"`, also `InputError` for
-    `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces almost without
-    height.
+    `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces whose height is
+    almost zero.
     """
     points = check_points(sources, mesh, "sources")
     if method == "exact":
@@ -312,9 +323,9 @@ def geodesic_distances_between(
 ) -> Float64[np.ndarray, " p"]:
     """Compute the geodesic distance between each point and its partner.
 
-    The search starts from the points or from the partners, whichever has fewer distinct points, and widens in
-    steps. For partners that are close together, such as good matches and true points, the search takes a
-    fraction of the time of all distances. It never stores p x n numbers.
+    The search starts from `points` or from `partners`, whichever has fewer distinct points. The radius of the
+    search grows in steps. If each point is close to its partner, as good matches are to true points, the
+    search is much faster than a computation of all distances. It never stores p times n numbers.
 
     **Arguments:**
 
@@ -366,7 +377,10 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the arguments of `_unfold` for points: origins, sides and positions of three beams per point."""
+    """Return arguments of `_unfold` for three beams per point, one through each side of the point's face.
+
+    The arguments are the origins, sides and positions.
+    """
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]
@@ -396,9 +410,10 @@ def _straight_distances(
 def _network(
     mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints, ends: Int64[np.ndarray, " q"] | SurfacePoints
 ) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
-    """Add surface points to the geodesic graph, as nodes with lines from the points and to the ends.
+    """Add surface points to the geodesic graph as nodes.
 
-    No path leads through an added node, so a distance does not depend on the other added points.
+    Lines lead from the points to vertices, and from vertices to the ends. No path leads through an added
+    node, so a distance does not depend on the other added points.
 
     **Returns:** The graph, the nodes of the points, and the nodes of the ends.
     """
@@ -430,11 +445,11 @@ def _network(
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
-    """Return a function that computes exact distances from a source to targets.
+    """Return a function that computes exact distances from a source vertex to target vertices.
 
     **Raises:** `InputError` for meshes that libigl cannot handle. libigl crashes at edges with three faces,
-    stops early at vertices that join several fans, and never ends on slivers. (libigl also never ends in very
-    small units, so the mesh is scaled first.)
+    and stops early at vertices that join several fans of faces. On slivers, libigl does not terminate. (It
+    also does not terminate on a mesh with very small coordinates, so the mesh is scaled to area 1 first.)
     """
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -463,8 +478,8 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
 def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarray, " p"]:
     if isinstance(points, SurfacePoints):
         raise InputError(
-            "exact geodesic distances are computed between vertices, not to points on faces: use "
-            "method='strips'."
+            "exact geodesic distances can be computed only between vertices, but points on faces were given: "
+            "use method='strips'."
         )
     return points
 
@@ -478,9 +493,9 @@ def check_points(
 
     - `points`: vertex indices (p,) or `SurfacePoints`.
     - `mesh`: the mesh.
-    - `name`: the name of the points in messages.
+    - `name`: the name that error messages give to the points.
 
-    **Returns:** The points, with int64 indices.
+    **Returns:** The points, with indices as int64.
 
     **Raises:** `InputError` if a vertex or face does not exist, or barycentric weights are negative or do not
     sum to 1.
@@ -502,7 +517,7 @@ def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> Surfac
         at = int(good.argmin())
         raise InputError(
             f"{name} on {mesh.name}: number {at} has the barycentric weights {points.weights[at].tolist()}, "
-            "which must be at least 0 and sum to 1: divide the weights by their sum."
+            "which must be at least 0 and sum to 1: correct the weights, or divide them by their sum."
         )
     return SurfacePoints(faces, points.weights)
 
@@ -510,12 +525,13 @@ def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> Surfac
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
     """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
 
-    `name` is the name of the indices in messages, in the singular, such as "vertex".
+    `name` is the name that error messages give to the indices, in the singular, such as "vertex".
 
-    **Raises:** `InputError` if the values are not a list of integers in this range, or are masked in part.
+    **Raises:** `InputError` if the values are not a list of integers in this range, or if some values are
+    masked.
     """
     if np.ma.is_masked(values):
-        raise InputError(f"{name} indices are masked in part: fill in the masked ones, or drop them.")
+        raise InputError(f"{name} indices are masked in part: fill in or remove the masked indices.")
     indices = np.asarray(values)
     if indices.ndim != 1 or indices.dtype.kind not in "iu":
         raise InputError(
@@ -525,7 +541,7 @@ def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray,
     outside = (indices < 0) | (indices >= count)
     if outside.any():
         at = int(outside.argmax())
-        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
+        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct the index"
         raise InputError(
             f"{name} indices must lie between 0 and {count - 1}, but number {at} is {indices[at]}: {cure}."
         )

@@ -1,4 +1,4 @@
-"""The discrete Laplace–Beltrami operator of a mesh: stiffness and vertex areas."""
+"""The discrete Laplace–Beltrami operator of a mesh, as a stiffness matrix and vertex areas."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
-    """Resolve `"auto"` for a mesh.
+    """Choose the Laplacian that the setting `"auto"` means for a mesh.
 
     **Returns:** `"robust"` if a triangle is degenerate or an edge has more than two faces, else
     `"cotangent"`.
@@ -27,25 +27,25 @@ def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
 def assemble_laplacian(
     mesh: Mesh, *, laplacian: Laplacian = "auto"
 ) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
-    """Assemble the stiffness matrix W and the lumped vertex areas A of `W phi = lambda A phi`.
+    """Assemble the stiffness matrix W and the lumped vertex areas A of the problem `W phi = lambda A phi`.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
     - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas; `"robust"` for the tufted
       intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles non-manifold and badly shaped
-      meshes; `"auto"` for the cotangent Laplacian unless the mesh needs the robust one (`choose_laplacian`).
+      meshes; `"auto"` for the Laplacian that `choose_laplacian` returns.
 
     **Returns:** W (n, n), symmetric and positive semi-definite, without unit, and A (n,), in the squared unit
-    of the mesh. Both are zero in rows of unreferenced vertices.
+    of the mesh. The rows of W and the entries of A are zero for unreferenced vertices.
 
-    **Raises:** `InputError` if the cotangent Laplacian is requested but undefined, because faces have no
+    **Raises:** `InputError` if the cotangent Laplacian is requested but is undefined because faces have no
     area.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
-        # robust_laplacian requires that every vertex belongs to a face.
+        # The package robust_laplacian requires that every vertex belongs to a face.
         referenced = np.flatnonzero(mesh.referenced_vertices)
         compact = np.full(len(mesh.vertices), -1)
         compact[referenced] = np.arange(len(referenced))

@@ -1,4 +1,4 @@
-"""Triangle meshes: checks, cleaning, areas, normals, and a diagnosis of defects."""
+"""Triangle meshes, with checks, cleaning, areas, normals and a diagnosis of defects."""
 
 from __future__ import annotations
 
@@ -17,40 +17,43 @@ from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 
-# A mesh of another library, recognized by its attributes; no such library is imported. See `make_mesh`.
+# A mesh of another library, as `make_mesh` describes it. Such meshes are recognised by their attributes,
+# because the other libraries are not imported.
 MeshLike: TypeAlias = Any
 
-# A triangle whose height is less than this fraction of its longest edge is degenerate. The fraction is far
-# above the rounding errors of a mesh that is a few extents from the origin, and far below any intended
-# triangle.
+# A triangle whose height is at most this fraction of its longest edge is degenerate. The fraction is far above
+# the rounding errors of positions, unless the mesh is many times its extent away from the origin. The fraction
+# is far below the relative height of any intended triangle.
 DEGENERATE_HEIGHT = 1e-10
 
-# Limits for coordinates. Meshes beyond these limits are damaged, or in an unsuitable unit. Between these
-# extents of a mesh, squares of areas (which occur in descriptors) neither overflow nor vanish.
+# The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit. Within
+# the limits, squares of areas, which occur in descriptors, neither overflow nor underflow.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
-# Limits in median edge lengths. At the first distance from the origin, float64 rounds positions by 1e-4 of an
-# edge. At the second distance from the middle of a mesh, float32 rounds positions by 0.1 of an edge; maps are
-# refined in float32. (The meshes of the data sets extend to 1e4.)
+# The limits for distances of vertices, in units of the median edge length. At `LARGEST_COORDINATE` from the
+# origin, float64 rounds positions by 1e-4 edge lengths. At `LARGEST_DISTANCE` from the middle of a mesh,
+# float32 rounds positions by 0.1 edge lengths. Maps are refined in float32. (The meshes of the data sets
+# extend to 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh whose vertices keep their numbers from the file.
+    """A triangle mesh whose vertices have the same order as in the file or in the given array.
 
-    Vertex i of the mesh is always vertex i of the user's file. Cleaning drops faces only. A vertex without
-    faces keeps its position and its number; its entry in `referenced_vertices` is False.
+    Vertex i of the mesh is always vertex i of the file, because cleaning drops only faces. A vertex without
+    faces keeps its position and its number, and its entry in `referenced_vertices` is False.
 
-    `read_mesh` and `make_mesh` check everything and return a `Mesh`. The class itself checks nothing.
+    Use `read_mesh` or `make_mesh` to get a `Mesh`. These functions check and clean their input; the
+    constructor of the class does not.
 
     **Attributes:**
 
     - `vertices`: positions (n, 3), float64, in the unit of the file.
-    - `faces`: vertex indices (f, 3), 0-based.
-    - `name`: the name of the mesh in messages; for a file, its path.
-    - `notes`: the changes by cleaning and the peculiarities of the mesh, one sentence each.
-    - `dropped_faces`: the numbers (d,), 0-based and ascending, of the given faces that cleaning dropped.
-      Files that refer to faces by number also count the dropped faces.
+    - `faces`: vertex indices (f, 3), int64, 0-based.
+    - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
+    - `notes`: sentences that report the changes by cleaning and the peculiarities of the mesh.
+    - `dropped_faces`: the numbers (d,) of the faces that cleaning dropped, ascending. The numbers are 0-based
+      and count all faces of the file. Other files that refer to faces by number use the same numbers.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -61,7 +64,7 @@ class Mesh:
 
     @property
     def face_numbers(self) -> Int64[np.ndarray, " f"]:
-        """The number of each face among the given faces (f,), 0-based, by which files refer to the face."""
+        """The 0-based number of each face (f,) among all faces of the file, including dropped faces."""
         return np.delete(np.arange(len(self.faces) + len(self.dropped_faces)), self.dropped_faces)
 
     @cached_property
@@ -97,32 +100,33 @@ class Mesh:
         """
         total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        # Without cancellation, the length is about twice the area of the faces, or six vertex areas.
+        # If the normals do not cancel, the length of their sum is about twice the area of the faces around
+        # the vertex, which is six vertex areas.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
 
     @cached_property
     def is_inside_out(self) -> bool:
-        """Whether the normals point inward: the faces then enclose a negative volume with the centroid."""
+        """Whether the normals point inward. Then the faces enclose a negative volume with the centroid."""
         corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
     @cached_property
     def referenced_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True for vertices with at least one face, False for unreferenced vertices; (n,)."""
+        """A mask (n,), True for vertices with at least one face, False for unreferenced vertices."""
         referenced = np.zeros(len(self.vertices), dtype=bool)
         referenced[self.faces] = True
         return referenced
 
     @cached_property
     def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
-        """True for triangles without area (f,): their height is at most 1e-10 of their longest edge."""
+        """A mask (f,), True for triangles whose height is at most 1e-10 of their longest edge."""
         longest = igl.squared_edge_lengths(self.vertices, self.faces).max(axis=1)
         return 2 * self.face_areas <= DEGENERATE_HEIGHT * longest
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """The undirected edges (e, 2) in lexicographic order, each once, with the smaller vertex first."""
+        """The undirected edges (e, 2) in lexicographic order. Each edge occurs once, smaller vertex first."""
         return self._edge_table.edges
 
     @cached_property
@@ -139,13 +143,13 @@ class Mesh:
     def misoriented_edges(self) -> Int64[np.ndarray, "b 2"]:
         """The edges whose two faces have opposite orientations, (b, 2).
 
-        The corners of both faces follow such an edge in the same direction.
+        Both faces traverse such an edge in the same direction.
         """
         return self.edges[(self._edge_table.faces == 2) & (self._edge_table.balance != 0)]
 
     @cached_property
     def nonmanifold_vertices(self) -> Bool[np.ndarray, " n"]:
-        """True for vertices whose faces form several fans that share no edge; (n,)."""
+        """A mask (n,), True for vertices whose faces form several fans that share no edge."""
         one_fan = igl.is_vertex_manifold(self.faces)
         pinched = self.referenced_vertices.copy()
         pinched[: len(one_fan)] &= ~one_fan
@@ -153,7 +157,10 @@ class Mesh:
 
     @cached_property
     def _edge_table(self) -> _EdgeTable:
-        """The edges, their numbers of faces, and the sums of the directions (1 or -1) of the faces."""
+        """The edges, with the number of faces at each edge and a balance of their directions.
+
+        A face counts as 1 or -1 in the balance, depending on the direction in which it traverses the edge.
+        """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         key = np.minimum(tail, head) * n + np.maximum(tail, head)
@@ -173,15 +180,17 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Counts of everything unusual in a mesh. None of these counts is an error. `str` explains the counts.
+    """The numbers of all unusual elements of a mesh, such as boundary edges. None of them is an error.
+
+    `str` of a `Diagnosis` explains the numbers in sentences, one per line.
 
     **Attributes:**
 
     - `vertices`, `faces`: the numbers of vertices and of faces.
     - `components`: the number of connected components, without unreferenced vertices.
     - `unreferenced_vertices`: the number of vertices that no face references.
-    - `boundary_edges`, `boundary_loops`: the numbers of edges with one face, and of the connected chains that
-      these edges form.
+    - `boundary_edges`: the number of edges with exactly one face.
+    - `boundary_loops`: the number of connected chains that the boundary edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
     - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
     - `misoriented_edges`: the number of edges whose two faces have opposite orientations. This number
@@ -244,15 +253,17 @@ class Diagnosis:
 
 
 def diagnose(mesh: Mesh) -> Diagnosis:
-    """Count everything unusual in a mesh, such as boundary edges and degenerate triangles.
+    """Count all unusual elements of a mesh, such as boundary edges and degenerate triangles.
 
     **Arguments:**
 
-    - `mesh`: a mesh from `read_mesh` or `make_mesh`.
+    - `mesh`: a `Mesh` from `read_mesh` or `make_mesh`.
 
     **Returns:**
 
-    A `Diagnosis`.
+    A `Diagnosis`. Its attributes are the integers `vertices`, `faces`, `components`, `unreferenced_vertices`,
+    `boundary_edges`, `boundary_loops`, `nonmanifold_edges`, `nonmanifold_vertices`, `misoriented_edges` and
+    `degenerate_faces`. `str` of the diagnosis explains these numbers in sentences, one per line.
     """
     unreferenced = int((~mesh.referenced_vertices).sum())
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
@@ -278,7 +289,7 @@ def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, 
     - `edges`: pairs of vertices (e, 2).
     - `n`: the number of vertices.
 
-    **Returns:** The number of components, and the number of each vertex's component (n,), counted from 0.
+    **Returns:** The number of components, and the 0-based index of each vertex's component (n,).
     """
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return csgraph.connected_components(graph, directed=False)
@@ -321,32 +332,34 @@ def make_mesh(
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
     The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
-    It never drops or renumbers vertices. `read_mesh` also makes its meshes by this function.
+    It never drops or renumbers vertices. `read_mesh` also calls this function.
 
     **Arguments:**
 
-    - `vertices`: positions (n, 3) of any integer or float type, in any unit; copied. Without `faces`, a mesh
-        of another library: an object with `vertices` and `faces`, as in trimesh, pyFM and geomfum; an object
-        with `points` and `faces`, such as a `PolyData` of PyVista; or a tuple of vertices and faces, as in
-        potpourri3d.
-    - `faces`: vertex indices (f, 3), 0-based, of any integer type (or whole floats); copied.
+    - `vertices`: positions (n, 3) of any integer or float type, in any unit. The array is copied. If `faces`
+        is None, `vertices` is a mesh of another library in one of these forms:
+        - an object with `vertices` and `faces`, as in trimesh, pyFM and geomfum;
+        - an object with `points` and `faces`, such as a `PolyData` of PyVista;
+        - a tuple of vertices and faces, as in potpourri3d.
+    - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
+        array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position. The other
-        vertices at this position remain, but are unreferenced. Welding closes seams along which some programs
-        duplicate vertices.
-    - `notes`: sentences that precede the notes of this function.
+    - `weld`: if True, all vertices at exactly the same position count as one vertex. Faces then use the
+        lowest-numbered of these vertices. The other vertices remain, but are unreferenced. Welding closes
+        seams along which some programs duplicate vertices.
+    - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
 
-    A `Mesh`. Its `notes` report how many faces were dropped or welded, and how many vertices look like a
-    seam.
+    A `Mesh`. Its `notes` report how many faces were dropped or changed by welding, how many vertices appear
+    to be duplicated along a seam, and how many vertices are unreferenced.
 
     **Raises:**
 
-    `InputError` for arrays of another shape or type, coordinates that are not finite, indices out of range,
-    no faces, no area, or an object that is not a triangle mesh. Also `InputError` for an extent outside 1e-60
-    … 1e60, a vertex more than 1e12 median edge lengths from the origin, or a vertex of a face more than 1e6
-    median edge lengths from the middle of the mesh.
+    `InputError` if an array has a wrong shape or type, a coordinate is not finite, an index is out of range,
+    there are no faces, all faces are degenerate, or an object is not a triangle mesh. Also `InputError` if
+    the extent of the mesh is below 1e-60 or above 1e60, a vertex is more than 1e12 median edge lengths from
+    the origin, or a vertex of a face is more than 1e6 median edge lengths from the middle of the mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
@@ -381,22 +394,24 @@ def make_mesh(
 def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarray, " g"], list[str]]:
     """Return the numbers of the faces to keep (g,), and notes about the dropped faces.
 
-    Faces that repeat a vertex, and faces with the vertices of an earlier face, are dropped.
+    Faces that repeat a vertex, and faces with the same three vertices as an earlier face, are dropped.
     """
     notes = []
     ordered = np.sort(triangles, axis=1)
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
     if repeating.any():
-        notes.append(f"{count_of(int(repeating.sum()), 'face')} with a repeated vertex dropped.")
+        notes.append(f"{count_of(int(repeating.sum()), 'face')} dropped because of a repeated vertex.")
     number, ordered = np.flatnonzero(~repeating), ordered[~repeating]
     first = first_equal_rows(ordered) == np.arange(len(ordered))
     if not first.all():
-        notes.append(f"{count_of(int((~first).sum()), 'face')} with the vertices of an earlier face dropped.")
+        notes.append(
+            f"{count_of(int((~first).sum()), 'face')} dropped because of an earlier face with equal vertices."
+        )
     return number[first], notes
 
 
 def _unusual_vertices(mesh: Mesh) -> list[str]:
-    """Return notes about vertices that look like a seam, and about unreferenced vertices."""
+    """Return notes about vertices that appear to be duplicated along a seam, and unreferenced vertices."""
     notes = []
     boundary = np.unique(mesh.boundary_edges)
     lowest = first_equal_rows(mesh.vertices[boundary])
@@ -408,7 +423,8 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
         )
     unreferenced = int((~mesh.referenced_vertices).sum())
     if unreferenced:
-        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {len(mesh.vertices)}.")
+        total = count_of(len(mesh.vertices), "vertex")
+        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {total} in all.")
     return notes
 
 
@@ -430,7 +446,7 @@ def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
 
 
 def _check_resolution(mesh: Mesh) -> None:
-    """Refuse positions that floating-point numbers cannot distinguish from those of their neighbors."""
+    """Refuse a mesh with a vertex so far away that rounding could merge neighbouring positions."""
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
     median = np.median(lengths[lengths > 0])
     referenced = np.flatnonzero(mesh.referenced_vertices)
@@ -449,13 +465,13 @@ def _check_resolution(mesh: Mesh) -> None:
 
 
 def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
-    """Return the vertices and faces of a mesh of another library, recognized by its attributes."""
+    """Return the vertices and faces of a mesh of another library, recognised by its attributes."""
     if isinstance(mesh, tuple) and len(mesh) == 2:
         return mesh
     faces = getattr(mesh, "faces", None)
     if faces is not None and hasattr(mesh, "vertices"):
         return mesh.vertices, faces
-    if faces is not None and hasattr(mesh, "points"):  # each face is preceded by its number of corners
+    if faces is not None and hasattr(mesh, "points"):  # PyVista stores the number of corners before each face
         table = np.asarray(faces)
         if table.ndim == 1:
             if len(table) % 4 or (table[::4] != 3).any():
@@ -504,7 +520,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
             f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but the vertices are 0 to "
             f"{n - 1}: {cure}."
         )
-    # A copy would keep libigl's "long long", which is another type of the same size.
+    # A copy would keep the type "long long" of libigl's arrays, which is not int64 but has the same size.
     triangles = np.empty(faces.shape, np.int64)
     triangles[...] = faces
     if (triangles != faces).any():
@@ -513,7 +529,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 
 
 def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """Return the index of the first equal row for each row of numbers (n, 3), as an array (n,)."""
+    """Return for each row of numbers (n, 3) the index of the first row that equals it, as an array (n,)."""
     order = np.lexsort(rows.T)  # a stable sort puts the first of equal rows first
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)

@@ -1,4 +1,4 @@
-"""Samples of a surface: evenly spread vertices."""
+"""The choice of samples, which are evenly spread vertices of a surface."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
     """Choose vertices one by one, each as far as possible from all earlier samples, in Euclidean distance.
 
     The first sample is the vertex farthest from the centroid of the vertices, so the samples do not depend on
-    the order of the vertices. (Ties go to the lowest index.)
+    the order of the vertices. (If several vertices are equally far, the vertex with the lowest index is
+    chosen.)
 
     **Arguments:**
 
     - `mesh`: the surface. Unreferenced vertices are never chosen.
-    - `number_of_samples`: s, from 1 to the number of referenced vertices.
+    - `number_of_samples`: the number s of samples, from 1 to the number of referenced vertices.
 
-    **Returns:** The samples (s,), as vertex indices in the order of choice.
+    **Returns:** The samples as 0-based vertex indices (s,), in the order in which they were chosen.
 
     **Raises:** `InputError` if the number of samples is below 1 or above the number of referenced vertices.
     """
@@ -47,12 +48,13 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
 
 class SurfaceSamples(NamedTuple):
-    """Samples that represent a surface.
+    """The samples of a surface, and the nearest sample of every vertex.
 
     **Attributes:**
 
-    - `vertices`: the sampled vertices (s,), ascending.
-    - `nearest`: for every vertex of the mesh, the position of the nearest sample in `vertices` (n,).
+    - `vertices`: the sampled vertices (s,), 0-based and ascending.
+    - `nearest`: an array (n,) with one entry per vertex of the mesh. `vertices[nearest[i]]` is the sample
+      nearest to vertex i.
     """
 
     vertices: Int64[np.ndarray, " s"]
@@ -62,10 +64,11 @@ class SurfaceSamples(NamedTuple):
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    This is Poisson-disk sampling: no two samples are closer in space than a distance derived from the area,
-    and no candidate can be added. (Candidates are one vertex per box of a grid with a third of this
-    distance.) For many samples, the function is much faster than `farthest_point_samples`. Two sheets of
-    surface that are closer than this distance share their samples.
+    In this Poisson-disk sampling, no two samples are closer in space than a smallest distance, and no
+    candidate can be added. The smallest distance follows from the area and the number of samples. The
+    candidates are one vertex per box of a grid, whose boxes are a third of the smallest distance wide. Two
+    sheets of surface that are closer to each other than the smallest distance share their samples. For many
+    samples, the function is much faster than `farthest_point_samples`.
 
     **Arguments:**
 
@@ -76,7 +79,7 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
     candidates = np.flatnonzero(mesh.referenced_vertices)
-    # A maximal set of samples at this distance has about 0.7 area / distance² members on a surface.
+    # A maximal set of samples with this smallest distance has about 0.7 area / distance² members.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # The candidates are thinned to one vertex, the lowest-numbered, per box of a grid around the centroid.
     positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)
@@ -110,28 +113,28 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
 
 
-# Every map looks discontinuous between vertices that are much closer together than the accuracy of maps. So a
-# mesh with more vertices than the first number is reduced to the second number of samples.
+# Every map looks discontinuous at edges that are much shorter than the usual errors of matches. Therefore a
+# mesh with more than `_DENSE` vertices is reduced to about `_SPREAD` samples.
 _DENSE, _SPREAD = 15_000, 5000
 
 
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
     """Choose a maximal set of vertices of a graph that are more than `radius` edges apart.
 
-    Luby, "A simple parallel algorithm for the maximal independent set problem", SIAM J. Comput. 1986, with a
-    fixed seed.
+    The algorithm is that of Luby, "A simple parallel algorithm for the maximal independent set problem", SIAM
+    J. Comput. 1986. Its random numbers come from a fixed seed.
 
     **Arguments:**
 
-    - `graph`: (n, n), symmetric, with a stored diagonal.
-    - `radius`: the number of edges, at least 1.
+    - `graph`: the adjacency matrix (n, n), symmetric, with a stored diagonal.
+    - `radius`: a number of edges, at least 1.
 
     **Returns:** The vertices (s,), ascending.
     """
     n = graph.shape[0]
     rank = np.random.default_rng(0).permutation(n)
     undecided, chosen = np.ones(n, bool), np.zeros(n, bool)
-    # Because of the diagonal, a vertex is among its own neighbors.
+    # Because of the stored diagonal, every vertex counts as its own neighbour.
     around, start = graph.indices, graph.indptr[:-1]
     while undecided.any():
         highest = np.where(undecided, rank, -1)

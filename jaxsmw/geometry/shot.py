@@ -1,4 +1,4 @@
-"""SHOT descriptors: histograms of normals in a local frame, which distinguish left from right."""
+"""SHOT descriptors, which are histograms of normals in a local frame and distinguish left from right."""
 
 from __future__ import annotations
 
@@ -14,46 +14,52 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` relies on the values 2
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` requires that elevation and radial are 2
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
-"""The MWP paper's radius of the neighbourhood, as a fraction of the square root of the area."""
-# Pairs of a vertex and a neighbor per block, at about 300 bytes per pair: few enough for the histograms to
-# stay in the processor's cache.
+"""The radius of SHOT neighbourhoods in the MWP paper, in units of the square root of the area."""
+# A block of vertices has about this number of pairs (a vertex and a neighbour). A pair takes about 300 bytes,
+# so the histograms of a block stay in the processor's cache.
 _PAIRS_PER_BLOCK = 30_000
 
 
 def shot_descriptors(
     mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: SurfaceSamples | None = None
 ) -> Float32[np.ndarray, "n 352"]:
-    """Compute signatures of histograms of orientations (SHOT), one per vertex.
+    """Compute SHOT descriptors (signatures of histograms of orientations), one per vertex.
 
-    Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and texture description",
-    CVIU 2014. The weighted scatter of the neighbors gives a local reference frame, and the majority of the
-    neighbors gives the signs of its axes. The frame divides the neighborhood into 8 sectors of azimuth, 2 of
-    elevation and 2 of distance. Each sector has a histogram, with 11 bins, of the cosine between a neighbor's
-    normal and the z axis of the frame. Binning is soft in all four directions, and descriptors have unit
-    length. All vertices within the radius are neighbors, with equal weights in the histograms.
+    SHOT is defined by Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and
+    texture description", CVIU 2014. The neighbours of a vertex are all vertices within the radius. Their
+    weighted scatter matrix gives the axes of a local reference frame. The x and z axes point to the side of
+    the majority of the neighbours.
+
+    The frame divides the neighbourhood into 32 sectors, by 8 ranges of azimuth, 2 of elevation and 2 of
+    distance. Each sector has a histogram of the cosine between a neighbour's normal and the z axis, with 11
+    bins. A neighbour contributes to the two nearest bins of azimuth, elevation, distance and cosine, with
+    linear weights. All neighbours have equal weights in the histograms. Each descriptor is scaled to unit
+    length.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
-    left from right. Renumbering the vertices only renumbers the descriptors. Normals are first turned
-    outward, by the sign of the enclosed volume, so an inside-out mesh has the same descriptors. Results are
+    left from right. Renumbering the vertices only renumbers the descriptors. If the enclosed volume is
+    negative, all normals are reversed first, so an inside-out mesh has the same descriptors. Results are
     cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices, consistently oriented.
-    - `radius`: the radius of the neighborhood, as a fraction of the square root of the area.
-    - `samples`: if given, only the samples count as neighbors and get descriptors
-      (`jaxsmw.geometry.sampling`). Each sample has the mean normal of the vertices nearest to it. Without
-      samples, the time grows with the square of the number of vertices.
+    - `radius`: the radius of the neighbourhoods, positive, in units of the square root of the area. The
+      default is the radius 0.06 of the MWP paper.
+    - `samples`: the s samples of the mesh as `SurfaceSamples` (`jaxsmw.geometry.sampling`), or None. If
+      given, only samples count as neighbours and get descriptors. The normal of a sample is the mean normal
+      of the vertices nearest to it. Without samples, the time grows with the square of the number of
+      vertices.
 
-    **Returns:** One row per vertex (n, 352) or, with samples, per sample (s, 352), float32, without unit. The
-    row is zero for unreferenced vertices and for vertices with fewer than 3 neighbors. The function warns if
-    more than 1 % of the vertices have fewer than 3 neighbors.
+    **Returns:** Descriptors (n, 352) with one row per vertex or, with samples, (s, 352) with one row per
+    sample, float32, without unit. The row is zero for unreferenced vertices and for vertices with fewer than
+    3 neighbours. The function warns if more than 1 % of the vertices have fewer than 3 neighbours.
 
-    **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbors.
+    **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbours.
     """
     if not radius > 0:
         raise InputError(f"the SHOT radius is {radius}, but must be positive: the usual choice is 0.06.")
@@ -78,12 +84,12 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        # Descriptors are less precise than the seven digits of float32.
+        # Single precision, with seven digits, suffices for the accuracy of descriptors.
         descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            # Two vertices at the same position have no direction between them.
+            # Pairs of vertices at the same position are left out, because they define no direction.
             apart = pairs["v"] > 0
             center, neighbor, distance = (pairs[column][apart] for column in "ijv")
             descriptors[rows[block]] = _describe(
@@ -100,9 +106,9 @@ def shot_descriptors(
 
 def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
-        f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbors within the "
-        f"SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh, or no "
-        "SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
+        f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "
+        f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh, or "
+        "avoid SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
     )
 
 
@@ -119,25 +125,27 @@ def _describe(
 
     **Arguments:**
 
-    - `positions`, `normals`: of all vertices, in square roots of the area.
+    - `positions`, `normals`: the positions of all vertices, in units of the square root of the area, and
+      their unit normals.
     - `block`: the vertices to describe.
-    - `center`, `neighbor`, `distance`: pairs of a position in the block and a vertex, and their distances.
-    - `radius`: the radius of the neighborhood.
+    - `center`, `neighbor`, `distance`: pairs of a vertex in the block and a neighbour. A pair is given by an
+      index into `block`, the neighbouring vertex, and the distance between both.
+    - `radius`: the radius of the neighbourhoods, in the unit of the positions.
     """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
     frames = _local_frames(offsets, center, radius - distance, len(block)).take(center, axis=0)
     x, y, z = np.einsum("pad,pd->ap", frames, offsets)
     cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
 
-    # Coordinates in units of bins, with the center of bin b at b.
+    # All coordinates are in units of bins. The centre of bin b has the coordinate b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
     elevation = np.arcsin(np.clip(z / distance, -1, 1)) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
-    # A pair contributes to two bins in each direction. Elevation and distance have only two bins, so every
-    # pair has weights for all four combinations. Azimuth and cosine select the rows of the histogram for
-    # these weights.
+    # A pair contributes to two bins of each quantity. Elevation and distance have only two bins, so every
+    # pair has weights for all four combinations of their bins. Azimuth and cosine select the rows of the
+    # histogram to which these weights are added.
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
     shares = np.empty((len(center), _ELEVATION * _RADIAL))
     for low, of_elevation in enumerate((1 - upper, upper)):
@@ -164,9 +172,10 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """Return one right-handed frame per center, with the axes x, y and z as rows.
+    """Return one right-handed frame per described vertex, with the axes x, y and z as rows.
 
-    The x axis points along the largest scatter, and the z axis along the smallest scatter.
+    The x axis is the direction of the largest scatter, and the z axis is the direction of the smallest
+    scatter.
     """
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
@@ -178,7 +187,7 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Regular meshes have ties, which must not be decided by the arbitrary signs of `eigh`.
+        # Ties occur on regular meshes. The arbitrary signs of `eigh` must not decide them.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis
@@ -190,7 +199,7 @@ def _local_frames(
 def _two_nearest(
     coordinate: Float64[np.ndarray, " p"],
 ) -> list[tuple[Int32[np.ndarray, " p"], Float64[np.ndarray, " p"]]]:
-    """Return the two nearest bins and their linear weights."""
+    """Return the two bins nearest to each coordinate, each with its weight in linear interpolation."""
     lower = np.floor(coordinate)
     upper_weight = coordinate - lower
     bins = lower.astype(np.int32)

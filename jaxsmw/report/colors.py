@@ -1,6 +1,6 @@
 """Colours for positions on a body, for errors and for signed values.
 
-Colours are interpolated in the colour space OKLab, in which equal distances look equally large.
+Colours are interpolated in the colour space OKLab, in which equal distances look like equal differences.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from jaxsmw.geometry.mesh import Mesh
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
 
-The value is the largest threshold of the evaluation. A match with a larger error counts as wrong. The scale
-is the same for all maps and reports, so that their colours are comparable.
+The value is the largest error threshold that evaluations report. A match with a larger error counts as wrong.
+All maps and reports use the same scale by default, which makes their colours comparable.
 """
 
-# Björn Ottosson, "A perceptual color space for image processing", 2020. The first matrix takes OKLab to the
-# cube roots of the cone responses. The second matrix takes cone responses to linear sRGB.
+# Björn Ottosson, "A perceptual color space for image processing", 2020. The first matrix converts OKLab to
+# the cube roots of cone responses. The second matrix converts cone responses to linear sRGB.
 _LAB_TO_ROOTS = np.array(
     [
         [1, 0.3963377774, 0.2158037573],
@@ -35,8 +35,9 @@ _CONES_TO_RGB = np.array(
     ]
 )
 
-# From no error (paper white) to large errors (dark plum), in OKLab. Lightness decreases monotonically, so
-# that the order is clear to colour-blind readers and in black-and-white prints.
+# The colours of errors in OKLab, from paper white for no error to dark plum for large errors. Lightness
+# decreases monotonically, which keeps the order visible to colour-blind readers and in black-and-white
+# prints.
 _ERROR_SCALE = np.array(
     [
         [0.95, 0.00, 0.015],
@@ -47,9 +48,9 @@ _ERROR_SCALE = np.array(
     ]
 )
 
-# From the most negative value (blue) through zero to the most positive value (red), in OKLab. Both ends have
-# the same lightness, so that neither sign stands out. Zero is paper white, or dark in the scale for dark
-# backgrounds (True).
+# The colours of signed values in OKLab, from blue for the most negative value to red for the most positive
+# value. Both ends have the same lightness, so neither sign stands out. Zero is paper white in the scale for
+# light backgrounds (False) and dark in the scale for dark backgrounds (True).
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -72,7 +73,7 @@ _SIGNED_SCALE = {
 }
 
 PLAIN = np.array([0.76, 0.77, 0.79])
-"""The grey of surfaces without colours and of vertices with an unknown error, in sRGB (3,) in [0, 1]."""
+"""The grey of plain surfaces and of vertices with an unknown error, as an sRGB colour (3,) in [0, 1]."""
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
@@ -90,13 +91,14 @@ def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray,
 
 
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """A smooth colour for every vertex, which shows the position of the vertex on the body.
+    """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
 
-    Right and left differ in hue (green and red). Height or length, whichever is larger, runs from yellow to
-    blue. The remaining direction changes the lightness, which is the least visible because of shading. Each
-    limb of people and animals therefore has its own hue, and a map that swaps left and right is obvious.
+    The right side of the body is green, and the left side is red. Along the height or the length of the body,
+    whichever is larger, the hue changes from yellow to blue. The third coordinate only changes the lightness,
+    because shading makes differences in lightness hard to see. Each limb of people and animals therefore has
+    its own hue, and a map that swaps left and right is obvious.
 
-    Each coordinate is the mean of the relative position between the extremes and the relative rank among the
+    Each coordinate combines the relative position in the bounding box with the relative rank among the
     vertices. Without the rank, the trunk of a slender body would be uniformly grey.
 
     **Arguments:**
@@ -108,8 +110,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Coordinates that differ only by rounding errors get the same rank. Otherwise a flat mesh would show
-    # noise.
+    # Coordinates that differ only by rounding errors get the same rank. Otherwise the colours of a flat mesh
+    # would be noisy.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
@@ -128,7 +130,7 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) -> Float64[np.ndarray, "m 3"]:
-    """The colours of errors on a scale from 0 to `limit`. Larger errors have the last colour.
+    """The colours of errors on a scale from 0 to `limit`. Errors above `limit` have the last colour.
 
     **Arguments:**
 
@@ -152,7 +154,7 @@ def signed_colors(
 
     - `values`: the values (m,) of a function or a matrix. Values outside of the scale are clipped.
     - `limit`: the end of the scale, positive, in the unit of the values.
-    - `on_dark`: whether zero is dark, for a dark background; otherwise zero is white.
+    - `on_dark`: True if the background is dark, so that zero has a dark colour; False if zero is white.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """

@@ -1,6 +1,6 @@
-"""Figures for papers and talks, drawn by matplotlib without a display (needs the extra `jaxsmw[report]`).
+"""Figures for papers and talks, drawn by matplotlib without a display.
 
-All functions that draw a figure return a `matplotlib.figure.Figure`.
+The functions need the extra `jaxsmw[report]`. They return each figure as a `matplotlib.figure.Figure`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ _LONGEST_NAME = 36
 # The height of one line of a legend in inches, and the width of the error scale at the right edge in pixels.
 _LEGEND_LINE, _SCALE_WIDTH = 0.24, 190
 _INK, _FAINT = "#1d2430", "#79818c"
-# Okabe and Ito's colours, which colour-blind readers can tell apart. Lines also differ in style, for prints.
+# Okabe and Ito's colours, which colour-blind readers can tell apart. The lines also differ in style, because
+# colours are lost in black-and-white prints.
 _LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -52,22 +53,25 @@ def draw_correspondence(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """A figure of a map by colour transfer: Y is coloured by position, and X has the colours of its matches.
+    """A figure that shows a map by colours: each vertex of X has the colour of its match on Y.
 
-    Both bodies are shown at the same scale and from the same direction. If the map is good, the colours of X
-    are as smooth as the colours of Y, and corresponding limbs have the same colours.
+    The colours of Y depend on the position on the body. Both bodies are shown at the same scale and from the
+    same direction. If the map is good, the colours of X are as smooth as the colours of Y, and corresponding
+    limbs have the same colours.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: by name, the error of the match of each vertex of X (m,), as a fraction of sqrt(area of Y);
-      NaN where the error is unknown. Each entry adds a panel that shows these errors as colours on X.
-    - `error_limit`: the end of the colour scale of errors, in the unit of the errors. The colours of two
-      figures are comparable if their limits are equal.
-    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+    - `errors`: arrays of errors by name. Each array (m,) contains the error of each match as a fraction of
+      sqrt(area of Y), or NaN where the error is unknown. For each array, the figure has a panel that shows
+      the errors as colours on X.
+    - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
+      of two figures are comparable if their limits are equal.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
+      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
     - `azimuth`: the direction from which the bodies are seen, in degrees from the front of the body towards
-      its left. By default `jaxsmw.report.rendering.choose_azimuth` chooses a direction.
+      its left. By default, `jaxsmw.report.rendering.choose_azimuth` chooses the direction.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -101,8 +105,8 @@ def draw_mesh(
     **Arguments:**
 
     - `mesh`: a surface with n vertices.
-    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); plain grey by default.
-    - `up`, `azimuth`: as in `draw_correspondence`.
+    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); by default, the mesh is grey.
+    - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -127,8 +131,9 @@ def draw_functional_map(
 
     **Arguments:**
 
-    - `functional_map`: C; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
-    - `convention`: the convention of C, for the labels of the axes.
+    - `functional_map`: the functional map C, with shape (k_X, k_Y) in the pullback convention and shape
+      (k_Y, k_X) in the pushforward convention.
+    - `convention`: the convention of C, `"pullback"` or `"pushforward"`, which determines the axis labels.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -163,9 +168,9 @@ def draw_filters(
     **Arguments:**
 
     - `eigenvalue_grid`: the values of lambda at which the responses are given (p,), ascending.
-    - `responses`: the responses (filters, p): the scaling function first, then wavelets from the coarsest to
-      the finest.
-    - `eigenvalues`: the eigenvalues of a shape (k,), which are marked on the axis.
+    - `responses`: the responses (filters, p). The first row belongs to the scaling function, and the other
+      rows belong to the wavelets, from the coarsest to the finest.
+    - `eigenvalues`: the eigenvalues of a shape (k,), which the figure marks on the horizontal axis.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -197,7 +202,7 @@ def draw_filters(
         np.asarray(eigenvalues),
         np.zeros(np.size(eigenvalues)),
         linestyle="none",
-        marker=2,  # a tick below the line
+        marker=2,  # a vertical tick below the point
         markersize=4,
         markeredgewidth=0.5,
         color=_FAINT,
@@ -218,13 +223,17 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """A figure of correspondence quality curves: the share of matches with an error of at most a threshold.
+    """A figure of correspondence quality curves.
+
+    A curve shows, for each threshold, the share of matches whose error is at most this threshold.
 
     **Arguments:**
 
-    - `curves`: by the name of a map, the thresholds (p,) in ascending order, as fractions of sqrt(area of Y),
-      and the shares (p,) in [0, 1].
-    - `mean_errors`: mean errors by the same names, for the legend. Curves without a mean error are allowed.
+    - `curves`: pairs of thresholds (p,) and shares (p,), by the name of a map. The thresholds are fractions
+      of sqrt(area of Y), in ascending order. Each share in [0, 1] counts the matches with an error of at most
+      the threshold.
+    - `mean_errors`: the mean errors of maps by the same names, which the legend shows. Some or all maps may
+      have no mean error.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -288,16 +297,16 @@ def draw_functions(
 ) -> Figure:
     """A figure of functions on bodies, with one row per body and one column per function.
 
-    Positive values are red, and negative values are blue. All bodies of a column share one colour scale. The
-    scale ends at the absolute value that 99.5 % of the vertices do not exceed.
+    Positive values are red, and negative values are blue. All bodies in a column have the same colour scale.
+    The scale ends at the absolute value that 99.5 % of the column's vertices do not exceed.
 
     **Arguments:**
 
     - `meshes`: the bodies. Their numbers of vertices n may differ.
     - `functions`: for each body, the values of all functions at its vertices (functions, n).
-    - `titles`: the titles of the functions.
-    - `marked`: one 0-based vertex of each body, which is marked by a ring.
-    - `up`, `azimuth`: as in `draw_correspondence`.
+    - `titles`: the titles of the columns, one per function.
+    - `marked`: one 0-based vertex of each body, which the figure marks by a ring.
+    - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -353,18 +362,19 @@ def draw_forest(
     xlabel: str,
     linear_up_to: float = 1.0,
 ) -> Figure:
-    """A forest plot: estimates with intervals, next to a line at zero, with one panel per group of cases.
+    """A forest plot of one or several panels, which show estimates with intervals and a line at zero.
 
-    The scale is linear near zero and logarithmic beyond, so that small and large differences are visible.
+    The scale is linear near zero and logarithmic elsewhere, which makes both small and large estimates
+    visible.
 
     **Arguments:**
 
-    - `panels`: by the title of a panel and the name of a series, an array (rows, 3). Each row has the
-      estimate and the lower and upper end of its interval; NaN for a missing estimate. All panels have the
-      same series.
+    - `panels`: the series of each panel, by the title of the panel. A series is an array (rows, 3) by its
+      name. Each row of the array contains an estimate and the lower and upper end of its interval, or NaN for
+      a missing estimate. All panels have the same series.
     - `rows`: the names of the rows, from top to bottom.
     - `xlabel`: the name of the estimated quantity.
-    - `linear_up_to`: the absolute value at which the scale becomes logarithmic.
+    - `linear_up_to`: the absolute value of an estimate above which the scale is logarithmic.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -434,14 +444,15 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure of tables of positive numbers: coloured cells that contain the numbers.
+    """A figure of tables of positive numbers, in which each cell contains its number and is coloured by it.
 
-    All tables share one logarithmic colour scale.
+    All tables have the same logarithmic colour scale.
 
     **Arguments:**
 
     - `panels`: the tables (rows, columns) by title.
-    - `rows`, `columns`: the name of the parameter that varies over the rows or columns, and its values.
+    - `rows`: the name of the parameter that varies from row to row, and its value in each row.
+    - `columns`: the name of the parameter that varies from column to column, and its value in each column.
     - `label`: the name of the quantity that the numbers measure.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -507,7 +518,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Checks that figures can be drawn. Call this function before a long computation whose result is drawn.
+    """Checks that matplotlib is installed. Call this function before a long computation.
 
     **Raises:** `InputError` if matplotlib is missing.
     """
@@ -531,12 +542,12 @@ def check_figure_path(path: str | os.PathLike[str]) -> None:
     check_writable(path)
 
 
-# The files contain no dates, so that equal figures give equal files.
+# Dates are left out of the files, because equal figures must give equal files.
 _METADATA: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
 class _Panel(NamedTuple):
-    """One body in a figure: its role in the pair, its upright mesh, and its vertex colours (n, 3)."""
+    """One body in a figure: the text above it, its upright mesh, and its vertex colours (n, 3)."""
 
     role: str
     mesh: Mesh
@@ -544,9 +555,9 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draws the bodies side by side at one scale, each below its role and name.
+    """Draws the bodies side by side at the same scale, with the role and the name of each body above it.
 
-    One pixel of the figure shows one pixel of the picture that `render` returns.
+    Each pixel of the figure shows one pixel of a picture that `render` returns. `right_margin` is in pixels.
     """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
@@ -594,7 +605,10 @@ def _shorten(name: str) -> str:
 
 
 def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
-    """Draws the colour bar of the errors at the right edge, and if needed the colour of unknown errors."""
+    """Draws the colour bar of errors at the right edge.
+
+    With `has_unknown`, a patch below the bar shows the colour of unknown errors.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.patches import Patch
@@ -615,9 +629,9 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
 
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
-    """An empty white figure with a canvas in memory; plots are laid out automatically.
+    """An empty white figure with a canvas in memory. The width and the height are in inches.
 
-    The width and the height are in inches.
+    With `plot`, matplotlib chooses the positions of axes and labels automatically.
     """
     check_drawable()
     from matplotlib.backends.backend_agg import FigureCanvasAgg

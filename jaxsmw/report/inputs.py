@@ -1,4 +1,4 @@
-"""Checks of the maps, errors and matrices for figures and pages."""
+"""Checks of the maps, errors and functional maps that figures and pages show."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ def check_map(
 
     **Returns:** The map (m,) as int64.
 
-    **Raises:** `InputError` unless the map has one vertex of Y for every vertex of X.
+    **Raises:** `InputError` if the map does not have one vertex of Y for every vertex of X.
     """
     indices = np.asarray(pointwise_map)
     m, n = len(mesh_x.vertices), len(mesh_y.vertices)
     if indices.shape != (m,) or not np.issubdtype(indices.dtype, np.integer):
         raise InputError(
-            f"the pointwise map from {mesh_x.name} must have one integer for each of its {m} vertices, but "
-            f"has shape {indices.shape} and type {indices.dtype}; give a map from X to Y."
+            f"the pointwise map has shape {indices.shape} and type {indices.dtype}, but must have one "
+            f"integer for each of the {m} vertices of {mesh_x.name}; give a map from X to Y."
         )
     if indices.min() < 0 or indices.max() >= n:
         raise InputError(
-            f"the pointwise map to {mesh_y.name} has indices from {indices.min()} to {indices.max()}, but "
-            f"its vertices are 0 to {n - 1}; give a map from X to Y with vertices counted from 0."
+            f"the pointwise map has indices from {indices.min()} to {indices.max()}, but the vertices of "
+            f"{mesh_y.name} are 0 to {n - 1}; give a map from X to Y with vertices counted from 0."
         )
     return indices.astype(np.int64)
 
@@ -49,11 +49,12 @@ def check_errors(
     **Arguments:**
 
     - `mesh_x`: the source, with m vertices.
-    - `errors`: by name, the error of each vertex of X (m,), non-negative; NaN where the error is unknown.
+    - `errors`: arrays by name. Each array (m,) contains a non-negative error for each vertex of X, or NaN
+      where the error is unknown.
 
-    **Returns:** The errors by name, (m,) in float64.
+    **Returns:** The arrays (m,) by the same names, in float64.
 
-    **Raises:** `InputError` unless each array has one non-negative number or NaN for every vertex of X.
+    **Raises:** `InputError` if an array does not have one non-negative number or NaN for every vertex of X.
     """
     m, checked = len(mesh_x.vertices), {}
     for name, of_vertices in errors.items():
@@ -68,12 +69,12 @@ def check_errors(
 
 
 def check_error_limit(limit: float) -> None:
-    """Checks the largest error on the colour scale of errors.
+    """Checks the error at which the colour scale of errors ends.
 
-    **Raises:** `InputError` unless the limit is positive and finite.
+    **Raises:** `InputError` if the limit is not positive or not finite.
     """
     if not 0 < limit < np.inf:
-        raise InputError(f"the error scale ends at {limit}; give a positive finite number.")
+        raise InputError(f"the colour scale of errors ends at {limit}; give a positive finite number.")
 
 
 def check_functional_map(
@@ -85,12 +86,15 @@ def check_functional_map(
     """
     matrix = np.asarray(functional_map, dtype=float)
     if matrix.ndim != 2 or not matrix.size or not np.isfinite(matrix).all():
-        raise InputError(f"the functional map has shape {matrix.shape}; give a matrix of finite numbers.")
+        raise InputError(
+            f"the functional map has shape {matrix.shape}, and {np.sum(~np.isfinite(matrix))} of its entries "
+            "are not finite; give a non-empty matrix of finite numbers."
+        )
     return matrix
 
 
 def describe(mesh: Mesh) -> tuple[str, str]:
-    """The caption of a body: the name of its file without the directory, and its number of vertices."""
+    """The caption of a mesh: the name of its file without the directory, and its number of vertices."""
     # File names may contain bytes that are not text. Question marks replace these bytes.
     name = Path(mesh.name).name.encode("utf-8", "replace").decode()
     return name, f"{len(mesh.vertices)} vertices"

@@ -1,4 +1,4 @@
-"""Correspondences as an interactive web page: a single file that needs no other files and no network."""
+"""An interactive web page that shows correspondences. The page is one file and needs no network."""
 
 from __future__ import annotations
 
@@ -48,18 +48,19 @@ _EXPLANATIONS = {
     ),
     "wavelets": (
         "A wavelet is a ripple around one point of a surface. Point at a body: if the map is good, the "
-        "ripple around that point and the ripple around its match look similar. Red is positive, blue is "
-        "negative."
+        "ripple around that point and the ripple around its match look similar. Positive values are red, and "
+        "negative values are blue."
     ),
     "eigenfunctions": (
         "Eigenfunctions are the vibration patterns of a surface, like the tones of a drum. These two "
-        "patterns belong to the chosen entry of the functional map. Red is positive, blue is negative."
+        "patterns belong to the chosen entry of the functional map. Positive values are red, and negative "
+        "values are blue."
     ),
-    "plain": "The two bodies without colours.",
+    "plain": "The two bodies are shown without colours.",
 }
 _DISTANCES = (
-    "Light means close, dark means far. Distances are fractions of √area, the square root of the target's "
-    "surface area: on an adult person 0.1 is about 13 cm."
+    "Light colours mark small distances, and dark colours mark large distances. Distances are fractions of "
+    "√area, the square root of the target's surface area. On an adult person, 0.1 is about 13 cm."
 )
 
 
@@ -70,12 +71,14 @@ class ShownMap:
     **Attributes:**
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: by name, the error of the match of each vertex of X (m,), as a fraction of sqrt(area of Y);
-      NaN where the error is unknown. Each entry adds a mode that shows these errors as colours.
-    - `functional_map`: C, shown as a picture; (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the
-      pushforward convention. None shows no functional map.
-    - `convention`: the convention of C.
-    - `statistics`: labels and values, shown in the table that compares all maps of the page.
+    - `errors`: arrays of errors by name. Each array (m,) contains the error of each match as a fraction of
+      sqrt(area of Y), or NaN where the error is unknown. For each array, the page has a mode that shows the
+      errors as colours.
+    - `functional_map`: the functional map C, which the page shows as a picture. The shape is (k_X, k_Y) in
+      the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the page shows no
+      functional map.
+    - `convention`: the convention of C, `"pullback"` or `"pushforward"`.
+    - `statistics`: values by label, which the page shows in the table that compares its maps.
     """
 
     pointwise_map: Int[np.ndarray | Array, " m"]
@@ -100,38 +103,42 @@ def write_page(
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
 ) -> None:
-    """Writes a web page that shows both bodies in 3D, coloured by a map, and the match under the pointer.
+    """Writes a web page that shows both bodies in 3D and colours them by one map at a time.
 
-    The page shows one of the maps at a time. If spectra are given, the page also shows the wavelets of a
-    refiner's bank,
+    The page also shows the match of the point under the pointer. If spectra are given, the page can show the
+    wavelets of a refiner's filter bank. The wavelet of scale l around a vertex y is the function
 
         psi_{l,y}(x) = sum_i g_l(lambda_i) phi_i(y) phi_i(x),
 
-    on X around the vertex y under the pointer, and on Y around the match of y. If the map preserves wavelets,
-    both look similar. The page prints their similarity: the map carries the wavelet on Y to X, and the
-    similarity is the cosine of the angle between the result and the wavelet on X.
+    where g_l is the filter of scale l, and lambda_i and phi_i are the eigenvalues and eigenvectors of the
+    shape. The page shows the wavelet on X around the vertex under the pointer, and the wavelet on Y around
+    the match of this vertex. If the map preserves wavelets, the two wavelets look similar. The page prints
+    their similarity: the wavelet on Y is transferred to X by the map, and the similarity is the cosine of the
+    angle between this function and the wavelet on X.
 
     **Arguments:**
 
-    - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB.
-      Meshes take 50 bytes per vertex, and maps a few bytes per vertex and map. Spectra take 133 bytes per
-      vertex, at most 8 MB in total.
+    - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB of
+      the file. The meshes take 50 bytes per vertex, and each map takes a few bytes per vertex. The spectra
+      take 133 bytes per vertex, but at most 8 MB in total.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `maps`: maps from X to Y by name. The page opens with the first map.
-    - `title`: the heading.
-    - `spectra`: the spectra of X and Y. The page contains up to
-      `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors, rounded to one byte per number. Wavelets
-      are then accurate to about one hundredth.
+    - `title`: the heading of the page.
+    - `spectra`: the spectra of X and Y, or None. The page contains at most
+      `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors of each shape, rounded to one byte per
+      number. This rounding changes wavelets by about one hundredth of the colour scale.
     - `refiner`: the refiner whose wavelets are shown.
-    - `statistics`: labels and values to show below the bodies.
-    - `error_meanings`: explanations of errors, one sentence by the name of each error.
-    - `error_limit`: the end of the colour scale of errors, in the unit of the errors. The colours of two
-      pages are comparable if their limits are equal.
-    - `figures`: captions and contents of PNG files, which are shown at the end of the page.
-    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+    - `statistics`: values by label, which the page shows below the bodies.
+    - `error_meanings`: one sentence by the name of the errors, with which the page explains these errors.
+    - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
+      of two pages are comparable if their limits are equal.
+    - `figures`: the caption and the content of a PNG file for each figure at the end of the page.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
+      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
-    **Raises:** `InputError` if there is no map, if the maps, errors or spectra do not fit the meshes, if the
-    limit is not positive, or if the file cannot be written.
+    **Raises:** `InputError` if there is no map, if the maps, errors or spectra do not fit the meshes, if a
+    functional map is not a matrix of finite numbers, if the limit is not positive, if `up` is not an axis, or
+    if the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one map.")
@@ -167,7 +174,7 @@ def write_page(
 
 
 def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """The data of two upright meshes, and of the camera."""
+    """The data from which the viewer draws two upright meshes: the meshes, their colours and the camera."""
     reach = np.max(
         [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
     )
@@ -182,7 +189,7 @@ def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
 
 
 def _encode_map(name: str, shown: ShownMap, mesh_x: Mesh, mesh_y: Mesh) -> dict[str, Any]:
-    """The data of one map."""
+    """The data from which the viewer shows one map."""
     return {
         "name": name,
         "map": encode(check_map(mesh_x, mesh_y, shown.pointwise_map), "<u4"),
@@ -212,7 +219,7 @@ def _add_wavelets(
 
 
 def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
-    """The labels of all modes in which the viewer colours the bodies, by the viewer's names of the modes."""
+    """The labels of the modes in which the viewer can colour the bodies, by the viewer's mode names."""
     modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
     if has_spectra:
         modes["wavelets"] = "Wavelets"
@@ -222,7 +229,7 @@ def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spec
 
 
 def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
-    """The page: the template, filled with data, fragments of HTML and the viewer's script."""
+    """The HTML of the page: the template, filled with the data, the fragments and the viewer's script."""
     assets = files("jaxsmw.report") / "assets"
     script = (assets / "viewer.js").read_text("utf-8")
     parts = {
@@ -245,7 +252,7 @@ def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """Radio buttons with the given labels by value. The first button is selected."""
+    """The HTML of radio buttons, whose labels are given by value. The first button is selected."""
     inputs = "".join(
         f'<label><input type="radio" name="{name}" autocomplete="off" value="{value}"'
         f"{'' if position else ' checked'}><span>{html.escape(text)}</span></label>"
@@ -258,7 +265,7 @@ def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
 
 
 def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -> str:
-    """One paragraph per mode. The viewer shows the paragraph of the current mode."""
+    """The HTML of one paragraph per mode. The viewer shows the paragraph of the current mode."""
     paragraphs = []
     for mode, label in modes.items():
         text = _EXPLANATIONS.get(mode)
@@ -269,7 +276,7 @@ def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -
 
 
 def _comparison(maps: Mapping[str, ShownMap]) -> str:
-    """A table of the maps' statistics, with one row per map and one column per label."""
+    """The HTML table of the maps' statistics, with one row per map and one column per label."""
     labels = dict.fromkeys(label for shown in maps.values() for label in shown.statistics)
     if not labels:
         return ""
@@ -287,7 +294,7 @@ def _comparison(maps: Mapping[str, ShownMap]) -> str:
 
 
 def _statistics(statistics: Mapping[str, str]) -> str:
-    """Labels and values, with one card per label."""
+    """The HTML of the statistics, with one card per label."""
     if not statistics:
         return ""
     rows = "".join(
@@ -298,7 +305,7 @@ def _statistics(statistics: Mapping[str, str]) -> str:
 
 
 def _figures(figures: Sequence[tuple[str, bytes]]) -> str:
-    """PNG pictures with their captions."""
+    """The HTML of PNG pictures with their captions."""
     if not figures:
         return ""
     shown = "".join(

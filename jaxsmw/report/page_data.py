@@ -1,4 +1,4 @@
-"""The arrays of a page in a compact encoding: little-endian numbers in base64."""
+"""A compact encoding of the arrays of a page: little-endian numbers in base64."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from jaxsmw.pair import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map
 
-# The largest and the smallest number of eigenvectors on a page, and the largest number of eigenvector entries
-# of both shapes together. An entry takes one byte, and a third more in base64. For up to 60 000 vertices in
-# total a page contains the paper's 100 eigenvectors. For more than 300 000 vertices it contains none.
+# The largest and the smallest number of eigenvectors per shape on a page, and the largest number of entries
+# of all eigenvectors of both shapes. An entry takes one byte, which base64 expands to 4/3 bytes. A page of
+# shapes with at most 60 000 vertices in total contains 100 eigenvectors, as many as the MWP paper uses. A
+# page of shapes with more than 300 000 vertices in total contains no eigenvectors.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 
 COLOR_SCALES = {
@@ -26,17 +27,17 @@ COLOR_SCALES = {
     "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
     "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
 }
-"""The colour scales by name: sRGB colours (n, 3) in [0, 1], at even steps between the ends of a scale.
+"""The colour scales by name. Each scale is an array of evenly spaced sRGB colours (n, 3) in [0, 1].
 
-The middle colour of a signed scale means zero.
+The middle colour of a signed scale belongs to the value zero.
 """
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
-    """The number of eigenvectors that a page of two meshes contains.
+    """The number of eigenvectors of each shape that a page of two meshes contains.
 
-    The number is 100 for up to 60 000 vertices in total, smaller for more vertices, and 0 for more than 300
-    000.
+    The number is 100 for meshes with at most 60 000 vertices in total. Above 60 000 vertices the number
+    decreases, and above 300 000 vertices it is 0.
     """
     room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
     return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
@@ -47,13 +48,13 @@ def spectra_on_page(
 ) -> tuple[Spectrum, Spectrum] | None:
     """The spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    If the spectra have different numbers of eigenvectors, as for a partial pair, they are also cut to their
-    common range.
+    If the two spectra have different numbers of eigenvectors, as for a partial pair, both spectra are also
+    cut to a common range of eigenvalues (`jaxsmw.pair.common_range`).
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: their spectra, without padding.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, without padding.
 
     **Returns:** Both spectra; None if the meshes are so large that a page contains no eigenvectors.
 
@@ -103,10 +104,11 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
     """The rows of a matrix, rounded to one byte per number, with one unit per row.
 
-    The code c of a number means sign(c) c² units, so small numbers get finer levels. Eigenvectors that are
-    large on a limb are small on the rest of the body, and even levels would cause visible errors of wavelets
-    there. The rounding changes wavelets by half a hundredth of the colour scale (root mean square, on people
-    and animals). Even levels would need 10 bits for the same accuracy.
+    The code c represents the number sign(c) c², in the unit of the row, so small numbers are rounded less
+    than large numbers. An eigenvector that is large on a limb is small on the rest of the body, where evenly
+    spaced levels would cause visible errors of wavelets. The rounding changes wavelets on people and animals
+    by half a hundredth of the colour scale (root mean square). Evenly spaced levels would need 10 bits per
+    number for the same accuracy.
 
     **Arguments:**
 

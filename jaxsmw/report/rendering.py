@@ -1,4 +1,4 @@
-"""Shaded pictures of meshes, rendered with NumPy: camera, visible surface and light."""
+"""Shaded pictures of meshes, rendered with NumPy: the camera, the visible surface and the light."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from scipy.ndimage import uniform_filter
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
 
-# The preferred azimuth of the viewer, in front of the body and a little to the side: the angle from +z
-# towards +x, in radians.
+# The preferred azimuth of the viewer in radians, measured from +z towards +x. The viewer is in front of the
+# body and a little to the side.
 _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
 """The angle at which the viewer looks down on the body, in radians."""
 
-# The direction to each light in camera coordinates (right, up, towards the viewer), followed by its strength.
+# For each light, the direction to the light in camera coordinates (right, up, towards the viewer) and the
+# strength of the light.
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# The number of samples per pixel in each direction, and the number of samples that are tested at a time.
+# The number of samples per pixel in each direction, and the approximate number of samples that are tested
+# against faces at a time.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
@@ -30,10 +32,10 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
     """The azimuth of a view that shows all meshes well.
 
     The best direction of view is the horizontal direction in which the bodies are thin. People are then seen
-    from the front, and animals from the side. A view from the front and a little to the side is preferred.
-    Let M be the sum of the horizontal covariances of the n meshes, each scaled to trace 1, and r the
-    preferred direction. The direction of view is the eigenvector of M - 0.8 n r r^T with the smallest
-    eigenvalue.
+    from the front, and animals from the side. Directions close to the preferred direction r have an
+    advantage; r is a view from the front and a little to the side. The direction of view is the eigenvector
+    of M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the sum of the
+    meshes' horizontal covariance matrices, each scaled to trace 1.
 
     **Arguments:**
 
@@ -75,8 +77,9 @@ def render(
 
     The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
     samples per pixel prevents cracks and wrongly sorted triangles. A strong light comes from the upper left,
-    and a weak light from the right. Both light the two sides of a face equally. Where one part of the body is
-    in front of another, the part behind is slightly darker near the outline of the front part.
+    and a weak light comes from the right. Both lights illuminate the two sides of a face equally. Where one
+    part of the body is in front of another part, the rear part is slightly darker near the outline of the
+    front part.
 
     **Arguments:**
 
@@ -103,8 +106,8 @@ def render(
     normal = np.einsum("pc,pcd->pd", weights, normals[corners])
     sides = positions[corners[:, 1:]] - positions[corners[:, :1]]
     flat = np.cross(sides[:, 0], sides[:, 1])
-    # Where the normals of the corners cancel out, the normal of the face is used. The normals of faces seen
-    # from behind are reversed, so that the back is lit like the front.
+    # Where the normals of the corners cancel out, the normal of the face is used. If the back of a face is
+    # visible, its normal is reversed, because the back is lit like the front.
     normal = np.where(np.any(normal, axis=1, keepdims=True), normal, flat) * np.where(flat[:, 2:] < 0, -1, 1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -175,7 +178,7 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """The share of the light that reaches each sample; the share is smaller behind a nearer surface.
+    """The share of the light that reaches each sample, which is smaller near the outline of a nearer part.
 
     The share is computed by unsharp masking of the depth (Luft et al. 2006).
     """

@@ -1,4 +1,4 @@
-"""Turns bodies upright and scales them for pictures, and guesses which axis of a file points up."""
+"""Turns meshes upright, scales them for pictures, and guesses which axis of a mesh file points up."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 
-# Rotations that turn the given axis of a file up. Forward is +z in y-up files and -y in z-up files, and x
-# runs across the body in both. After the rotation, bodies of both kinds of files face the same way.
+# For each axis, the rotation that makes this axis of a file point up. Forward is +z in y-up files and -y in
+# z-up files, and x runs across the body in both. After the rotation, bodies of both kinds of files face the
+# same way.
 _STAND = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -24,25 +25,28 @@ _STAND = {
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
 
-# The usual conventions: y up in computer graphics, z up in engineering, y down in computer vision.
+# The usual conventions of files: y points up in computer graphics, z points up in engineering, and y points
+# down in computer vision.
 _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
-# A body is slender along y if its spread along z is at most this multiple of its spread along y. The ratio of
-# standing people in y-up files is at most 0.42. Animals in z-up files are long along y, but their ratio is at
-# least 0.47, except for two animals that leap or crouch.
+# A body is slender along y if its spread along z is at most this multiple of its spread along y. For standing
+# people in y-up files, the ratio of these spreads is at most 0.42. Animals in z-up files are long along y,
+# but the ratio is at least 0.47, except for two animals that leap or crouch.
 _SLENDER = 0.45
-# The amount by which the score of another axis must exceed the score of the usual axis. The scores of people
-# with raised arms on one foot are up to 0.18 higher upside down. The scores of sitting or leaping bodies are
-# up to 0.09 higher for a wrong axis.
+# For each usual axis, the amount by which the score of another axis must exceed the score of the usual axis.
+# If people stand on one foot with raised arms, an upside-down axis has a score that is up to 0.18 higher than
+# the score of the correct axis. If bodies sit or leap, a wrong axis has a score that is up to 0.09 higher.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, because larger or smaller values carry no information. The unit is the
 # square root of the area.
 _STABILITY_RANGE = (-0.2, 0.1)
-# Points in the lowest part of the body, with this share of the height, count as touching the ground.
+# A point counts as touching the ground if its height above the lowest point is at most this share of the
+# body's height.
 _CONTACT = 0.1
 _DIRECTIONS = 32
-# The side of the cells in which vertices are merged, which gives about 1500 cells per body, and the length of
-# the shortest limb that counts. Shorter limbs are noise. Both are in square roots of the area.
+# The side length of the grid cells in which vertices are merged, and the length of the shortest limb that
+# counts. Both are in units of the square root of the area. A body has about 1500 cells. Shorter limbs are
+# noise.
 _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
 # A shape counts as partial if its area is between these multiples of the area of the other shape.
@@ -50,17 +54,18 @@ _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
 
 
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
-    """The upright form of a mesh, with its bounding box centred on the origin and with area 1.
+    """The mesh turned upright and scaled to area 1, with its bounding box centred on the origin.
 
-    Faces are reoriented such that adjacent faces have consistent orientations. Vertices keep their numbers.
+    Faces are reoriented where needed, so adjacent faces have consistent orientations. Vertices keep their
+    indices.
 
     **Arguments:**
 
     - `mesh`: a surface of positive area.
-    - `up`: the axis of the file that points up; by default `guess_up`.
+    - `up`: the axis of the file that points up, such as `"y"` or `"-z"`; by default the result of `guess_up`.
 
-    **Returns:** A `Mesh` in which x runs across the body, y points up and z forward, provided that the file
-    follows one of the usual conventions.
+    **Returns:** A `Mesh` in which y points up. If the file follows one of the usual conventions (y up, z up
+    or y down), x runs across the body, and z points forward.
 
     **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
     """
@@ -83,19 +88,20 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
 
 
 def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
-    """The upright forms (`stand`) of both meshes: Y with area 1, and X with area 1 unless one shape is
-    partial.
+    """Both meshes turned upright and scaled for a common picture; see `stand`.
 
-    If the ratio of the smaller to the larger area is between 1/16 and 0.6, the smaller mesh counts as a
-    partial shape, and X keeps its size relative to Y. With a larger ratio both are full shapes. With a
-    smaller ratio the meshes have different units of length.
+    Y is scaled to area 1. X is also scaled to area 1, unless one of the shapes seems to be partial. This is
+    the case if the ratio of the smaller area to the larger area is between 1/16 and 0.6. X then keeps its
+    size relative to Y. If the ratio is larger, both meshes count as full shapes. If the ratio is smaller, the
+    meshes are assumed to have different units of length.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: surfaces of positive area.
-    - `up`: the axis of both files that points up; by default `guess_up` of each mesh.
+    - `up`: the axis of both files that points up, such as `"y"` or `"-z"`. By default, `guess_up` guesses the
+      axis of each mesh.
 
-    **Returns:** The upright forms of X and of Y.
+    **Returns:** The upright meshes X and Y.
 
     **Raises:** `InputError` if a mesh has no area, or if `up` is not an axis.
     """
@@ -110,15 +116,17 @@ def guess_up(mesh: Mesh) -> Axis:
     """Guesses which axis of the file points up, from the limbs on which the body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
-    axis (`_hanging_limbs`): legs and arms hang down, and hardly anything but a head rises. The second term
-    measures how stably the body would stand (`_stability`). The usual axis is y for a body that is slender
-    along y, such as a person, and z otherwise. The usual axis is returned unless the score of another axis is
-    clearly higher.
+    axis (`_hanging_limbs`), because legs and arms hang down, and hardly anything but the head points up. The
+    second term measures how stably the body would stand (`_stability`). The usual axis is y for a body that
+    is slender along y, such as a person, and z otherwise. The usual axis is returned if no other axis has a
+    clearly higher score.
 
-    Visual inspection shows that the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies (z up; a
-    leaping and a crouching animal are not upright), 30 of 32 SMAL animals (y down), 17 of 19 people of
-    SHREC'19 (both conventions) and all 16 bodies of SHREC'16 topology. Without the two terms the guess was
-    right for 70, 41, 1, 16 and 16 bodies. The guess can be wrong for a body that lies down or is cut in half.
+    By visual inspection, the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies, 30 of 32 SMAL
+    animals, 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16 topology. TOSCA files have z up, SMAL
+    files have y down, and SHREC'19 has files with y up and files with z up. The two wrong TOSCA bodies are a
+    leaping and a crouching animal. Without the two terms, the guess is right for 70 FAUST bodies, 41 TOSCA
+    bodies, 1 SMAL animal, 16 people of SHREC'19 and 16 bodies of SHREC'16 topology. The guess can be wrong
+    for a body that lies down or is cut in half.
 
     **Arguments:**
 
@@ -142,7 +150,9 @@ def guess_up(mesh: Mesh) -> Axis:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """A coarse copy of the mesh: the mean vertex of each cell of a grid, and the edges between cells."""
+    """A coarse copy of the mesh: one point per grid cell, at the mean of the cell's vertices, and the edges
+    between cells.
+    """
     used = mesh.vertices[mesh.referenced_vertices]
     keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
@@ -160,8 +170,8 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
     A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
     lower. Its length is the persistence of its component in the sublevel sets of the height (Edelsbrunner,
     Letscher and Zomorodian, "Topological persistence and simplification", 2002). The component with the
-    lowest point of the body does not count. A standing quadruped has three such limbs. A quadruped on its
-    back has none.
+    lowest point of the body does not count. Therefore three limbs of a standing quadruped count, and no limb
+    of a quadruped on its back counts.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 
@@ -186,7 +196,7 @@ def _stability(heights: Float64[np.ndarray, " c"], ground: Float64[np.ndarray, "
     """The distance of the body's centre from the boundary of its support, clipped to `_STABILITY_RANGE`.
 
     The distance is negative if the centre is outside of the support. The support is the convex hull of the
-    lowest points, seen from above. The centre is the origin.
+    lowest points, projected to the ground. The body's centre is at the origin.
     """
     low = ground[heights <= heights.min() + _CONTACT * np.ptp(heights)]
     angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS

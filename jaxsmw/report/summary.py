@@ -1,4 +1,4 @@
-"""Reports: pictures, numbers and interactive pages about one match, or about several maps of a pair."""
+"""Reports with pictures, numbers and interactive pages, about one match or about several maps of a pair."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ _QUALITY_CAPTION = (
     "The share of matches whose geodesic error is at most a threshold. Higher curves are better."
 )
 _FILTERS_CAPTION = (
-    "The filters of the wavelets of each scale, over the eigenvalues of the source (scaled to area 1)."
+    "The responses of all filters as functions of the eigenvalue. Ticks mark the eigenvalues of the source, "
+    "scaled to area 1."
 )
 _ERROR_MEANINGS = {
     "Error": "The distance along the surface between each match and the true point on the target.",
@@ -85,16 +86,19 @@ def write_report(
 
     **Arguments:**
 
-    - `directory`: created if missing. It gets `report.html` (an interactive page with both bodies, the map
-      and the initial map), `correspondence.png`, `functional_map.png`, `filters.png` (if a stage has
-      filters), `quality.png` (if there are errors) and `summary.json`.
-    - `correspondence`: the match.
-    - `errors`: geodesic errors by the name of a map. The entry `initial` is the error of
-      `correspondence.initial_map`. The last entry is the error of `correspondence.pointwise_map`.
+    - `directory`: the directory of the report, which is created if it does not exist. The function writes
+      `report.html` (an interactive page with both bodies, the map and the initial map), `correspondence.png`,
+      `functional_map.png`, `filters.png` (if a stage has filters), `quality.png` (if errors are given) and
+      `summary.json`.
+    - `correspondence`: the result of `match`.
+    - `errors`: geodesic errors by the name of a map. The entry `initial` contains the errors of
+      `correspondence.initial_map`. The last entry contains the errors of `correspondence.pointwise_map`.
     - `settings`: settings to include in the summary, which must be serialisable as JSON.
     - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
-      `match`. The report adds its own steps and prints the sum as the total, so steps must not overlap.
-    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+      `match`. The steps must not overlap, because the report adds its own steps and prints the sum as the
+      total time.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
+      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
     **Returns:** The files that were written.
 
@@ -110,7 +114,7 @@ def write_report(
     with timed("pictures", steps):
         pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
     wavelets = _last_wavelets(correspondence)
-    # The page's table of maps already has the errors of the initial and the refined map.
+    # The page's table of maps already shows the errors of the initial map and of the refined map.
     others = {name: error for name, error in list(errors.items())[:-1] if name != "initial"}
     write_page(
         directory / "report.html",
@@ -144,7 +148,7 @@ def _shown_maps(
     errors: Mapping[str, GeodesicError],
     expected_error: Float[np.ndarray, " m"],
 ) -> dict[str, ShownMap]:
-    """The refined and the initial map, as the page shows them."""
+    """The refined map and the initial map, with the errors and functional maps that the page shows."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
     convention = correspondence.preset.stages[-1].refiner.convention
@@ -154,14 +158,14 @@ def _shown_maps(
         _named_errors(final, m) | {"Expected error": expected_error},
         correspondence.functional_map,
         convention,
-        _main_figures(final),
+        _error_statistics(final),
     )
     before = ShownMap(
         correspondence.initial_map,
         _named_errors(initial, m),
         _encoded(correspondence.initial_map, *spectra, convention),
         convention,
-        _main_figures(initial),
+        _error_statistics(initial),
     )
     return {"refined": refined, "initial": before}
 
@@ -173,7 +177,7 @@ def _save_figures(
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
 ) -> tuple[list[Path], dict[Path, str]]:
-    """Writes all figures. Returns their files, and the captions of the files that the page also shows."""
+    """Writes all figures. Returns their files, and the captions of the figures that the page also shows."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
@@ -197,7 +201,10 @@ def _save_figures(
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
-    """The last refiner that preserves wavelets, and its number of eigenvectors; None without such a stage."""
+    """The refiner and the number of eigenvectors of the last stage that preserves wavelets.
+
+    The result is None if no stage preserves wavelets.
+    """
     for stage in reversed(correspondence.preset.stages):
         if isinstance(stage.refiner, WaveletPreservation):
             return stage.refiner, stage.number_of_eigenvectors
@@ -216,8 +223,9 @@ def write_comparison(
 ) -> None:
     """Writes an interactive page with several maps of one pair. The page shows one map at a time.
 
-    The page also shows the functional maps and the wavelets of the paper's bank. If the eigenvectors of the
-    meshes cannot be computed, a warning says so, and the page shows neither.
+    The page also shows the functional maps, and the wavelets of the MWP paper's filter bank. If the
+    eigenvectors of the meshes cannot be computed, the function issues a warning, and the page shows no
+    functional maps and no wavelets.
 
     **Arguments:**
 
@@ -225,10 +233,12 @@ def write_comparison(
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
     - `pointwise_maps`: maps T: X -> Y (m,) by name, in the order in which the page lists them; 0-based
       vertices of Y.
-    - `errors`: geodesic errors by the same names. The page shows these errors as colours, a table of the main
-      figures of all maps, and the correspondence quality curves.
-    - `partial`: whether one shape is a partial view of the other; see `jaxsmw.match`.
-    - `up`: the axis of the files that points up; by default `jaxsmw.report.standing.guess_up`.
+    - `errors`: geodesic errors by the same names. The page shows these errors as colours. It also contains a
+      table of the mean errors and further statistics of all maps, and the correspondence quality curves.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
+      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
     **Raises:** `InputError` if the maps do not fit the meshes, if the file cannot be written, if `up` is not
     an axis, or if errors are given and matplotlib is missing.
@@ -246,7 +256,7 @@ def write_comparison(
             pointwise_map,
             _named_errors(errors.get(name), len(pointwise_map)),
             _encoded(pointwise_map, *spectra) if spectra else None,
-            statistics=_main_figures(errors.get(name)),
+            statistics=_error_statistics(errors.get(name)),
         )
         for name, pointwise_map in maps.items()
     }
@@ -264,9 +274,9 @@ def write_comparison(
 
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
-    """The spectra for a page of two meshes; None if the meshes are too large.
+    """The spectra for a page of two meshes; None if the meshes have too many vertices.
 
-    If the spectra cannot be computed, the result is also None, and a warning says why.
+    If the spectra cannot be computed, the result is also None, and a warning gives the reason.
     """
     pair, room = Pair(mesh_x, mesh_y, partial), eigenvectors_on_page(mesh_x, mesh_y)
     if not room:
@@ -297,8 +307,8 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
     return f"{Path(mesh_x.name).name} to {Path(mesh_y.name).name}"
 
 
-def _main_figures(error: GeodesicError | None) -> dict[str, str]:
-    """The labels and values of a map in the table of maps; empty without errors."""
+def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
+    """The statistics of a map by label, for the table of maps; empty if no errors are given."""
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -308,12 +318,13 @@ def _main_figures(error: GeodesicError | None) -> dict[str, str]:
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
-    """A figure of the filters of a bank and their frame function, over the eigenvalues of a shape.
+    """A figure of the filters of a bank and of their frame function, as functions of the eigenvalue.
 
     **Arguments:**
 
     - `bank`: the filter bank.
-    - `eigenvalues`: the eigenvalues of the shape (k,), ascending.
+    - `eigenvalues`: the eigenvalues of a shape (k,), ascending. The figure marks these eigenvalues and ends
+      at the last eigenvalue.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -351,11 +362,11 @@ def summarize(
     expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """The main facts about a match, as printable text by label.
+    """The sizes, errors and times of a match, as printable text by label.
 
     **Arguments:**
 
-    - `correspondence`: the match.
+    - `correspondence`: the result of `match`.
     - `errors`: geodesic errors by the name of a map.
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
@@ -383,17 +394,17 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """The versions of packages, the machine and the device. Results depend on these and on the input."""
+    """The versions of packages, the machine and the device, on which results depend."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
 def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """The errors of the m source vertices under their name on the page; empty without errors."""
+    """The errors of the m source vertices, by the name that the page shows; empty if no errors are given."""
     return {} if error is None else {"Error": _per_vertex(error, m)}
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """The error of each of the m source vertices: NaN if unknown, and the mean if a vertex has several."""
+    """One error for each of the m source vertices: NaN without an error, and the mean of several errors."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

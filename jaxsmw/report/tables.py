@@ -1,4 +1,4 @@
-"""The results of a benchmark for publication: tables, curves and a columnar file."""
+"""The results of a benchmark for publication: tables, quality curves and a Parquet file."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
 
 REFERENCE = "mwp"
-"""The name of the reference method. Tables show the difference of each other method from this method."""
+"""The name of the reference method. Tables compare the errors of other methods with those of this method."""
 
 
 class MethodSummary(NamedTuple):
-    """The figures of one method, over all pairs on which the method did not fail.
+    """The errors and times of one method, over all pairs on which the method did not fail.
 
     **Attributes:**
 
-    - `mean`, `median`: the mean and the median over the pairs of the mean geodesic error of a pair, x 10^-3,
-      in square roots of the target's area.
-    - `difference`: the mean over the pairs of the error of a pair minus the error of `REFERENCE` on the same
-      pair, x 10^-3; NaN for `REFERENCE` itself.
-    - `within`: the mean share of points with an error of at most 0.05.
-    - `area_under_curve`: the mean area under the correspondence quality curve, at most 1.
-    - `coverage`: the mean coverage of the target, in [0, 1].
+    - `mean`, `median`: the mean and the median of the errors of all pairs. The error of a pair is its mean
+      geodesic error, in thousandths of the square root of the target's area.
+    - `difference`: the difference between the errors of this method and of `REFERENCE` on the same pair: the
+      mean over all pairs and its confidence interval, in the same unit; NaN for `REFERENCE` itself.
+    - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
+      The value is the mean over all pairs.
+    - `area_under_curve`: the area under the correspondence quality curve, at most 1; the mean over all pairs.
+    - `coverage`: the coverage of the target, in [0, 1]; the mean over all pairs.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
     - `pipeline_seconds`: the median time in seconds, including the precomputation of both shapes.
     - `failures`: the number of pairs on which the method failed.
@@ -93,7 +94,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Returns the mean errors of the successful rows, x 10^-3, by pair."""
+    """Returns the mean errors of the successful rows by pair, in the unit of `MethodSummary.mean`."""
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -160,7 +161,7 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
     """Returns a LaTeX table of summaries by method, with one row for each method.
 
-    The rules need the LaTeX package booktabs. The smallest mean error is in bold.
+    The horizontal lines of the table need the LaTeX package booktabs. The smallest mean error is in bold.
     """
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
@@ -184,7 +185,7 @@ def write_tables(
     - `data_set`: the data set on which the methods were measured.
     - `results`: the results of the benchmark.
     - `settings`: the settings of the benchmark.
-    - `methods`: the methods by name, at least those that `results` contains.
+    - `methods`: the methods by name. Every method in `results` must be included.
 
     **Returns:** The summaries of the methods, by name.
 
@@ -196,7 +197,8 @@ def write_tables(
         _introduction(data_set, results, settings),
         markdown_table(summaries),
         "\n".join(f"- **{name}**: {methods[name].reference}" for name in summaries),
-        "Single pairs: `results.csv`, `results.parquet`; shapes: `shapes.csv`; origin: `provenance.json`.",
+        "`results.csv` and `results.parquet` contain the results of each pair, `shapes.csv` contains the "
+        "times of each shape, and `provenance.json` contains the provenance of the results.",
     ]
     _write(directory / "summary.md", "\n\n".join(parts) + "\n")
     _write(directory / "table.tex", latex_table(summaries))
@@ -215,12 +217,12 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     sentences = [
         f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}); all methods start from the same "
         f"initial map ({Path(settings.init).name}).",
-        "Errors are mean geodesic errors x 10⁻³ of the square root of the target's area, at "
+        "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",
-        "Mean and median are over the pairs on which a method did not fail; the difference is taken pair by "
-        f"pair and has a {CONFIDENCE:.0%} bootstrap interval.",
-        f"Times are medians over the pairs, without compilation, on {machines}; local workers have one "
-        "core each.",
+        "The mean and the median are over the pairs on which a method did not fail. The difference is the "
+        f"mean of the differences on single pairs, with a {CONFIDENCE:.0%} bootstrap interval.",
+        f"Times are medians over the pairs, without compilation, on {machines}. Each local worker process "
+        "uses one core.",
     ]
     if results.failures:
         sentences.append(f"{len(results.failures)} shapes or pairs could not be measured.")
@@ -238,7 +240,8 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
     **Arguments:**
 
     - `path`: the file to create or to replace.
-    - `rows`: rows with `RESULT_COLUMNS` as text. The column `curve` becomes a list of shares.
+    - `rows`: rows with the columns `RESULT_COLUMNS`, as text. In the file, the column `curve` contains lists
+      of shares.
 
     **Raises:** `InputError` if the file cannot be written.
     """

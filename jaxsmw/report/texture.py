@@ -1,4 +1,4 @@
-"""Two meshes with a common texture as OBJ files, for any viewer of such files."""
+"""Export of two meshes with a common texture as OBJ files, for other 3D programs."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
 """The files that `write_textured_pair` writes."""
 
 _MATERIAL = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.png\n"
-# The side of the picture in pixels, and the number of squares along a side.
+# The side length of the square picture in pixels, and the number of checkerboard squares along a side.
 _PIXELS, _SQUARES = 1024, 32
 
 
 def write_textured_pair(
     directory: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints
 ) -> None:
-    """Writes `source.obj` and `target.obj` with the same checkered picture as texture.
+    """Writes `source.obj` and `target.obj` with the same checkerboard picture as texture.
 
     The picture is projected onto the target along the shortest principal axis of the target. The projection
-    has no seams, and front and back look the same. The texture coordinates of a source vertex are those of
-    its match.
+    has no seams, and front and back look the same. Each source vertex gets the texture coordinates of its
+    match on the target.
 
     **Arguments:**
 
@@ -52,13 +52,14 @@ def write_textured_pair(
 
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
-    """Coordinates (n, 2) along the two longest principal axes.
+    """The texture coordinates of all vertices (n, 2), along the two longest principal axes of the mesh.
 
-    The coordinates of referenced vertices are in [0, 1].
+    The texture coordinates of referenced vertices are in [0, 1].
     """
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # The signs of singular vectors are arbitrary, so the largest component of each axis is made positive.
+    # The signs of singular vectors are arbitrary. The sign is chosen such that the largest component is
+    # positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)
     return (flat - low) / np.ptp(used @ longest.T, axis=0).max()

@@ -21,7 +21,7 @@ from jaxsmw.report.summary import draw_bank
 
 
 def draw_figures(output: Path, data: Path, study: Study, parameters: Sequence[Row]) -> None:
-    """Write all figures as PNG."""
+    """Write all figures of the study as PNG files."""
     for data_set in DATA_SETS:
         _draw_wavelets(output, data, study.pairs[data_set][0], study.settings)
     for convention in CONVENTIONS:
@@ -34,7 +34,7 @@ def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings)
     mesh_x, mesh_y, truth = read_pair(data, pair)
     meshes = mesh_x, mesh_y
     spectra = [compute_spectrum(mesh, settings.number_of_eigenvectors) for mesh in meshes]
-    # The wavelets are centred at the point of the source nearest to the viewer, because it is visible.
+    # The wavelets are centred at the point of the source nearest to the viewer, because this point is visible.
     standing = [stand(mesh) for mesh in meshes]
     towards = camera_axes(choose_azimuth(standing))[2]
     row = np.argmax(standing[0].vertices[truth.source_vertices] @ towards)
@@ -56,7 +56,7 @@ def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings)
 
 
 def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
-    """Draw paired differences from the default. Each ablation has its own row, with one interval."""
+    """Draw intervals of paired differences from the default. Each frame and each ablation has its own row."""
     rows = {frame: {update: (frame, update) for update in UPDATES} for frame in study.settings.frames}
     rows |= {f"{frame}, {update}": {"filtering": (frame, update)} for frame, update in ABLATIONS}
 
@@ -71,7 +71,7 @@ def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
 
 
 def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings) -> None:
-    """Draw the errors over eigenvectors x filters after the last iteration, and eigenvectors x iterations."""
+    """Draw heat maps of the errors: eigenvectors x filters (last iteration), and eigenvectors x iterations."""
     ks, filters = settings.parameter_eigenvectors, settings.parameter_filters
     iterations = range(1, settings.parameter_iterations + 1)
     errors = {}

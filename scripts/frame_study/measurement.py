@@ -1,4 +1,4 @@
-"""The measurements on one pair of shapes. They run in worker processes, each on one core."""
+"""The measurements on one pair of shapes. Each pair is measured in a worker process on one core."""
 
 from __future__ import annotations
 
@@ -42,20 +42,24 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
 
 DATA_SETS = ("faust_r", "tosca_r")
-# Shapes are padded to a multiple of this number of vertices, so that one compiled program serves a data set.
+# Shapes are padded to a multiple of this number of vertices. All shapes of a data set then share one compiled
+# program.
 _PADDING = 1024
 MOVE = 0.02
-"""A match counts as moved beyond this straight distance, in square roots of the area: about one edge."""
+"""An iteration moves a match if the old and the new match are farther apart than this Euclidean distance.
+
+The unit is the square root of the area. The distance is about the length of an edge.
+"""
 INVARIANCE_FRAMES = ("Meyer", "cubic spline")
 SEARCH = DEFAULT._replace(update="nearest neighbors")
-"""The name of the nearest-neighbour search, the other half of an iteration, in `times.csv`."""
+"""The key in `times.csv` of the nearest-neighbour search, which is the second half of an iteration."""
 _SERIES = "error", "changed", "moved"
 _TIMED_RUNS = 9
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings on which the results depend, besides data and code. `provenance.json` gets every field."""
+    """All settings that influence the results, apart from data and code. `provenance.json` stores every field."""
 
     pairs: int = 40
     seed: int = 0
@@ -86,9 +90,9 @@ class MeasuredPair:
     - `mesh_x`, `mesh_y`: source and target.
     - `spectra`: the padded spectra of source and target.
     - `start`: the initial map, padded like the source.
-    - `sources`, `targets`: the evaluated part of the ground truth, vertices of X and of Y (p,).
-    - `distances`: the geodesic distances from the targets to all vertices of Y (p, n), in square roots of the
-      area of Y.
+    - `sources`, `targets`: the evaluated vertices of X and their true matches on Y (p,).
+    - `distances`: the geodesic distances from `targets` to all vertices of Y (p, n), in units of the square root
+      of the area of Y.
     """
 
     mesh_x: Mesh
@@ -100,7 +104,7 @@ class MeasuredPair:
     distances: Float64[np.ndarray, "p n"]
 
     def error(self, pointwise_map: Int[np.ndarray, " m"]) -> float:
-        """Return the mean geodesic error, as `jaxsmw.evaluation.metrics.geodesic_error`, from `distances`."""
+        """Return the mean error that `jaxsmw.evaluation.metrics.geodesic_error` defines, from `distances`."""
         errors = self.distances[np.arange(len(self.sources)), pointwise_map[self.sources]]
         return GeodesicError(errors, self.sources, "strips").mean
 
@@ -154,10 +158,11 @@ class Diagnosis(NamedTuple):
 
     **Attributes:**
 
-    - `energy`: the energy (5) in the area norm of the last functional map under the last pointwise map.
+    - `energy`: the energy of the last functional map under the last pointwise map, in the area norm (eq. (5) of
+      the MWP paper).
     - `energy_of_zero`: the energy of the functional map C = 0 under the same pointwise map.
-    - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
-      none.
+    - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve no
+      least-squares problem.
     """
 
     energy: Float[Array, ""]
@@ -190,7 +195,7 @@ def _frames(number_of_filters: int) -> dict[str, FilterBank]:
 def measure_variants(
     pair: MeasuredPair, name: PairName, wanted: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Refine a pair with every variant; return a row of `results.csv` for each variant."""
+    """Refine a pair with each wanted variant, and return a row of `results.csv` for each of them."""
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     start = np.asarray(pair.start)
     rows = []
@@ -221,9 +226,9 @@ def measure_variants(
 
 
 def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
-    """Return the error of each map, and the shares of matches that each iteration changes and moves.
+    """Return the error of each map, the share of changed matches, and the share of matches moved beyond `MOVE`.
 
-    If the refinement failed, all numbers except the error of the initial map are NaN.
+    If the refinement failed, all values except the error of the initial map are NaN.
     """
     m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
     row: dict[str, float] = {"error_0": pair.error(maps[0])}
@@ -272,10 +277,13 @@ def measure_parameters(
 def measure_invariance(
     pair: MeasuredPair, name: PairName, wanted: list[tuple[str, int]], settings: Settings
 ) -> list[Row]:
-    """Compare wavelets around corresponding centres at corresponding points, for each frame and scale.
+    """Compare the wavelets of both shapes around corresponding vertices, for each frame and scale.
 
-    **Returns:** Rows of `invariance.csv` with medians over the centres of two numbers: the correlation, and
-    the relative difference `|a - b| / sqrt((|a|² + |b|²) / 2)` (0 for equal, sqrt(2) for unrelated wavelets).
+    The values of two wavelets a and b at corresponding points are compared.
+
+    **Returns:** Rows of `invariance.csv`. Each row contains the median correlation and the median relative
+    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. It is 0
+    for equal wavelets and sqrt(2) for unrelated wavelets.
     """
     banks = _frames(settings.number_of_filters)
     vertices = pair.sources, pair.targets
@@ -305,7 +313,9 @@ def measure_invariance(
 def wavelets(
     bank: FilterBank, spectrum: Spectrum, scale: int, centers: Int[np.ndarray, " c"]
 ) -> Float64[np.ndarray, "c n"]:
-    """Return the wavelets of one scale around c vertices, at all n vertices (eq. 2).
+    """Return the values at all n vertices of the wavelets of one scale around c vertices.
+
+    The wavelets follow eq. (2) of the MWP paper.
 
     Scale 0 is the scaling function.
     """
@@ -355,7 +365,9 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
-    """Measure, in turns, the second update of every variant and one nearest-neighbour search.
+    """Measure the time of the second update of every variant, and the time of a nearest-neighbour search.
+
+    The measurements run in turns.
 
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """

@@ -16,20 +16,21 @@ from jaxsmw.evaluation.intervals import CONFIDENCE, RESAMPLES, Interval, mean_in
 from jaxsmw.evaluation.journal import Row
 
 SETTLED = 0.05
-"""A map settles in the first iteration in which less than this share of the matches moves."""
+"""A map settles in the first iteration that moves less than this share of the matches."""
 
 
 class Comparison(NamedTuple):
     """A comparison of one variant with the default on the same pairs.
 
-    Errors are in thousandths of the square root of the area. Read means and medians together with the number
-    of failures, because failed pairs are left out.
+    Errors are in thousandths of the square root of the area. Means and medians leave out failed pairs, so they
+    must be read together with the number of failures.
 
     **Attributes:**
 
     - `mean`, `median`: the mean and the median error of the variant over the pairs on which it did not fail.
-    - `difference`: the mean of the error of the variant minus the error of the default, with its interval.
-    - `better`: the share of all pairs on which the error of the variant is smaller.
+    - `difference`: the mean of the paired difference, the variant's error minus the default's error, with its
+      confidence interval.
+    - `better`: the share of all pairs on which the variant has a smaller error than the default.
     - `failures`: the number of pairs on which the variant failed.
     """
 
@@ -43,7 +44,8 @@ class Comparison(NamedTuple):
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
     """Compare the errors of a variant with the errors of the default, pair by pair.
 
-    An error of NaN means that the variant failed on the pair. The variant counts as not better on this pair.
+    A NaN error means that the variant failed on the pair. On such a pair, the variant is not better than the
+    default.
     """
     succeeded = np.isfinite(errors)
     differences = (errors - reference)[succeeded & np.isfinite(reference)]
@@ -57,7 +59,7 @@ def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " 
 
 
 class Study:
-    """The results of a study, by variant and pair."""
+    """The results of a study for each variant and each pair."""
 
     def __init__(
         self,
@@ -98,7 +100,10 @@ class Study:
         return 1e3 * self.numbers(variant, data_set, f"error_{self.settings.iterations}")
 
     def median_settling(self, variant: Variant, data_set: str) -> float:
-        """The median iteration in which the map settles; infinite if at least half of the maps never do."""
+        """Return the median iteration in which maps settle; infinite if at least half of them never settle.
+
+        The median leaves out pairs on which the variant failed.
+        """
         last = self.settings.iterations
         moved = np.array([self.numbers(variant, data_set, f"moved_{i}") for i in range(1, last + 1)])
         still = moved < SETTLED
@@ -114,7 +119,7 @@ class Study:
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
         """Return the mean difference between two variants over the pairs on which neither failed.
 
-        The text also gives the number of pairs on which one of the variants failed.
+        The text also states the number of pairs on which at least one of the variants failed.
         """
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
         both = np.isfinite(differences)
@@ -122,7 +127,7 @@ class Study:
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """Return the mean of E(C) / E(0), a ratio that makes frames of different heights comparable."""
+        """Return the mean of E(C) / E(0), which makes frame functions of different heights comparable."""
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")
@@ -133,7 +138,7 @@ class Study:
         return float(np.median(self._times[self.twins.get(variant, variant)]))
 
     def failures(self) -> Counter[tuple[Variant, str]]:
-        """Return, for each variant and each message of failure, the number of pairs."""
+        """Return the number of failed pairs for each variant and each failure message."""
         counts: Counter[tuple[Variant, str]] = Counter()
         for variant in self.variants:
             if variant not in self.twins:
@@ -154,35 +159,40 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
     start = {name: 1e3 * study.numbers(DEFAULT, name, "error_0").mean() for name in study.pairs}
     parts = [
         "# Frames compared",
-        f"Pairs: {counts}, evenly spread over their lists. All variants start from the same SHOT matches "
-        "(mean error "
+        f"The pairs ({counts}) are evenly spread over the lists of the data sets. All variants start from the "
+        "same SHOT matches (mean error "
         + ", ".join(f"{error:.1f} on {name}" for name, error in start.items())
-        + f"), with {settings.number_of_eigenvectors} eigenvectors per shape, {settings.number_of_filters} "
-        f"filters if the bank allows any number, and {settings.iterations} iterations. Made by "
-        "`scripts/compare_frames.py`; `provenance.json` has versions, seeds and settings, and `results.csv` "
-        "has the numbers of every pair.",
+        + f"). They use {settings.number_of_eigenvectors} eigenvectors per shape and {settings.iterations} "
+        f"iterations. Banks of any size have {settings.number_of_filters} filters. "
+        "`scripts/compare_frames.py` wrote this page. `provenance.json` has versions, seeds and settings, and "
+        "`results.csv` has the results of every pair.",
         _list(
-            "**error**: mean geodesic error x 10⁻³ of the square root of the target's area, at "
-            f"{settings.evaluated_points} points of the ground truth, the same for all variants.",
-            "**difference**: mean over the pairs of the error minus that of the default (Meyer, filtering, "
-            f"pullback) on the same pair, with its {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} "
-            "resamples of pairs). Pairs share shapes, so the intervals are somewhat too narrow. Without any "
-            "true difference, one in twenty intervals would miss zero by chance.",
-            "**better**: the share of pairs with a smaller error than the default's; a failure counts as not "
-            "better.",
-            "**energy**: E(C) / E(0) for the last C, where E is the energy (5) under the last pointwise map, "
-            "in the area norm and with the variant's own frame (for the band mask, the Meyer frame).",
+            "**error**: the mean geodesic error, in units of 10⁻³ times the square root of the target's area. All "
+            f"variants are evaluated at the same {settings.evaluated_points} points of the ground truth.",
+            "**difference**: the mean over the pairs of a paired difference. The paired difference is the error "
+            "of the variant minus the error of the default (Meyer, filtering, pullback) on the same pair. "
+            f"Brackets contain the {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} resamples of pairs). "
+            "Pairs share shapes, so the intervals are somewhat too narrow. If there were no true differences, "
+            f"{1 - CONFIDENCE:.0%} of the intervals would still miss zero by chance.",
+            "**better**: the share of pairs on which the error is smaller than the error of the default. A "
+            "failure counts as not better.",
+            "**energy**: the ratio E(C) / E(0) for the last C. E is the energy of eq. (5) of the MWP paper under "
+            "the last pointwise map, in the area norm and with the variant's own frame. The band mask uses the "
+            "energy of the Meyer frame.",
             f"**settles**: the first iteration in which fewer than {SETTLED:.0%} of the matches move by more "
-            f"than {MOVE} square roots of the area (about the length of an edge); median over the pairs.",
-            "**update**: milliseconds for one functional map from a pointwise map, without the search "
-            f"({search:.0f} ms); median of runs in turns, one core, one pair per data set.",
-            "**condition**: condition number of the first least-squares problem (for the regularized update, "
-            "of its wavelet term); median over the pairs. In float32, a number above 10⁵ means singular.",
-            "**failed**: pairs on which the update reported a failure; means and medians leave these pairs "
-            "out.",
-            "`=`: provably the same as filtering, so not computed again. In the pushforward convention and "
-            "the area norm, least squares divides columns by the frame function, which is 1 for a Parseval "
-            "frame.",
+            f"than {MOVE} times the square root of the area, which is about the length of an edge. The table has "
+            "the median over the pairs.",
+            "**update**: the milliseconds to compute a functional map from a pointwise map, without the search, "
+            f"which takes {search:.0f} ms. The table has the median of runs in turns on one core, for one pair "
+            "of each data set.",
+            "**condition**: the condition number of the first least-squares problem. For the regularized update, "
+            "the problem is its wavelet term. The table has the median over the pairs. In float32, a matrix with "
+            "a condition number above 10⁵ is numerically singular.",
+            "**failed**: the number of pairs on which the update reported a failure. Means and medians leave "
+            "these pairs out.",
+            "`=`: the variant provably equals filtering, so it is not computed again. In the pushforward "
+            "convention and the area norm, least squares divides columns by the frame function. The frame "
+            "function of a Parseval frame is 1.",
         ),
     ]
     for convention in CONVENTIONS:
@@ -194,15 +204,16 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "## Ablations, both data sets",
         _ablations(study),
         "## What the update changes within a frame, pullback",
-        "Paired differences of the error, one update minus another.",
+        "The table has paired differences: the error with one update minus the error with another update.",
         _updates_within_frames(study),
         "## What scaling and tightening change, pullback",
-        "Paired differences of the error. A scaled bank is multiplied by one number, so that its frame "
-        "function is one in the mean. A tightened bank is replaced by its canonical tight frame, whose frame "
-        "function is one everywhere.",
+        "The table has paired differences of the error. A scaled bank is multiplied by a number that gives its "
+        "frame function a mean of 1. A tightened bank is replaced by its canonical tight frame, whose frame "
+        "function is 1 everywhere.",
         _tightening(study),
         "## The height of C",
-        "Mean error of filtering with the Meyer frame if C is multiplied by a number in every iteration.",
+        "The table has the mean error of filtering with the Meyer frame if every iteration multiplies C by a "
+        "number.",
         _gains(study),
     ]
     for convention in CONVENTIONS:
@@ -213,10 +224,10 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             ]
     parts += [
         "## Invariance of wavelets under near-isometry",
-        "Wavelets around corresponding vertices of the two shapes, compared at corresponding vertices. "
-        f"Medians over {settings.wavelet_centers} centres, and over the pairs, of the relative difference "
-        "(0: equal, 1.41: unrelated) and of the correlation. Scale 0 is the scaling function; the last scale "
-        "is the finest.",
+        "The table compares wavelets around corresponding vertices of the two shapes, at corresponding vertices. "
+        "It has the relative difference, which is 0 for equal and 1.41 for unrelated wavelets, and the "
+        f"correlation. Both are medians over {settings.wavelet_centers} centres and over the pairs. Scale 0 is "
+        "the scaling function, and the last scale is the finest.",
         _invariance(study, invariance),
         "## Failures",
         _failures(study),

@@ -71,11 +71,11 @@ UPDATES: dict[str, Solution] = {
 
 
 def frames(number_of_filters: int) -> dict[str, FilterBank]:
-    """Return all frames and controls by name, with `number_of_filters` filters if the number is free."""
+    """Return all compared filter banks by name. Banks of any size get `number_of_filters` filters."""
     not_tight = {
         "cubic spline": CubicSpline(number_of_filters),
         "Mexican hat": MexicanHat(number_of_filters),
-        # Octave scales, as in the Meyer frame.
+        # The scales are octaves apart, as in the Meyer frame.
         "heat": Heat(jnp.asarray(2.0 ** np.arange(number_of_filters))),
         "Gabor": Gabor(number_of_filters),
     }
@@ -109,8 +109,9 @@ QUICK_FRAMES = (
     "no filter",
 )
 
-# Variants outside the grid of frames and updates: pairs of frame and update, measured in both conventions.
-# The search compares points that C has mapped with points that it has not, so the scale of C matters, too.
+# The ablations are pairs of a frame and an update that are not in the grid of frames and updates. They are
+# measured in both conventions. The gains are factors of C. Such a factor changes the matches, because only one
+# of the two point sets in the nearest-neighbour search is mapped by C.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -127,10 +128,10 @@ def variants(frame_names: Iterable[str]) -> list[Variant]:
 
 
 def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
-    """Return the variants that provably equal another variant, with this other variant.
+    """Return each variant that provably equals another variant, together with this other variant.
 
     In the pushforward convention and the area norm, least squares divides the columns of the filtered map by
-    the frame function. The frame function of a Parseval frame is one, so the variant equals filtering.
+    the frame function. The frame function of a Parseval frame is 1, so least squares equals filtering.
     """
     return {
         name: name._replace(update="filtering")
@@ -142,7 +143,7 @@ def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Var
 
 
 def is_parseval(bank: FilterBank) -> bool:
-    """Whether the frame function is one on all of [0, lambda_max], up to rounding."""
+    """Return whether the frame function of a bank is 1 everywhere in [0, lambda_max], up to rounding."""
     bounds = eqx.filter_jit(frame_bounds)(bank, jnp.arange(100.0), over="interval")
     return bool(np.allclose(bounds, 1, atol=1e-5))
 
@@ -150,7 +151,7 @@ def is_parseval(bank: FilterBank) -> bool:
 class TabulatedPreservation(WaveletPreservation):
     """`WaveletPreservation` with tabulated responses of the bank on both shapes.
 
-    With tabulated responses, all banks run the same compiled program.
+    With tabulated responses, all banks share one compiled program.
     """
 
     responses_x: Float[Array, "filters k_x"] = eqx.field(kw_only=True)
@@ -172,9 +173,9 @@ class BandMask(Filtering):
 
 
 class Scaled(FilterBank):
-    """A bank times one number, so that its frame function is one in the mean over a shape's eigenvalues.
+    """A bank multiplied by a number that gives the frame function a mean of 1 over a shape's eigenvalues.
 
-    Scaling changes the height of the bank as tightening does, but not the shapes of the filters.
+    Scaling and tightening both change the height of the bank. Only tightening changes the shapes of the filters.
     """
 
     bank: FilterBank
@@ -214,7 +215,7 @@ def refiner(
     *,
     number_of_filters: int,
 ) -> TabulatedPreservation:
-    """Return the refiner of a variant for a pair; zero filters fill up the bank to `number_of_filters`."""
+    """Return the refiner of a variant for a pair, with zero filters added up to `number_of_filters`."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = NearestOrthogonal(Filtering())
@@ -244,13 +245,13 @@ _sample_bank: Callable[[FilterBank, Array], Array] = eqx.filter_jit(
 
 
 def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Float[Array, "filters k"]:
-    """Return the responses of a bank on a shape, filled up with zero filters to `number_of_filters`."""
+    """Return the responses of a bank on a shape, with zero filters added up to `number_of_filters`."""
     responses = _sample_bank(bank, spectrum.eigenvalues)
     return jnp.pad(responses, ((0, number_of_filters - len(responses)), (0, 0)))
 
 
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
-    """Return how many octaves each eigenvalue is above the edge of the Meyer scaling function, at least 0."""
+    """Return the octaves from the edge of the Meyer scaling function to each eigenvalue; 0 below the edge."""
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
 
@@ -260,9 +261,9 @@ def band_mask(
 ) -> Float64[np.ndarray, "k_out k_in"]:
     """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
 
-    The mask is 1 up to half the half-width (in octaves), 1/2 at the half-width, and 0 from one and a half
-    times the half-width on, with a cosine in between. The flat top makes the mask indefinite. The kernel
-    `G^T G` of a filter bank is never indefinite.
+    Here d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for d <= 0.5,
+    0.5 at d = 1, and 0 for d >= 1.5. In between, the mask falls like a cosine. Because of its flat top, the mask
+    is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
     """
     distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
     return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))
@@ -271,7 +272,7 @@ def band_mask(
 def matching_half_width(
     octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], total: float
 ) -> float:
-    """Return the half-width, in octaves, at which the entries of `band_mask` have a given sum."""
+    """Return the half-width, in octaves, for which the entries of `band_mask` have the sum `total`."""
     return brentq(lambda width: band_mask(octaves_out, octaves_in, width).sum() - total, 1e-3, 100)
 
 
@@ -280,9 +281,8 @@ def least_kernel_eigenvalue(
 ) -> float:
     """Return the ratio of the smallest to the largest eigenvalue of the kernel of a variant.
 
-    The kernel of a map from the shape to itself is the matrix by which the variant multiplies the unfiltered
-    map C_0 elementwise. The ratio is not negative, up to rounding, for every filter bank. It is negative for
-    `band_mask`.
+    The variant multiplies the unfiltered map C_0 from the shape to itself elementwise by this kernel. Up to
+    rounding, the ratio is nonnegative for every filter bank. The ratio is negative for `band_mask`.
     """
     method = refiner(variant, bank, spectrum, spectrum, number_of_filters=number_of_filters)
     kernel = multiscale_kernel(method.responses_x, method.responses_y)

@@ -1,13 +1,14 @@
-"""Filter banks: a scaling function and wavelets, sampled over the spectrum of a shape.
+"""Filter banks: a scaling function and wavelet filters, which are functions of the eigenvalue.
 
-All banks depend only on ratios of eigenvalues, so the scale of a shape cancels. The first filter passes the
-lowest eigenvalues.
+All banks of this package depend only on ratios of eigenvalues, so the size of a shape has no effect. By
+convention, the first filter of a bank is the scaling function, which passes the lowest eigenvalues.
 
-- Parseval frames (the squares sum to one): `Meyer`, `SimpleTight`, `Itersine`, `HalfCosine`, `Held`,
-  `Simoncelli`, `Papadakis`, `Regular`, `SoftmaxFrame` (with parameters to be learned) and `Identity`. Each of
-  these frames remains Parseval in `Warped`.
-- Not tight: `CubicSpline`, `MexicanHat`, `Heat`, `Gabor`, `ExponentialWindow` and `LowPass`. `tighten` turns
-  any bank into a tight frame.
+- The following banks are Parseval frames, whose squared filters sum to one: `Meyer`, `SimpleTight`,
+  `Itersine`, `HalfCosine`, `Held`, `Simoncelli`, `Papadakis`, `Regular`, `Identity`, and `SoftmaxFrame`,
+  whose parameters can be learned. These banks remain Parseval frames when `Warped` evaluates them on a warped
+  spectrum.
+- The following banks are not tight: `CubicSpline`, `MexicanHat`, `Heat`, `Gabor`, `ExponentialWindow` and
+  `LowPass`. The function `tighten` turns any bank into a tight frame.
 """
 
 from jaxsmw.core.banks.base import FilterBank

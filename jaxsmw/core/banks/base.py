@@ -10,50 +10,59 @@ from jaxtyping import Array, Float
 
 
 class FilterBank(eqx.Module):
-    """A scaling function g_0 and wavelets g_1 … g_L, as functions of the eigenvalue.
+    """The base class of filter banks: a scaling function g_0 and wavelet filters g_1 … g_L of the eigenvalue.
 
-    A bank is a pytree. Its continuous parameters are leaves, which can be traced and learned; its sizes are
-    static. A new bank is a subclass that defines `__call__`.
+    `jaxsmw.banks` contains ready subclasses, such as `Meyer` (the default of `WaveletPreservation`) and
+    `CubicSpline`.
+
+    A subclass must define `__call__(points, eigenvalues)`, which returns the responses (filters, p) of all
+    filters at p points. A bank is an Equinox module, and therefore a pytree. Its continuous parameters are
+    arrays, which JAX can trace and differentiate. Its sizes, such as the number of filters, are static
+    fields.
     """
 
     @abc.abstractmethod
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
-        """Returns the responses g_l at the given points. On a shape, call `bank(eigenvalues, eigenvalues)`.
+        """Returns the responses of all filters at the given points of the eigenvalue axis.
+
+        `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) at the eigenvalues of a shape.
 
         **Arguments:**
 
         - `points`: (p,), points in [0, lambda_max], in any order.
         - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
-          last eigenvalue is lambda_max. A bank may also adapt to the other eigenvalues.
+          last eigenvalue is lambda_max. Most banks use only lambda_max, but a bank may adapt to all
+          eigenvalues.
 
-        **Returns:** The responses (filters, p), without unit, scaling function first.
+        **Returns:** The responses (filters, p), numbers without unit. Row 0 is the scaling function.
         """
 
 
 def sample_bank(
     bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
 ) -> Float[Array, "filters p"]:
-    """Returns the responses of a bank after a check of their shape, because users write banks of their own.
+    """Returns the responses (filters, p) of a bank, and checks their shape.
 
-    The arguments and the result (filters, p) are those of `FilterBank.__call__`.
+    The check is necessary because users can define their own banks. The arguments are those of
+    `FilterBank.__call__`.
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """
     responses = bank(points, eigenvalues)
     if responses.ndim != 2 or responses.shape[1] != points.shape[0]:
         raise ValueError(
-            f"the bank {type(bank).__name__} gave responses of shape {responses.shape} at {points.shape[0]} "
-            f"points, where (filters, {points.shape[0]}) is needed"
+            f"the bank {type(bank).__name__} returned responses of shape {responses.shape} for "
+            f"{points.shape[0]} points, but the shape (filters, {points.shape[0]}) is needed"
         )
     return responses
 
 
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
-    """Checks the number of filters of a bank.
+    """Checks the number of filters that a bank is given.
 
-    **Raises:** `TypeError` if the number is not an integer; `ValueError` if the number is below `least`.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `least`.
     """
     if not isinstance(filters, int | np.integer):
         raise TypeError(f"{type(bank).__name__} needs a whole number of filters, not {filters!r}")

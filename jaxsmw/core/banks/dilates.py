@@ -1,4 +1,4 @@
-"""Banks of one kernel at several scales."""
+"""Filter banks that evaluate one kernel at several scales."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _LogSpacedDilates(FilterBank):
-    """One wavelet at log-spaced scales, and a scaling function for eigenvalues below `lambda_max / ratio`."""
+    """A bank of one wavelet kernel at log-spaced scales and of a scaling function.
+
+    The scaling function covers the eigenvalues below `lambda_max / ratio`.
+    """
 
     filters: int = eqx.field(static=True, default=6)
     ratio: Float[Array, ""] = eqx.field(converter=as_parameter, default=20.0)
@@ -26,18 +29,18 @@ class _LogSpacedDilates(FilterBank):
 
     @abc.abstractmethod
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the wavelet of scale 1."""
+        """Returns the wavelet kernel at `scaled`, the products of scales and eigenvalues."""
 
     @abc.abstractmethod
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Returns the scaling function; its argument is 1 at `lambda_max / ratio`."""
+        """Returns the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
-        # The scales are in units of 1 / lambda_max. The coarsest scale is 2 / lambda_min, with lambda_min =
-        # lambda_max / ratio. The finest scale is 1 / lambda_max.
+        # The scales are in units of 1 / lambda_max. In absolute units, the coarsest scale is 2 / lambda_min,
+        # with lambda_min = lambda_max / ratio, and the finest scale is 1 / lambda_max.
         scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
         wavelets = self.wavelet(scales[:, None] * relative[None, :])
         if self.normalize:
@@ -46,48 +49,64 @@ class _LogSpacedDilates(FilterBank):
 
 
 class CubicSpline(_LogSpacedDilates):
-    """Dilates of a wavelet that rises like y², falls like 4 / y² and is a cubic spline in between.
+    """A filter bank of a cubic-spline wavelet at several scales. The bank is not tight.
 
-    This is the wavelet of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
-    theory", 2011 ("abspline"), and the general wavelet of the MWP paper. The bank is not tight: its frame
-    bounds are 1.28 and 2.12 with the default parameters.
+    The wavelet is a function of y, the product of the scale and the eigenvalue lambda. It equals y² for y
+    below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
+    log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function covers the eigenvalues
+    below `lambda_max / ratio`. `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k
+    eigenvalues in any unit, scaling function first.
+
+    The wavelet is that of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
+    theory", 2011, also known as "abspline". It is also the general (not tight) wavelet of the MWP paper. With
+    the default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
 
     **Arguments:**
 
-    - `filters`: the number of filters including the scaling function, at least 2.
-    - `ratio`: lambda_max over the smallest eigenvalue that the wavelets cover, above 1.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale (in units of
-      1 / lambda_max).
+    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
+    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. A single
+      number above 1, or an array of shape ().
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
+      units of 1 / lambda_max. The default is False.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
+    `ratio` is not a single finite number above 1.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
         spline = -5 + 11 * scaled - 6 * scaled**2 + scaled**3
-        # The maximum avoids a division by zero in the branch that is not taken.
+        # `jnp.maximum` avoids a division by zero in the branch that `jnp.where` does not select.
         tail = 4 / jnp.maximum(scaled, 2) ** 2
         return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        # The value at zero is the maximum of the wavelet, at 2 - 1 / sqrt(3).
+        # At zero the scaling function equals the maximum of the wavelet, which is reached at 2 - 1 / sqrt(3).
         return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
 
 
 class MexicanHat(_LogSpacedDilates):
-    """Dilates of the Mexican hat `y exp(-y)`, the second derivative of a Gaussian.
+    """A filter bank of the Mexican-hat wavelet `y exp(-y)` at several scales. The bank is not tight.
 
-    This is the wavelet of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014, at the
-    scales of Hammond, Vandergheynst and Gribonval 2011. The bank is not tight: its frame bounds are 0.177 and
-    0.270 with the default parameters.
+    Here y is the product of the scale and the eigenvalue lambda. In space, this wavelet corresponds to the
+    second derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
+    `1 / lambda_max`. The scaling function covers the eigenvalues below `lambda_max / ratio`.
+    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit, scaling
+    function first.
+
+    The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014. The
+    scales are those of Hammond, Vandergheynst and Gribonval 2011. With the default parameters, the frame
+    bounds over [0, lambda_max] are 0.177 and 0.270.
 
     **Arguments:**
 
-    - `filters`: the number of filters including the scaling function, at least 2.
-    - `ratio`: lambda_max over the smallest eigenvalue that the wavelets cover, above 1.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale (in units of
-      1 / lambda_max).
+    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
+    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. A single
+      number above 1, or an array of shape ().
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
+      units of 1 / lambda_max. The default is False.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
+    `ratio` is not a single finite number above 1.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -98,14 +117,18 @@ class MexicanHat(_LogSpacedDilates):
 
 
 class Heat(FilterBank):
-    """Heat kernels `exp(-t lambda / lambda_max)`. All of them are low-pass filters.
+    """A filter bank of heat kernels `exp(-t lambda / lambda_max)`, with several diffusion times t.
 
-    Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale signature based on heat
-    diffusion", 2009. The bank is not tight.
+    The bank is not tight. All filters are low-pass filters. `bank(eigenvalues, eigenvalues)` returns the
+    responses (filters, k) for k eigenvalues lambda in any unit, one row per diffusion time.
+
+    The kernels are those of Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale
+    signature based on heat diffusion", 2009.
 
     **Arguments:**
 
-    - `times`: (filters,), the diffusion times t in units of 1 / lambda_max, positive.
+    - `times`: (filters,), a list or an array of one or more positive diffusion times t, in units of
+      1 / lambda_max.
 
     **Raises:** `ValueError` if the times are not a list of one or more positive, finite numbers.
     """

@@ -13,18 +13,27 @@ from jaxsmw.core.checks import check_choice
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
-    """Returns the frame function G(lambda) = sum_l g_l(lambda)² (eq. 7), (k,), from responses (filters, k).
+    """Returns the frame function `G(lambda) = sum_l g_l(lambda)²` of a filter bank at k eigenvalues, (k,).
 
-    G is constant for a tight frame and 1 for a Parseval frame.
+    This is eq. (7) of the MWP paper. G is constant for a tight frame, and 1 for a Parseval frame.
+
+    **Arguments:**
+
+    - `responses`: (filters, k), the responses g_l of the bank, from `bank(eigenvalues, eigenvalues)`.
     """
     return jnp.sum(responses**2, axis=0)
 
 
 class FrameBounds(NamedTuple):
-    """The minimum and the maximum of the frame function.
+    """The frame bounds of a filter bank: the minimum and the maximum of its frame function.
 
-    Every function f satisfies `lower |f|² <= sum of squared coefficients <= upper |f|²`. The bounds are
-    equal for a tight frame, and both are 1 for a Parseval frame. A bank with `lower = 0` is not a frame.
+    For every function f in the span of the eigenvectors, the sum of the squared wavelet coefficients is
+    between `lower |f|²` and `upper |f|²`. The bounds are equal for a tight frame, and both are 1 for a
+    Parseval frame. A bank with `lower = 0` is not a frame.
+
+    **Attributes:**
+
+    - `lower`, `upper`: the minimum and the maximum, as arrays of shape () without unit.
     """
 
     lower: Float[Array, ""]
@@ -38,29 +47,33 @@ def frame_bounds(
     over: Literal["eigenvalues", "interval"] = "eigenvalues",
     resolution: int = 10_001,
 ) -> FrameBounds:
-    """Returns the frame bounds of a bank on a shape.
+    """Returns the frame bounds of a filter bank: the extrema of its frame function `G = sum_l g_l²`.
 
     **Arguments:**
 
-    - `bank`: the filter bank.
-    - `eigenvalues`: (k,), the eigenvalues of the shape, ascending.
-    - `over`: `"eigenvalues"` gives the bounds for functions in the span of these eigenfunctions.
-      `"interval"` gives the bounds over [0, lambda_max], which hold for every shape with that lambda_max.
-    - `resolution`: the number of evenly spaced points that sample the interval. With the spacing h of these
-      points, the lower bound is too large, and the upper bound too small, by at most `h² max|G''| / 8`. At a
-      kink of G this error is at most `h max|G'| / 2`. With the default resolution this error is below 1e-5 of
-      G for the banks of this package with up to 8 filters.
+    - `bank`: the filter bank, a `FilterBank`.
+    - `eigenvalues`: (k,), the eigenvalues of a shape, ascending, in any unit. The last eigenvalue is
+      lambda_max.
+    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. These bounds hold for
+      functions in the span of the corresponding eigenvectors. `"interval"` evaluates G on [0, lambda_max].
+      These bounds hold for every shape with this lambda_max, if the bank depends on no other eigenvalue.
+    - `resolution`: the number of evenly spaced points at which `"interval"` evaluates G, at least 2. The
+      sampled lower bound is slightly too large, and the sampled upper bound is slightly too small. If h is
+      the spacing of the points, this error is at most `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G.
+      With the default resolution, the error is below 1e-5 G for the banks of this package with up to 8
+      filters.
 
-    **Returns:** The smallest and the largest value of the frame function, as numbers without unit.
+    **Returns:** A `FrameBounds` with `lower` and `upper`, the smallest and the largest value of G, without
+    unit.
 
-    **Raises:** `ValueError` for an unknown value of `over`, a resolution below 2, or responses that are not
-    of shape (filters, points).
+    **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2, or if the bank returns
+    responses that are not of shape (filters, points).
     """
     check_choice("over", over, ("eigenvalues", "interval"))
     points = eigenvalues
     if over == "interval":
         if resolution < 2:
-            raise ValueError(f"an interval needs a resolution of at least 2 points, not {resolution}")
+            raise ValueError(f"over='interval' needs a resolution of at least 2 points, not {resolution}")
         points = jnp.linspace(0, eigenvalues[-1], resolution, dtype=eigenvalues.dtype)
     covered = frame_function(sample_bank(bank, points, eigenvalues))
     return FrameBounds(jnp.min(covered), jnp.max(covered))
@@ -75,9 +88,10 @@ class Tightened(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         responses = self.bank(points, eigenvalues)
-        # The largest response cancels in the ratio. Division by this response prevents underflow of squares.
+        # Division by the largest response prevents underflow of the squares. This divisor cancels in
+        # `scaled / sqrt(frame)`.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
-        # The negated comparison keeps NaN as NaN; `>=` would hide it.
+        # The negated comparison counts NaN as covered, so NaN stays in the result; `>=` would hide NaN.
         covered = ~(largest < jnp.finfo(points.dtype).tiny)
         scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
         frame = jnp.where(covered, frame_function(scaled)[None, :], 1)
@@ -85,16 +99,20 @@ class Tightened(FilterBank):
 
 
 def tighten(bank: FilterBank) -> FilterBank:
-    """Returns the canonical tight frame `g_l / sqrt(G)`, the Parseval frame that is closest to a bank.
+    """Returns the canonical tight frame of a filter bank, which divides each filter g_l by `sqrt(G)`.
 
-    If no response at an eigenvalue is above the smallest normal number, G vanishes there. The responses and
-    their gradients are then zero, and the frame is tight on the rest of the spectrum only. A Parseval bank
-    has the same responses as before.
+    G is the frame function `sum_l g_l²`. Of all Parseval frames, the canonical tight frame is closest to the
+    given bank. If the given bank is a Parseval frame, its responses do not change.
+
+    If all responses at an eigenvalue are below the smallest normal floating-point number, G counts as zero
+    there. At this eigenvalue, the new responses and their gradients are zero. The new bank is then a Parseval
+    frame only on the rest of the spectrum.
 
     **Arguments:**
 
-    - `bank`: any bank.
+    - `bank`: any `FilterBank`.
 
-    **Returns:** A bank with the same leaves. Its responses are differentiable with respect to the leaves.
+    **Returns:** A filter bank with the responses `g_l / sqrt(G)`, (filters, k). It has the same parameters
+    (pytree leaves) as `bank`, and its responses are differentiable with respect to them.
     """
     return Tightened(bank)

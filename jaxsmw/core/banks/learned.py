@@ -1,4 +1,4 @@
-"""A tight frame with filters that can be learned."""
+"""A Parseval frame whose filters can be learned."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from jaxsmw.core.checks import as_parameter
 
 
 class SoftmaxFrame(FilterBank):
-    """Filters whose squares are a softmax, so the squares sum to one for all finite parameters.
+    """A filter bank with trainable filters that is a Parseval frame for all finite parameters.
 
-    `g_l(lambda)² = exp(z_l) / sum_j exp(z_j)`. Each z_l is linear in lambda between evenly spaced knots.
-    Every Parseval frame of positive filters has this form, up to the resolution of the knots. To learn a
-    frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by gradient descent.
-    If the smallest eigenvalues matter most, `Warped(SoftmaxFrame(…), Power())` spaces the knots evenly in
-    frequency.
+    The squared filters are a softmax: `g_l(lambda)² = exp(z_l(lambda)) / sum_j exp(z_j(lambda))`. Each z_l is
+    a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. Up to
+    the resolution of the knots, every Parseval frame of positive filters has this form.
+    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+
+    To learn a frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by
+    gradient descent. If the smallest eigenvalues matter most, use `Warped(SoftmaxFrame(…), Power())`. This
+    bank spaces the knots evenly in frequency, the square root of the eigenvalue.
 
     **Arguments:**
 
-    - `logits`: (filters, knots), the values of z at the knots, which run from 0 to lambda_max; at least 2
-      knots. A constant added to a column changes nothing.
+    - `logits`: (filters, knots), the values of z_l at the knots, with at least 1 filter and 2 knots. Adding a
+      constant to a column does not change the filters.
 
     **Raises:** `ValueError` if the logits do not have this shape.
     """
@@ -33,30 +36,32 @@ class SoftmaxFrame(FilterBank):
     def __check_init__(self) -> None:
         if self.logits.ndim != 2 or self.logits.shape[0] < 1 or self.logits.shape[1] < 2:
             raise ValueError(
-                f"the logits of SoftmaxFrame have shape {self.logits.shape}, where (filters, knots) with at "
+                f"the logits of SoftmaxFrame have shape {self.logits.shape}, but (filters, knots) with at "
                 "least 2 knots is needed"
             )
 
     @classmethod
     def like(cls, bank: FilterBank, knots: int = 32, *, floor: float = 0.01) -> SoftmaxFrame:
-        """Returns the frame whose squares at the knots are proportional to the squares of a bank.
+        """Returns a `SoftmaxFrame` that imitates a given filter bank.
 
-        A bank that adapts to the spectrum is sampled for evenly spaced eigenvalues.
+        At each knot, the squared filters of the frame are proportional to the squared filters of the bank. If
+        the bank adapts to the spectrum, its responses are computed for evenly spaced eigenvalues.
 
         **Arguments:**
 
-        - `bank`: any bank. The signs of its filters do not matter.
+        - `bank`: any `FilterBank`. The signs of its filters are lost.
         - `knots`: the number of knots, at least 2.
-        - `floor`: the smallest value of a filter, at least 1e-12 and below 1. Smaller values are raised to
-          the floor, because a filter that is zero cannot be learned.
+        - `floor`: the smallest absolute response of the bank that is kept, at least 1e-12 and below 1.
+          Smaller responses are raised to the floor, because a filter that is zero cannot be learned.
 
         **Returns:** A frame with logits (filters, knots).
 
-        **Raises:** `ValueError` for fewer than 2 knots, or a floor below 1e-12 or not below 1.
+        **Raises:** `ValueError` if `knots` is below 2, if `floor` is below 1e-12, or if `floor` is 1 or more.
         """
         if knots < 2 or not 1e-12 <= floor < 1:
             raise ValueError(
-                f"SoftmaxFrame.like needs at least 2 knots and a floor from 1e-12 to 1, not {knots}, {floor}"
+                "SoftmaxFrame.like needs at least 2 knots and a floor from 1e-12 to 1, not "
+                f"knots={knots} and floor={floor}"
             )
         points = jnp.linspace(0, 1, knots)
         return cls(2 * jnp.log(jnp.maximum(jnp.abs(sample_bank(bank, points, points)), floor)))

@@ -13,17 +13,21 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class ExponentialWindow(FilterBank):
-    """One infinitely smooth low-pass filter: 1 at zero, 1/2 at half the edge, and 0 beyond the edge.
+    """A filter bank of one infinitely smooth low-pass filter. The bank is not tight.
 
-    The filter is `e(u) / (e(u) + e(1 - u))` with `e(u) = exp(-slope / u)` and `u = 1 - lambda / edge`
-    (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
+    The filter is 1 at zero, 1/2 at half the edge, and 0 beyond the edge. With the eigenvalue lambda as a
+    fraction of lambda_max, the filter is `e(u) / (e(u) + e(1 - u))`. Here `e(u) = exp(-slope / u)` and
+    `u = 1 - lambda / edge` (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
+    `bank(eigenvalues, eigenvalues)` returns the responses (1, k) for k eigenvalues in any unit.
 
     **Arguments:**
 
-    - `edge`: the edge relative to lambda_max, positive.
-    - `slope`: the steepness, positive. The derivative at half the edge is `-2 slope / edge`.
+    - `edge`: the eigenvalue from which the filter is zero, as a fraction of lambda_max, by default 0.2. A
+      single positive number, or an array of shape ().
+    - `slope`: the steepness, by default 1. A single positive number, or an array of shape (). The derivative
+      of the filter at half the edge is `-2 slope / edge`.
 
-    **Raises:** `ValueError` if a parameter is not one positive, finite number.
+    **Raises:** `ValueError` if a parameter is not a single positive, finite number.
     """
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.2)
@@ -37,23 +41,25 @@ class ExponentialWindow(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
-        # At u = 0 and u = 1 the exponents are infinite and have no gradient.
+        # At u = 0 and u = 1 the exponents are infinite and have no gradient, so u is kept away from both.
         tiny = jnp.finfo(points.dtype).eps
         u = jnp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
         return jax.nn.sigmoid(slope / (1 - u) - slope / u)[None, :]
 
 
 class LowPass(FilterBank):
-    """One low-pass filter and no wavelets: a control experiment that smooths at a single scale.
+    """A filter bank of one low-pass filter without wavelets, for control experiments. The bank is not tight.
 
-    This is the scaling function of `Meyer` with an adjustable edge. The bank is not tight.
+    The filter is the scaling function of `Meyer` with an adjustable edge. It is 1 up to the edge, and 0
+    beyond twice the edge. `bank(eigenvalues, eigenvalues)` returns the responses (1, k) for k eigenvalues in
+    any unit.
 
     **Arguments:**
 
-    - `edge`: the end of the pass band relative to lambda_max, in (0, 1). The filter is 1 up to the edge and 0
-      beyond twice the edge.
+    - `edge`: the end of the pass band as a fraction of lambda_max, by default 0.25. A single number in
+      (0, 1), or an array of shape ().
 
-    **Raises:** `ValueError` if the edge is not one number in (0, 1).
+    **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.25)
@@ -65,12 +71,15 @@ class LowPass(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
-        # Beyond twice the edge this sine is exactly zero. The equivalent cosine of pi/2 has a rounding error.
+        # Beyond twice the edge this sine is exactly zero. The equivalent form cos(pi/2) has a rounding error.
         return jnp.sin(jnp.pi / 2 * (1 - meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
 
 
 class Identity(FilterBank):
-    """One filter that passes everything: a Parseval frame for control experiments without filtering."""
+    """A filter bank of one filter that is 1 at every eigenvalue, for control experiments without filtering.
+
+    The bank is a Parseval frame. `bank(eigenvalues, eigenvalues)` returns ones of shape (1, k).
+    """
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]

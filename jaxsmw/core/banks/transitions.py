@@ -1,4 +1,4 @@
-"""Tight frames made of smooth transitions between neighbouring bands: octave bands and pairs of bands."""
+"""Parseval frames with smooth transitions between neighbouring bands: octave bands and pairs of bands."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _Transitions(FilterBank):
-    """Bands with transitions between them: cos(theta_1), sin(theta_1) cos(theta_2), …, sin(theta_L).
+    """A bank with the filters cos(theta_1), sin(theta_1) cos(theta_2), …, sin(theta_L).
 
-    Each theta rises from 0 to pi/2. The squares sum to cos² + sin² = 1 because each transition starts where
-    the previous transition has ended.
+    Each theta_l is a function of the eigenvalue that rises from 0 to pi/2, the transition from one band to
+    the next. The squared filters sum to cos² + sin² = 1, because the transitions do not overlap.
     """
 
     @abc.abstractmethod
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        """Returns the progress of each transition from 0 to 1: theta / (pi / 2)."""
+        """Returns `theta / (pi / 2)` of each transition, which rises from 0 to 1."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -35,7 +35,10 @@ class _Transitions(FilterBank):
 
 
 class _DyadicBands(_Transitions):
-    """Octave bands: each band rises over one octave and falls over the next. The last band never falls."""
+    """A bank of octave bands. Each band rises over one octave and falls over the next octave.
+
+    The first band only falls, and the last band only rises.
+    """
 
     filters: int = eqx.field(static=True, default=6)
 
@@ -44,37 +47,45 @@ class _DyadicBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the transition as a function of a linear ramp; both run from 0 to 1."""
+        """Returns the transition as a function of a linear ramp. Both run from 0 to 1."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        # Only the eigenvalue 0 is 100 octaves below the largest eigenvalue, and 2^octaves must not overflow.
+        # The limit of 100 octaves prevents overflow of 2^octaves. The limit does not change the responses,
+        # because only the eigenvalue 0 is 100 octaves below the largest eigenvalue.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
         return self.profile(jnp.clip(ratios - 1, 0, 1))
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns nu(u), elementwise, for an array of any shape with numbers u from 0 to 1.
+    """Returns the Meyer polynomial nu(u), elementwise, for an array of any shape with numbers u from 0 to 1.
 
-    nu is the polynomial of least degree with nu(u) + nu(1 - u) = 1 and 3 vanishing derivatives at 0 and 1.
+    The polynomial rises from 0 to 1. It is the polynomial of least degree with nu(u) + nu(1 - u) = 1 whose
+    first 3 derivatives vanish at 0 and 1.
     """
     return ramp**4 * (35 - 84 * ramp + 70 * ramp**2 - 20 * ramp**3)
 
 
 class Meyer(_DyadicBands):
-    """The Meyer tight frame: octave bands whose squares sum to one exactly.
+    """The Meyer frame: a filter bank of octave bands that is a Parseval frame.
 
-    Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section 4.2 of the MWP paper
-    uses this frame. The scaling function passes the lowest band, which is the *largest* spatial scale. The
-    bank would not be tight if the scaling function and the finest wavelet were exchanged.
+    The scaling function is 1 up to `lambda_max / 2^L`, with the number of wavelets `L = filters - 1`. It
+    falls to 0 over the next octave, in which the first wavelet rises. The last wavelet rises from
+    `lambda_max / 2` to lambda_max. `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k
+    eigenvalues in any unit, scaling function first.
+
+    The frame is that of Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section
+    4.2 of the MWP paper uses this frame. The scaling function passes the lowest eigenvalues, which belong to
+    the *largest* spatial scale. The bank would not be tight if the scaling function belonged to the smallest
+    scale and the finest wavelet to the largest scale.
 
     **Arguments:**
 
-    - `filters`: the number of filters including the scaling function, at least 2.
+    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` for fewer than 2 filters.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2.
     """
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -82,16 +93,19 @@ class Meyer(_DyadicBands):
 
 
 class SimpleTight(_DyadicBands):
-    """The simple tight frame: the octave bands of `Meyer`, but each band rises like sin².
+    """The simple tight frame: a filter bank of octave bands that is a Parseval frame.
 
-    Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and application to denoising",
-    2018, after Coulhon, Kerkyacharian and Petrushev 2012.
+    The bands are those of `Meyer`, but each band rises like sin² over an octave. `bank(eigenvalues,
+    eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit, scaling function first.
+
+    The frame is that of Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and
+    application to denoising", 2018, after Coulhon, Kerkyacharian and Petrushev 2012.
 
     **Arguments:**
 
-    - `filters`: the number of filters including the scaling function, at least 2.
+    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` for fewer than 2 filters.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2.
     """
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -101,7 +115,7 @@ class SimpleTight(_DyadicBands):
 
 
 class _TwoBands(_Transitions):
-    """A low-pass and a high-pass filter with one transition, which starts at an edge."""
+    """A bank of a low-pass and a high-pass filter. The transition between both filters starts at an edge."""
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=1 / 3)
 
@@ -120,16 +134,22 @@ class _TwoBands(_Transitions):
 
 
 class Held(_TwoBands):
-    """A low-pass and a high-pass filter with a cubic transition over one octave.
+    """A Parseval frame of a low-pass and a high-pass filter, with a cubic transition over one octave.
 
-    Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the Riesz transform", 2010.
+    The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
+    rises. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for
+    k eigenvalues in any unit, low-pass filter first.
+
+    The filters are those of Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the
+    Riesz transform", 2010.
 
     **Arguments:**
 
-    - `edge`: the start of the octave relative to lambda_max, in (0, 1). Above 1/2 the high-pass filter does
-      not reach one.
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. A
+      single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass filter does
+      not reach one on [0, lambda_max].
 
-    **Raises:** `ValueError` if the edge is not one number in (0, 1).
+    **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -138,17 +158,23 @@ class Held(_TwoBands):
 
 
 class Simoncelli(_TwoBands):
-    """A low-pass and a high-pass filter with a transition over one octave that is linear in log lambda.
+    """A Parseval frame of a low-pass and a high-pass filter, with a log-linear transition over one octave.
 
-    Portilla and Simoncelli, "A parametric texture model based on joint statistics of complex wavelet
-    coefficients", 2000.
+    The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
+    rises. The filters are the cosine and the sine of an angle that is linear in the logarithm of the
+    eigenvalue. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for
+    k eigenvalues in any unit, low-pass filter first.
+
+    The filters are those of Portilla and Simoncelli, "A parametric texture model based on joint statistics of
+    complex wavelet coefficients", 2000.
 
     **Arguments:**
 
-    - `edge`: the start of the octave relative to lambda_max, in (0, 1). Above 1/2 the high-pass filter does
-      not reach one.
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. A
+      single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass filter does
+      not reach one on [0, lambda_max].
 
-    **Raises:** `ValueError` if the edge is not one number in (0, 1).
+    **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -156,17 +182,23 @@ class Simoncelli(_TwoBands):
 
 
 class Papadakis(_TwoBands):
-    """A low-pass and a high-pass filter with a linear transition from the edge to 5/3 of the edge.
+    """A Parseval frame of a low-pass and a high-pass filter, with a linear transition.
 
-    Romero, Alexander, Baid, Jain and Papadakis, "The geometry and the analytic properties of isotropic
-    multiresolution analysis", 2009.
+    The low-pass filter falls from 1 to 0 between the edge and 5/3 times the edge, while the high-pass filter
+    rises. The filters are the cosine and the sine of an angle that is linear in the eigenvalue.
+    `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for k eigenvalues in any unit, low-pass
+    filter first.
+
+    The filters are those of Romero, Alexander, Baid, Jain and Papadakis, "The geometry and the analytic
+    properties of isotropic multiresolution analysis", 2009.
 
     **Arguments:**
 
-    - `edge`: the start of the transition relative to lambda_max, in (0, 1). Above 3/5 the high-pass filter
-      does not reach one.
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 3/8. A
+      single number in (0, 1), or an array of shape (). If the edge is above 3/5, the high-pass filter does
+      not reach one on [0, lambda_max].
 
-    **Raises:** `ValueError` if the edge is not one number in (0, 1).
+    **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=3 / 8)
@@ -176,15 +208,17 @@ class Papadakis(_TwoBands):
 
 
 class Regular(_Transitions):
-    """A low-pass and a high-pass filter with a transition over the whole interval.
+    """A Parseval frame of a low-pass and a high-pass filter, with a transition over the whole spectrum.
 
-    The angle is `pi/4 (1 + s)`. The number s results from `2 lambda / lambda_max - 1` by `degree`
-    applications of `sin(pi/2 ·)` (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
-    2014).
+    The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. The number s is obtained from
+    `2 lambda / lambda_max - 1` by applying the function `sin(pi/2 ·)` repeatedly, `degree` times (Perraudin
+    et al., "GSPBOX: A toolbox for signal processing on graphs", 2014). `bank(eigenvalues, eigenvalues)`
+    returns the responses (2, k) for k eigenvalues lambda in any unit, low-pass filter first.
 
     **Arguments:**
 
-    - `degree`: how often the sine is applied, 0 or more. Higher degrees make the transition steeper.
+    - `degree`: how often the sine is applied, an integer of 0 or more, by default 3. A higher degree makes
+      the transition steeper.
 
     **Raises:** `ValueError` if the degree is negative.
     """

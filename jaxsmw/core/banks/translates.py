@@ -1,4 +1,4 @@
-"""Banks of one window that moves along the spectrum in even steps."""
+"""Filter banks of evenly spaced copies (translates) of one window."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _UniformTranslates(FilterBank):
-    """One window that moves along the spectrum in even steps.
+    """A bank of evenly spaced translates of one window.
 
-    `overlap` windows cover each point of [0, lambda_max]. If the squares of all integer translates of the
-    window sum to a constant, the squares of the filters also sum to a constant.
+    Each point of [0, lambda_max] is covered by `overlap` windows. If the squares of all integer translates of
+    the window sum to a constant, the squared filters also sum to a constant.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -40,17 +40,24 @@ class _UniformTranslates(FilterBank):
 
 
 class Itersine(_UniformTranslates):
-    """Evenly spaced translates of the window `sin(pi/2 cos²(pi u))`. Their squares sum to one.
+    """A filter bank of evenly spaced translates of the window `sin(pi/2 cos²(pi u))`: a Parseval frame.
 
-    This is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014.
-    The squared window is 1/2 plus odd harmonics. The harmonics of an even number of translates cancel.
+    u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
+    windows are zero for |u| above 1/2. The first window passes the lowest eigenvalues.
+    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+
+    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
+    2014. The squared window is 1/2 plus odd harmonics. The harmonics cancel in the sum over an even number of
+    translates.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`.
-    - `overlap`: the number of windows that cover each point, an even number, at least 2.
+    - `filters`: the number of filters, at least `overlap`. The default is 6.
+    - `overlap`: the number of windows that cover each eigenvalue, an even number, at least 2. The default is
+      2.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
+    if `overlap` is odd or below 2.
     """
 
     def __check_init__(self) -> None:
@@ -62,17 +69,23 @@ class Itersine(_UniformTranslates):
 
 
 class HalfCosine(_UniformTranslates):
-    """Evenly spaced translates of the Hann window `cos²(pi u)`. Their squares sum to one.
+    """A filter bank of evenly spaced translates of the Hann window `cos²(pi u)`: a Parseval frame.
 
-    These are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight
-    graph wavelet and vertex-frequency frames", 2015. In that paper the squares sum to `3/8 overlap`.
+    u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
+    windows are zero for |u| above 1/2. The first window passes the lowest eigenvalues.
+    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+
+    The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
+    tight graph wavelet and vertex-frequency frames", 2015. In that paper the squared filters sum to
+    `3/8 overlap`; here they are scaled to sum to one.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`.
-    - `overlap`: the number of windows that cover each point, at least 3.
+    - `filters`: the number of filters, at least `overlap`. The default is 6.
+    - `overlap`: the number of windows that cover each eigenvalue, at least 3. The default is 3.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
+    if `overlap` is below 3.
     """
 
     overlap: int = eqx.field(static=True, default=3)
@@ -86,17 +99,21 @@ class HalfCosine(_UniformTranslates):
 
 
 class Gabor(FilterBank):
-    """Gaussians with evenly spaced centres from 0 to lambda_max: short-time Fourier analysis of a shape.
+    """A filter bank of Gaussians with evenly spaced centres from 0 to lambda_max. The bank is not tight.
 
-    The bank follows Shuman, Ricaud and Vandergheynst, "Vertex-frequency analysis on graphs", 2016, but with
-    few centres instead of one centre at every eigenvalue. The bank is not tight.
+    The filters correspond to the windows of a short-time Fourier transform. They follow Shuman, Ricaud and
+    Vandergheynst, "Vertex-frequency analysis on graphs", 2016. In contrast to that paper, there are only
+    `filters` centres instead of a centre at every eigenvalue. `bank(eigenvalues, eigenvalues)` returns the
+    responses (filters, k) for k eigenvalues in any unit. The first Gaussian is centred at 0.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least 2.
-    - `width`: the standard deviation of the Gaussians relative to the spacing of the centres, positive.
+    - `filters`: the number of filters, at least 2. The default is 6.
+    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres, by
+      default 0.5. A single positive number, or an array of shape ().
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if a parameter is outside its range.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
+    `width` is not a single positive, finite number.
     """
 
     filters: int = eqx.field(static=True, default=6)

@@ -1,4 +1,4 @@
-"""Warps, and banks on a warped spectrum."""
+"""Warps of the eigenvalue axis, and filter banks on a warped spectrum."""
 
 from __future__ import annotations
 
@@ -13,31 +13,40 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class Warp(eqx.Module):
-    """A monotone map of the spectrum. A constant factor in the map has no effect on any bank."""
+    """The base class of warps: monotone maps of the eigenvalue axis, for use in `Warped(bank, warp)`.
+
+    A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
+    are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
+    `__call__(points, eigenvalues)`, which returns the warped points. All banks of `jaxsmw.banks` depend only
+    on ratios of eigenvalues, so a constant factor in a warp has no effect on them.
+    """
 
     @abc.abstractmethod
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Returns the warped points (p,).
+        """Returns the warped points (p,), in any unit.
 
         **Arguments:**
 
         - `points`: (p,), points in [0, lambda_max], in any order.
-        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit. The last eigenvalue
-          is lambda_max.
+        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
+          last eigenvalue is lambda_max.
         """
 
 
 class Warped(FilterBank):
-    """A bank evaluated on a warped spectrum: `g_l(warp(lambda))`. A Parseval bank stays Parseval.
+    """A filter bank evaluated on a warped spectrum: the filters are `g_l(warp(lambda))`.
 
-    Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency
-    frames", 2015.
+    If `bank` is a Parseval frame, `Warped` is a Parseval frame. The call
+    `Warped(bank, warp)(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues lambda
+    in any unit. The construction is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
+    tight graph wavelet and vertex-frequency frames", 2015.
 
     **Arguments:**
 
-    - `bank`: any bank. A `Logarithm` turns uniform translates into wavelets. A `SpectralDistribution` turns
-      uniform translates into bands with equal numbers of eigenvalues.
-    - `warp`: the warp.
+    - `bank`: any `FilterBank` with filters g_l.
+    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. If the bank consists of
+      uniform translates (`Itersine` or `HalfCosine`), `Logarithm` turns the translates into wavelets, and
+      `SpectralDistribution` turns them into bands with equal numbers of eigenvalues.
     """
 
     bank: FilterBank
@@ -50,15 +59,15 @@ class Warped(FilterBank):
 
 
 class Logarithm(Warp):
-    """The warp `log(1 + strength lambda / lambda_max)`.
+    """The warp `log(1 + strength lambda / lambda_max)` of the eigenvalues lambda, for `Warped`.
 
-    The warp is nearly linear below `lambda_max / strength` and nearly logarithmic above.
+    The warp is nearly linear below `lambda_max / strength` and nearly logarithmic above this eigenvalue.
 
     **Arguments:**
 
-    - `strength`: a positive number.
+    - `strength`: a single positive number, or an array of shape (). The default is 10.
 
-    **Raises:** `ValueError` if the strength is not one positive, finite number.
+    **Raises:** `ValueError` if the strength is not a single positive, finite number.
     """
 
     strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
@@ -71,13 +80,15 @@ class Logarithm(Warp):
 
 
 class Power(Warp):
-    """The warp `(lambda / lambda_max)^exponent`; the square root turns eigenvalues into frequencies.
+    """The warp `(lambda / lambda_max)^exponent` of the eigenvalues lambda, for `Warped`.
+
+    The default exponent 0.5, the square root, turns eigenvalues into frequencies.
 
     **Arguments:**
 
-    - `exponent`: a positive number.
+    - `exponent`: a single positive number, or an array of shape (). The default is 0.5.
 
-    **Raises:** `ValueError` if the exponent is not one positive, finite number.
+    **Raises:** `ValueError` if the exponent is not a single positive, finite number.
     """
 
     exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
@@ -87,25 +98,28 @@ class Power(Warp):
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
         relative = points / eigenvalues[-1]
-        # For exponents below 1 the slope at the eigenvalue 0 is infinite. Gradients use the slope 0 there.
+        # For exponents below 1 the slope at the eigenvalue 0 is infinite, so gradients use the slope 0 there.
         positive = jnp.where(relative > 0, relative, 1)
         return jnp.where(relative > 0, positive ** jnp.asarray(self.exponent, points.dtype), 0)
 
 
 class SpectralDistribution(Warp):
-    """The number of eigenvalues below lambda, with linear interpolation between eigenvalues.
+    """The warp that maps an eigenvalue lambda to the number of smaller eigenvalues, for `Warped`.
 
-    This is the warp of Shuman, Wiesmeyr, Holighaus and Vandergheynst 2015. Under this warp, uniform
-    translates pass equal numbers of eigenvalues; the first and the last translate pass half as many.
+    Between eigenvalues, the warp is linear. With this warp, uniform translates (`Itersine` or `HalfCosine`)
+    pass equal numbers of eigenvalues, except that the first and the last translate pass half as many. The
+    warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
+    vertex-frequency frames", 2015. It has no parameters.
 
-    The warp maps a simple eigenvalue to its index, and a repeated eigenvalue to the mean of its indices. So a
-    bank treats all functions of an eigenspace equally. If all eigenvalues are simple, the responses at the
-    eigenvalues depend only on the indices. By Weyl's law the eigenvalues of a surface grow nearly evenly, so
-    this warp is nearly linear, and its effect is small.
+    A simple eigenvalue is mapped to its index, counted from 0. A repeated eigenvalue is mapped to the mean of
+    its indices, so a bank treats all functions of an eigenspace equally. If all eigenvalues are simple, the
+    responses at the eigenvalues depend only on their indices. By Weyl's law the eigenvalues of a surface grow
+    nearly linearly. So this warp is nearly linear, and its effect is small.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        # Eigensolvers return repeated eigenvalues as nearly equal numbers.
+        # Eigensolvers return repeated eigenvalues as nearly equal numbers, so eigenvalues are compared with a
+        # tolerance.
         tolerance = 1e-6 * eigenvalues[-1]
         below = jnp.searchsorted(eigenvalues, eigenvalues - tolerance, side="left")
         not_above = jnp.searchsorted(eigenvalues, eigenvalues + tolerance, side="right")

@@ -1,6 +1,7 @@
-"""Solutions compute functional maps from pointwise maps: by filtering, exactly, or with further energy terms.
+"""Solutions: methods that compute a functional map from a pointwise map.
 
-A `Solution` is one way to minimise the wavelet-preservation energy. `WaveletPreservation` uses a solution.
+A `Solution` minimises the wavelet-preservation energy, exactly or approximately, with or without further
+energy terms. The refiner `WaveletPreservation` uses a solution in every iteration.
 """
 
 from jaxsmw.core.functional_map import WaveletProblem

@@ -16,19 +16,26 @@ PreparedT = TypeVar("PreparedT")
 
 
 class Solution(eqx.Module, Generic[PreparedT]):
-    """A way to compute a functional map that preserves wavelets under a given pointwise map.
+    """The base class of solutions: methods that compute a functional map C from a pointwise map T.
 
-    The type parameter is the type of the values that `prepare` returns.
+    The refiner `WaveletPreservation` takes a solution as its argument `solution`. Ready subclasses are
+    `Filtering` (the default), `LeastSquares`, `RegularizedLeastSquares` and `NearestOrthogonal`.
+
+    A subclass must define `solve`, which returns C (k_out, k_in). In the pullback convention (the default), C
+    maps functions on Y ("in") to functions on X ("out"). In the pushforward convention, C maps functions on X
+    to functions on Y. A subclass may also define `prepare`. The type parameter is the type of the values that
+    `prepare` returns.
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
         """Returns the values that `solve` needs and that do not depend on the pointwise map.
 
-        The default is None.
+        A refinement calls `prepare` only once, before the first iteration. The base class returns None.
 
         **Arguments:**
 
-        - `problem`: both shapes and the responses of the filter bank.
+        - `problem`: a `WaveletProblem`, which contains the spectra of both shapes, the responses of the
+          filter bank, and the convention of C.
         """
         return None  # type: ignore[return-value]
 
@@ -40,13 +47,16 @@ class Solution(eqx.Module, Generic[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the functional map (k_out, k_in) of a pointwise map, and a member of `RESULTS`.
+        """Computes the functional map C that corresponds to a pointwise map T.
 
         **Arguments:**
 
-        - `problem`: both shapes and the responses of the filter bank.
-        - `prepared`: the result of `prepare` for this problem.
+        - `problem`: a `WaveletProblem`, which contains the spectra of both shapes, the responses of the
+          filter bank, and the convention of C.
+        - `prepared`: the values that `prepare` returned for this problem.
         - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
-        - `previous`: the functional map of the previous iteration, from which iterative solvers start; None
-          in the first iteration.
+        - `previous`: the functional map (k_out, k_in) of the previous iteration, from which an iterative
+          solver can start; None in the first iteration.
+
+        **Returns:** The functional map C (k_out, k_in), and a status code, which is a member of `RESULTS`.
         """

@@ -28,8 +28,8 @@ class PreparedFiltering(NamedTuple):
 
     **Attributes:**
 
-    - `kernel`: the `multiscale_kernel`.
-    - `dual_out`: the `dual_eigenvectors` of the shape that C maps to.
+    - `kernel`: the `multiscale_kernel` of the filter bank on both shapes, (k_out, k_in).
+    - `dual_out`: the `dual_eigenvectors` of the shape that C maps to, (n_out, k_out).
     """
 
     kernel: Float[Array, "k_out k_in"]
@@ -37,18 +37,25 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """Filtering of the unfiltered functional map C_0: `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (eq. 8).
+    """The solution for Parseval frames: it filters the functional map C_0 of a pointwise map T.
 
-    The sum is one elementwise product; no system is solved. For a Parseval frame with orthonormal inputs, C
-    is the minimiser of the energy (see `jaxsmw.core.functional_map`). If the inputs are not orthonormal, C is
-    close to the minimiser. For banks that are not Parseval frames, C is only a smoothed map.
+    The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)`, eq. (8) of the MWP paper. The filters g_l
+    are those of the bank, and Lambda_out and Lambda_in contain the eigenvalues of the shapes that C maps to
+    and maps from. The sum equals one elementwise product, so no linear system is solved. `Filtering` is a
+    `Solution`, for the argument `solution` of `WaveletPreservation`.
+
+    If the bank is a Parseval frame and T preserves area, C minimises the wavelet-preservation energy in the
+    area norm (for the default pullback convention). If T does not preserve area, C is close to the minimiser.
+    If the bank is not a Parseval frame, C is only a smoothed map.
 
     **Arguments:**
 
-    - `pseudo_inverse`: the pseudo-inverse of the eigenvectors of the shape that C maps to; see
-      `dual_eigenvectors`. Samples always use least squares.
+    - `pseudo_inverse`: the pseudo-inverse `Phi^+` of the eigenvectors Phi of the shape that C maps to.
+      `"area"` (the default) is `Phi^T A`, with the vertex areas A. `"least_squares"` is
+      `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. When a refiner iterates on samples,
+      `Filtering` always uses `"least_squares"`.
 
-    **Raises:** `ValueError` for an unknown `pseudo_inverse`.
+    **Raises:** `ValueError` if `pseudo_inverse` is unknown.
     """
 
     pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
@@ -57,7 +64,7 @@ class Filtering(Solution[PreparedFiltering]):
         check_choice("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
-        """Returns the multiscale kernel and the dual eigenvectors."""
+        """Returns the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
         spectrum_out, _ = problem.spectra
         pseudo_inverse: PseudoInverse = "least_squares" if problem.sampled else self.pseudo_inverse
         return PreparedFiltering(
@@ -71,20 +78,21 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the functional map of eq. (8), (k_out, k_in), and `RESULTS.successful`."""
+        """Returns C of eq. (8) of the MWP paper, (k_out, k_in), and `RESULTS.successful`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
 
 class NearestOrthogonal(Solution[PreparedT]):
-    """The matrix with orthonormal rows or columns that is nearest to the map of another solution.
+    """A solution that replaces the functional map of another solution by the nearest orthogonal matrix.
 
-    With `Filtering` and the bank `Identity`, this solution is the update of spectral ICP (Ovsjanikov et al.
-    2012).
+    The new map (k_out, k_in) has orthonormal columns, or orthonormal rows if k_out is below k_in. With
+    `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
+    et al. 2012). `NearestOrthogonal` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
 
     **Arguments:**
 
-    - `solution`: the solution whose map is replaced by the nearest orthogonal matrix.
+    - `solution`: the `Solution` whose functional map is replaced. The default is `Filtering()`.
     """
 
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
@@ -100,24 +108,29 @@ class NearestOrthogonal(Solution[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the polar factor of the map of `solution`, (k_out, k_in), and the result of `solution`."""
+        """Returns the polar factor (k_out, k_in) of the other solution's map, and its status code."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
         return product(left, right), result
 
 
 class LeastSquares(Solution[None]):
-    """The exact minimiser of the wavelet-preservation energy for any frame, by one Cholesky factorisation.
+    """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
-    `solve` reports `RESULTS.undetermined_functional_map` if some eigenvalue of the shape that C maps from is
-    passed by no filter. It reports `RESULTS.singular_system` if the gram matrix is singular to working
-    precision.
+    The energy is that of eq. (5) of the MWP paper. The minimiser C (k_out, k_in) is computed by one Cholesky
+    factorisation of a (k_in, k_in) matrix, the gram matrix of the energy. `LeastSquares` is a `Solution`, for
+    the argument `solution` of `WaveletPreservation`.
+
+    `solve` returns the status code `RESULTS.undetermined_functional_map` if all filters are zero at an
+    eigenvalue of the shape that C maps from. It returns `RESULTS.singular_system` if the gram matrix is
+    singular to working precision.
 
     **Arguments:**
 
-    - `norm`: how the energy weights vertices, `"area"` or `"frobenius"`; see `WaveletProblem.energy`.
+    - `norm`: the weights of the vertices of X in the energy. `"area"` (the default) weights each vertex by
+      its area. `"frobenius"` gives all vertices the same weight, as in eq. (5) of the paper.
 
-    **Raises:** `ValueError` for an unknown norm.
+    **Raises:** `ValueError` if `norm` is unknown.
     """
 
     norm: Norm = eqx.field(static=True, default="area")
@@ -132,7 +145,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser of the energy, (k_out, k_in), and a member of `RESULTS`."""
+        """Returns the minimiser C of the energy, (k_out, k_in), and a status code (member of `RESULTS`)."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

@@ -1,4 +1,4 @@
-"""Corresponding functions on both shapes, expressed in the eigenbases."""
+"""Descriptors of both shapes, expressed in the eigenbases, for `RegularizedLeastSquares`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class ProjectedDescriptors(eqx.Module):
 
     **Attributes:**
 
-    - `coefficients`: (k, d), `Phi^+ f` of each function f.
-    - `operators`: (d, k, k), `Phi^+ diag(f) Phi`, the multiplication by each function f (Nogneng and
-      Ovsjanikov 2017); or None.
+    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with `Phi^+ = Phi^T A`.
+    - `operators`: (d, k, k), for each function f the operator `Phi^+ diag(f) Phi`, which multiplies another
+      function by f (Nogneng and Ovsjanikov 2017); None if no operators were computed.
     """
 
     coefficients: Float[Array, "k d"]
@@ -30,26 +30,31 @@ class ProjectedDescriptors(eqx.Module):
     ) -> ProjectedDescriptors:
         """Projects the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
 
-        With `operators` True, the multiplication operators are computed as well. The shapes of the arrays are
-        not checked; `DescriptorPair.project` checks them.
+        If `operators` is True, the multiplication operators are computed as well. This method does not check
+        the shapes of the arrays; `DescriptorPair.project` does.
         """
         dual = dual_eigenvectors(spectrum, "area")
 
         def multiply(f: Float[Array, " n"]) -> Float[Array, "k k"]:
             return product((dual * f[:, None]).T, spectrum.eigenvectors)
 
-        # The functions are processed one by one, because all functions at once would need d copies of the
-        # eigenvectors.
+        # The functions are processed one by one. Processing all d functions together would need memory for d
+        # copies of the eigenvectors.
         made = jax.lax.map(multiply, descriptors.T) if operators else None
         return cls(product(dual.T, descriptors), made)
 
 
 class DescriptorPair(eqx.Module):
-    """Corresponding functions on both shapes, expressed in the eigenbases.
+    """Corresponding functions on two shapes X and Y, such as descriptors, expressed in the eigenbases.
+
+    `RegularizedLeastSquares` uses a `DescriptorPair` in its terms for descriptors. `DescriptorPair.project`
+    computes a pair from the values of functions at the vertices.
 
     **Attributes:**
 
-    - `x`, `y`: the functions on X and the corresponding functions on Y.
+    - `x`, `y`: d functions on X and the corresponding d functions on Y. Both have the attributes
+      `coefficients`, (k_x, d) or (k_y, d), and `operators`, (d, k_x, k_x) or (d, k_y, k_y). `operators` is
+      None if no operators were computed.
 
     **Raises:** `ValueError` if X and Y have different numbers of functions.
     """
@@ -61,8 +66,8 @@ class DescriptorPair(eqx.Module):
         shape_x, shape_y = self.x.coefficients.shape, self.y.coefficients.shape
         if len(shape_x) != 2 or len(shape_y) != 2 or shape_x[1] != shape_y[1]:
             raise ValueError(
-                f"descriptors with coefficients of shapes {shape_x} on X and {shape_y} on Y are not (k_x, d) "
-                "and (k_y, d) of the same d functions"
+                f"the coefficients of the descriptors have the shapes {shape_x} on X and {shape_y} on Y, but "
+                "(k_x, d) and (k_y, d) with the same number d are needed"
             )
 
     @classmethod
@@ -75,14 +80,15 @@ class DescriptorPair(eqx.Module):
         *,
         operators: bool = False,
     ) -> DescriptorPair:
-        """Projects values at vertices onto the eigenbases.
+        """Returns the pair of functions on X and Y whose values at the vertices are given.
 
         **Arguments:**
 
         - `descriptors_x`, `descriptors_y`: the values of d functions on X (m, d) and of the corresponding
           functions on Y (n, d), in any unit.
-        - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-        - `operators`: whether to compute the `operators` as well: d matrices of size k x k per shape.
+        - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
+        - `operators`: whether to compute the multiplication operators as well, which are d matrices of size
+          k x k per shape. Descriptor commutativity needs these operators. The default is False.
 
         **Raises:** `ValueError` if the values do not have one row per vertex and one column per function.
         """

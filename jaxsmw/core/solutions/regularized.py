@@ -39,42 +39,51 @@ def _as_weight(value: ArrayLike | None) -> Array | None:
 
 
 class RegularizedLeastSquares(Solution[None]):
-    """The minimiser of the wavelet-preservation energy plus further terms, by an iterative solver.
+    """The solution that minimises the wavelet-preservation energy plus further terms, by an iterative solver.
 
-    The functional map minimises the weighted sum of
+    `RegularizedLeastSquares` is a `Solution`, for the argument `solution` of `WaveletPreservation`. The
+    functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
-    - the wavelet-preservation energy of eq. (5);
-    - Laplacian commutativity, `||Lambda_out C - C Lambda_in||²`, with eigenvalues as fractions of the
-      largest;
-    - orthogonality, `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This term is not
-      quadratic;
-    - descriptor preservation, `||C F_in - F_out||²` (Ovsjanikov et al. 2012);
-    - descriptor commutativity, `sum_d ||C D_in - D_out C||²` (Nogneng and Ovsjanikov 2017).
+    - Wavelet preservation is the energy of eq. (5) of the MWP paper.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. Lambda_out and Lambda_in contain the
+      eigenvalues of the shapes that C maps to and maps from. Both are divided by the larger of the two
+      shapes' largest eigenvalues.
+    - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. Only this term
+      is not quadratic.
+    - Descriptor preservation is `||C F_in - F_out||²`, where F contains the coefficients of the descriptors
+      (Ovsjanikov et al. 2012).
+    - Descriptor commutativity is `sum_d ||C D_in - D_out C||²`, where D is the operator that multiplies a
+      function by descriptor d (Nogneng and Ovsjanikov 2017).
 
-    The terms are scaled so that weights near one are comparable for all banks and all units of descriptors:
-    C = 0, or one side of a difference alone, costs about k_out. The wavelet term is divided by the mean of
-    the frame function, which is one for a Parseval frame. `F_out` is scaled to the squared norm k_out. All
-    `D_out` together are also scaled to the squared norm k_out.
+    Each term is scaled so that its value is about k_out if C = 0, or if one side of its difference is zero.
+    Weights near one are therefore comparable, for all banks and all units of descriptors. The wavelet term is
+    divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled to the
+    squared norm k_out. The operators `D_out` are scaled by a common factor such that their squared norms sum
+    to k_out.
 
-    The wavelet term and the descriptor term have many thousand columns. Both are first reduced to k_in
-    columns without approximation. Then `optimistix.least_squares` takes Gauss–Newton steps. Conjugate
-    gradients solve each step without a matrix of size k² x k². The solver starts from the previous functional
-    map if there is one. The result is differentiable, by implicit differentiation at the minimum.
+    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. Both
+    are first reduced to k_in columns without approximation. Then `optimistix.least_squares` takes
+    Gauss–Newton steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver
+    starts from the functional map of the previous iteration, if there is one. C is differentiable, by
+    implicit differentiation at the minimum.
 
     **Arguments:**
 
     - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
-      `descriptor_commutativity`: positive weights. None omits a term.
-    - `descriptors`: the descriptors for the last two terms. Descriptor commutativity needs their `operators`.
-    - `norm`: the norm of the wavelet term, `"area"` or `"frobenius"`; see `WaveletProblem.energy`.
-    - `tolerance`: the tolerance of the solver, relative to C and to the residuals; positive.
-    - `max_steps`: the largest number of steps, at least 1. If this number does not suffice, the result is
-      `RESULTS.solver_not_converged`.
+      `descriptor_commutativity`: the weights of the five terms. Each weight is a single positive number or an
+      array of shape (); None omits the term. The defaults are 1, 1, 0.1, None and None.
+    - `descriptors`: a `DescriptorPair` for the two descriptor terms; None (the default) without these terms.
+      Descriptor commutativity needs `DescriptorPair.project(..., operators=True)`.
+    - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
+      by its area. `"frobenius"` gives all vertices the same weight.
+    - `tolerance`: the tolerance at which the solver stops, relative to C and to the residuals. A positive
+      number, by default 1e-3.
+    - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
+      reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` if a weight or the tolerance is not positive, `max_steps` is below 1, or the norm
-    is unknown. Also `ValueError` if neither `wavelet_preservation` nor `descriptor_preservation` has a
-    weight, if descriptors are given without a weight or a weight without descriptors, or if operators are
-    missing.
+    **Raises:** `ValueError` in the following cases: a weight or the tolerance is not positive; `max_steps` is
+    below 1; `norm` is unknown; neither `wavelet_preservation` nor `descriptor_preservation` has a weight;
+    descriptors are given without a weight, or a weight without descriptors; operators are missing.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -94,14 +103,14 @@ class RegularizedLeastSquares(Solution[None]):
                 check_between(self, term, getattr(self, term))
         if self.wavelet_preservation is None and self.descriptor_preservation is None:
             raise ValueError(
-                "C is undetermined without wavelet_preservation and descriptor_preservation: give one "
-                "of these weights"
+                "C is undetermined without a weight for wavelet_preservation or descriptor_preservation: "
+                "give at least one of these weights"
             )
         weighted = self.descriptor_preservation is not None or self.descriptor_commutativity is not None
         if weighted != (self.descriptors is not None):
             raise ValueError(
                 "descriptors need a weight, descriptor_preservation or descriptor_commutativity, and these "
-                "weights need descriptors"
+                "weights need descriptors: give both or neither"
             )
         if not self.tolerance > 0 or self.max_steps < 1:
             raise ValueError(f"tolerance={self.tolerance} and max_steps={self.max_steps} must be positive")
@@ -110,7 +119,10 @@ class RegularizedLeastSquares(Solution[None]):
             and self.descriptors is not None
             and self.descriptors.x.operators is None
         ):
-            raise ValueError("descriptor_commutativity needs DescriptorPair.project(..., operators=True)")
+            raise ValueError(
+                "descriptor_commutativity needs operators, which the descriptors lack: compute the "
+                "descriptors with DescriptorPair.project(..., operators=True)"
+            )
 
     def solve(
         self,
@@ -119,11 +131,13 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser of the objective, (k_out, k_in), and a member of `RESULTS`.
+        """Returns the minimiser C of the objective, (k_out, k_in), and a status code (member of `RESULTS`).
 
-        The solver starts from the previous functional map, or from an estimate if that is None.
+        The solver starts from the previous functional map. If there is none, the solver starts from an
+        estimate.
 
-        **Raises:** `ValueError` if the descriptors are in bases of another size than the functional map.
+        **Raises:** `ValueError` if the descriptors have another number of eigenvectors than the functional
+        map.
         """
         energy = None
         if self.wavelet_preservation is not None:
@@ -145,21 +159,22 @@ class RegularizedLeastSquares(Solution[None]):
         *,
         initial: Float[Array, "k_out k_in"] | None = None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the objective with the given energy in place of the wavelet-preservation energy.
+        """Minimises the objective with a given energy in place of the wavelet-preservation energy.
 
         **Arguments:**
 
-        - `energy`: any quadratic energy, with the weight `wavelet_preservation`; None if and only if that
-          weight is None.
+        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. It must
+          be None if, and only if, this weight is None.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
           the shape that C maps from (k_in,). `descriptors.x` belongs to the shape that C maps to, as in the
           pullback convention.
-        - `initial`: the functional map (k_out, k_in) from which the solver starts; by default an estimate.
+        - `initial`: the functional map (k_out, k_in) from which the solver starts. By default, the solver
+          starts from an estimate.
 
-        **Returns:** The minimiser C (k_out, k_in), and a member of `RESULTS`.
+        **Returns:** The minimiser C (k_out, k_in), and a status code, which is a member of `RESULTS`.
 
-        **Raises:** `ValueError` for an energy without a weight, a weight without an energy, or descriptors in
-        bases of another size than C.
+        **Raises:** `ValueError` if an energy is given without a weight or a weight without an energy, or if
+        the descriptors have another number of eigenvectors than C.
         """
         descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
         return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
@@ -181,15 +196,15 @@ class RegularizedLeastSquares(Solution[None]):
         determined = curvature > quadratic.rounding()
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
-        # Conjugate gradients take few steps in units in which the quadratic terms have the same curvature in
-        # every entry of C.
+        # The entries of C are scaled so that the quadratic terms have the same curvature in each of them.
+        # Then conjugate gradients need few steps.
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if initial is None:
             initial = quadratic.cross * unit**2
         functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
         if len(terms) == 1:
             result = where(quadratic.is_regular(), result, RESULTS.singular_system)
-        # A NaN outside the quadratic terms appears in the residuals, for example if a weight is negative.
+        # A NaN outside the quadratic terms, such as from a negative weight, appears only in the residuals.
         residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
         finite &= jnp.all(jnp.isfinite(residuals))
         result = where(solvable, result, RESULTS.undetermined_functional_map)
@@ -215,9 +230,9 @@ class RegularizedLeastSquares(Solution[None]):
             f_out, f_in = (side.coefficients for side in descriptors)
             if (f_out.shape[0], f_in.shape[0]) != shape:
                 raise ValueError(
-                    f"the descriptors are in bases of {f_out.shape[0]} and {f_in.shape[0]} eigenvectors, but "
-                    f"the functional map is {shape[0]} x {shape[1]}: project the descriptors on the same "
-                    "spectra, in the same order"
+                    f"the descriptors are expressed in {f_out.shape[0]} and {f_in.shape[0]} eigenvectors, "
+                    f"but the functional map is {shape[0]} x {shape[1]}: project the descriptors onto the "
+                    "spectra for which the functional map is computed, in the same order"
                 )
             size = jnp.sum(f_out**2)
             weight = self.descriptor_preservation.astype(dtype) * shape[0] / size
@@ -254,7 +269,7 @@ class RegularizedLeastSquares(Solution[None]):
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Minimises the sum of the squared residuals in the given units, and reports convergence.
 
-        If the problem is not solvable, its residuals are replaced by zeros, so the solver stops at once.
+        If the problem is not solvable, its residuals are replaced by zeros, so the solver stops immediately.
         """
         import lineax as lx  # imported here because the import takes as long as computing an eigenbasis
         import optimistix as optx
@@ -262,8 +277,9 @@ class RegularizedLeastSquares(Solution[None]):
         precision = 0.1 * self.tolerance
         inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(unit.shape)))
         with jax.default_matmul_precision("highest"):
-            # Full Gauss–Newton steps suffice: on real pairs a trust region never shortened a step. Besides,
-            # the trust regions of optimistix do not accept float32 while jax_enable_x64 is set.
+            # The solver takes full Gauss–Newton steps, because a trust region never shortened a step on real
+            # pairs. The trust-region solvers of optimistix also do not accept float32 while jax_enable_x64 is
+            # set.
             solution: optx.Solution = optx.least_squares(
                 lambda scaled, _: [jnp.where(solvable, term.residual(scaled * unit), 0) for term in terms],
                 optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
@@ -277,7 +293,7 @@ class RegularizedLeastSquares(Solution[None]):
 
 
 class _Term(NamedTuple):
-    """One term of the objective, the squared norm of a residual.
+    """One term of the objective: the squared norm of a residual.
 
     **Attributes:**
 
@@ -291,11 +307,11 @@ class _Term(NamedTuple):
 
 
 def _energy_term(energy: QuadraticEnergy) -> _Term:
-    """The given energy, up to a constant.
+    """Returns the given energy as a term with k_in columns, up to a constant.
 
-    The Cholesky factor has the same inner products as the columns in the energy, so the factor can replace
-    these columns. A ridge of the size of the rounding error ensures that the factor exists even if the energy
-    alone does not determine C.
+    The energy is a sum of squares over many columns. The Cholesky factor of the gram matrix has the same
+    inner products as these columns, so it can replace them. A ridge of the size of the rounding error is
+    added to the gram matrix. With this ridge the factor exists even if the energy alone does not determine C.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))
@@ -307,7 +323,7 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """The weighted term `||Lambda_out C - C Lambda_in||²`, relative to the largest eigenvalue."""
+    """The weighted term `||Lambda_out C - C Lambda_in||²`, with eigenvalues divided by the largest one."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -315,7 +331,7 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """The weighted term `||C^T C - I||²` or `||C C^T - I||²`, whichever is smaller in size."""
+    """The weighted term `||C^T C - I||²` or `||C C^T - I||²`, whichever has the smaller matrix."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -323,7 +339,7 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """The weighted term `sum_d ||C D_in - D_out C||²`, with all D_out scaled to the squared norm k_out."""
+    """The weighted term `sum_d ||C D_in - D_out C||²`, with squared norms of the D_out that sum to k_out."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]

@@ -1,13 +1,15 @@
-"""The methods that `jaxsmw benchmark` compares with each other, in one module each.
+"""The methods that `jaxsmw benchmark` compares with each other.
+
+The modules of this package are:
 
 - `base`: the input of a method (`MethodInput`) and the interface of a method (`Method`).
 - `initial_map`: the initial map without refinement.
 - `presets`: this library's own methods.
-- `published_maps`: maps in files.
+- `published_maps`: maps that other programs computed, read from files.
 - `spectral_icp`, `zoomout`, `bcicp`, `cpd`, `partial_functional_maps`: methods by other authors,
   reimplemented here.
 - `peers`: methods of other libraries, if these are installed.
 - `registry`: the name of each method on the command line and in results.
 
-The docstring of each module names the publication of its methods and the settings in use.
+The docstring of each module names the publication of its methods and the settings that the benchmark uses.
 """

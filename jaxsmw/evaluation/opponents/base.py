@@ -1,6 +1,6 @@
-"""The interface of the compared methods: their input and their result.
+"""The interface of the compared methods: their input and their output.
 
-All methods get the same prepared pair: the same spectra, the same initial map and the same samples.
+All methods get the same prepared pair, with the same spectra, the same initial map and the same samples.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000
-"""The number of samples of each shape in a prepared pair. Smaller shapes have fewer; no method uses more."""
+"""The number of samples of each shape in a prepared pair, which is the largest number that a method uses.
+
+If a shape has fewer vertices, both shapes have fewer samples.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,16 +35,18 @@ class MethodInput:
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra, with at least as many eigenvectors as any method uses.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, with at least as many eigenvectors as any method
+      uses.
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
-    - `samples`: vertices of X and of Y in farthest-point order, for methods that iterate on samples.
-    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, for methods that need
-      `both_directions`.
+    - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
+      iterate on samples.
+    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, for methods whose attribute
+      `both_directions` is True; otherwise None.
     - `meshes`: X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
     - `partial`: whether one shape is a partial shape of the other. The two spectra are then comparable only
       up to the smaller of their largest eigenvalues.
-    - `prepared`: the pair as `jaxsmw.match` prepares it, for methods that run a preset.
+    - `prepared`: the prepared pair as in `jaxsmw.match`, for methods that run a preset.
     """
 
     spectrum_x: Spectrum
@@ -61,11 +66,11 @@ class MethodInput:
         names: tuple[str, str],
         reverse_initial_map: Int64[np.ndarray, " n"] | None = None,
     ) -> MethodInput:
-        """Returns the input of all methods for a pair.
+        """Creates the input of all methods from a prepared pair.
 
         **Arguments:**
 
-        - `prepared`: the result of `jaxsmw.preparation.prepare`, with samples.
+        - `prepared`: the prepared pair that `jaxsmw.preparation.prepare` returns, with samples.
         - `names`: the names of X and Y.
         - `reverse_initial_map`: the initial map Y -> X (n,), or None.
         """
@@ -88,33 +93,39 @@ class MethodInput:
         )
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra with the eigenvectors and descriptors of a stage.
+        """Returns both spectra with the eigenvectors and descriptors that a stage uses; see `Stage.view`.
 
-        The spectra of a partial pair are also cut to their common range.
+        The spectra of a partial pair are also cut to their common range of eigenvalues.
         """
         return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
 
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra with k eigenvectors; for a partial pair, with those in the common range."""
+        """Returns both spectra with their first k eigenvectors.
+
+        The spectra of a partial pair are also cut to their common range of eigenvalues.
+        """
         return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
-        """Returns the first `count` samples of X and of Y; None for both if `count` is None."""
+        """Returns the first `count` samples of X and of Y, or twice None if `count` is None."""
         samples_x, samples_y = self.samples
         return (None, None) if count is None else (samples_x[:count], samples_y[:count])
 
 
 class Method(abc.ABC):
-    """A method that computes a pointwise map from a prepared pair; the interface of all compared methods.
+    """The base class of all compared methods. A method computes a pointwise map from a prepared pair.
+
+    A subclass must define `__call__`, `reference` and `number_of_eigenvectors`. `METHODS` in
+    `jaxsmw.evaluation.opponents.registry` contains the available methods.
 
     **Attributes:**
 
-    - `reference`: the publication and the settings, as text that is printed with the results.
+    - `reference`: the publication and the settings of the method, as text that is printed with the results.
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
     - `both_directions`: whether the method needs `MethodInput.reverse_initial_map`.
-    - `full_only`: whether the method is undefined on partial pairs.
-    - `partial_only`: whether the method is undefined on pairs of full shapes.
+    - `full_only`: whether the method cannot match partial pairs.
+    - `partial_only`: whether the method cannot match pairs of full shapes.
     """
 
     reference: str
@@ -126,23 +137,24 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y (m,), 0-based vertices of Y, and a member of `RESULTS`.
+        """Returns the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
 
-        If the result is not successful, the map is invalid; most methods then return -1 everywhere.
+        If the status code is not `RESULTS.successful`, the map is invalid. Most methods then return -1 for
+        all vertices.
         """
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Checks, before any pair is matched, that the method is defined on all pairs.
+        """Checks that the method can match all pairs. A benchmark calls `check` before it matches any pair.
 
-        **Raises:** `InputError` if the method is undefined on a pair.
+        **Raises:** `InputError` if the method cannot match a pair.
         """
         if self.full_only and any(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: cannot match partial shapes: remove it from --methods.")
+            raise InputError(f"{self.reference}: cannot match partial shapes: remove this method from --methods.")
         if self.partial_only and not all(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: matches partial shapes only: remove it from --methods.")
+            raise InputError(f"{self.reference}: matches partial shapes only: remove this method from --methods.")
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
-        """Returns whether the method is defined on all pairs. Unlike `check`, `suits` checks no files."""
+        """Returns whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
         partial = [pair.partial for pair in pairs]
         return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))
 
@@ -155,5 +167,6 @@ def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
     rows, n = spectrum.mask.shape[0], len(mesh.vertices)
     if rows < n:
         raise InputError(
-            f"{mesh.name}: has {n} vertices, but its spectrum has {rows}: give the spectrum of this mesh."
+            f"{mesh.name}: has {n} vertices, but its spectrum has {rows} rows: give the spectrum of this "
+            "mesh."
         )

@@ -353,7 +353,7 @@ class BijectiveContinuousICP(Method):
     full_only: bool = True
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None and pair.reverse_initial_map is not None
         initial_maps = (
             np.asarray(initial_map).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The initial map without refinement. All other methods start from the same map."""
+"""The initial map without refinement. All other methods start from this map."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput
 
 @dataclass(frozen=True)
 class Unrefined(Method):
-    """Returns the initial map unchanged."""
+    """A method that returns the initial map unchanged."""
 
-    reference: str = "nearest neighbours of the descriptors: the initial map of all other methods"
+    reference: str = "the initial map of all other methods, from nearest neighbours in descriptor space"
     number_of_eigenvectors: int = 1
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         return pair.initial_map, RESULTS.successful  # type: ignore[return-value]
 
 

@@ -443,7 +443,7 @@ class PartialFunctionalMaps(Method):
     partial_only: bool = True
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None
         spectra = pair.seen_in(
             Stage(

@@ -1,13 +1,15 @@
-"""ZoomOut of other libraries, on the same spectra and initial maps as all other methods.
+"""The ZoomOut implementations of other libraries, on the same spectra and initial maps as all other methods.
 
-The methods need optional packages, and are available if these are installed:
+The methods need optional packages, and are available only if these packages are installed:
 
     pip install 'jaxsmw[benchmark,peers]'
 
 The methods run in the same process and on the same number of cores as all other methods. Both have the
-settings of the ZoomOut paper (see `zoomout`): k = 20, 25, ..., 120, all vertices in every iteration.
+settings of the ZoomOut paper (see `zoomout`): the number of eigenvectors k is 20, 25, ..., 120, and every
+iteration uses all vertices.
 
-- `PyFM`: the function `zoomout_refine` of pyFM (`pyfmaps` on the package index) by R. Magnet, with one job.
+- `PyFM`: the function `zoomout_refine` of pyFM (`pyfmaps` on the package index) by R. Magnet, with one
+  job.
 - `Geomfum`: the class `ZoomOut` of geomfum.
 """
 
@@ -28,10 +30,11 @@ from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVE
 
 
 class Peer(Method):
-    """ZoomOut of another library, from k = 20 to 120 in the steps of the paper.
+    """The base class of ZoomOut implementations of other libraries, with k = 20, 25, ..., 120 eigenvectors.
 
-    Shape 1 of the other libraries is our Y, and shape 2 is our X. Their functional maps take functions on
-    shape 1 to functions on shape 2, and their pointwise maps take vertices of shape 2 to vertices of shape 1.
+    A subclass must define `refine`, `reference` and `package`. In the other libraries, Y is called shape 1,
+    and X is called shape 2. Functional maps take functions on shape 1 to functions on shape 2, and pointwise
+    maps take vertices of shape 2 to vertices of shape 1.
 
     **Attributes:**
 
@@ -43,7 +46,7 @@ class Peer(Method):
     package: str
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
         found = np.zeros(pair.initial_map.shape, np.int32)
@@ -52,22 +55,22 @@ class Peer(Method):
 
     @abc.abstractmethod
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Returns the refined map X -> Y (u,) between referenced vertices, which are numbered from 0.
+        """Returns the refined map X -> Y (u,) between the referenced vertices, which are counted from 0.
 
         **Arguments:**
 
-        - `initial_map`: the initial map X -> Y (u,), in the same numbering.
-        - `x`, `y`: the referenced vertices of X and of Y.
+        - `initial_map`: the initial map X -> Y (u,) between the referenced vertices.
+        - `x`, `y`: the spectra of X and Y at their referenced vertices.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The spectrum of a shape at its u referenced vertices, without padding, in float64 for other libraries.
+    """The spectrum of a shape at its u referenced vertices, converted to float64 for other libraries.
 
     **Attributes:**
 
-    - `vertices`: the referenced vertices (u,).
+    - `vertices`: the indices of the referenced vertices in the mesh (u,).
     - `eigenvalues`: the eigenvalues (k,).
     - `eigenvectors`: the eigenvectors (u, k).
     - `areas`: the vertex areas (u,).
@@ -80,20 +83,20 @@ class _Shape:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Shape:
-        """Returns a spectrum at its referenced vertices."""
+        """Returns a spectrum without padding and without unreferenced vertices."""
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
 
 
 class PyFM(Peer):
-    """The ZoomOut of pyFM."""
+    """The ZoomOut implementation of pyFM."""
 
     reference = "pyFM's zoomout_refine, k = 20, 25, ..., 120, one job"
     package = "pyFM"
 
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Calls `pyFM.refine.zoomout_refine`."""
+        """Refines the initial map with `pyFM.refine.zoomout_refine`; see `Peer.refine`."""
         from pyFM.refine import zoomout_refine
         from pyFM.spectral import p2p_to_FM
         from scipy.sparse import diags_array
@@ -119,13 +122,13 @@ class PyFM(Peer):
 
 
 class Geomfum(Peer):
-    """The ZoomOut of geomfum."""
+    """The ZoomOut implementation of geomfum."""
 
     reference = "geomfum's ZoomOut, k = 20, 25, ..., 120"
     package = "geomfum"
 
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Calls `geomfum.refine.ZoomOut`."""
+        """Refines the initial map with `geomfum.refine.ZoomOut`; see `Peer.refine`."""
         from geomfum.basis import EigenBasis
         from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
         from geomfum.refine import ZoomOut

@@ -1,8 +1,8 @@
 """This library's own methods: MWP with a fixed number of eigenvectors, and the presets of `jaxsmw.PRESETS`.
 
-MWP is implemented from Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
-manifold wavelets preservation*, CVPR 2021, Algorithm 1. `MWP` has the settings of the paper: 100
-eigenvectors, a Meyer frame of 6 filters, 3 iterations. `MWP_SAMPLED` iterates on 500 samples of each shape,
+MWP is Algorithm 1 of Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
+manifold wavelets preservation*, CVPR 2021. `MWP` has the settings of the paper: 100 eigenvectors, a Meyer frame
+of 6 filters, and 3 iterations. `MWP_SAMPLED` has the same settings, but iterates on 500 samples of each shape,
 like the fast variant of the paper's authors.
 """
 
@@ -23,13 +23,13 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True)
 class Refined(Method):
-    """Refines the initial map with `jaxsmw.refine` and a fixed number of eigenvectors.
+    """A method that refines the initial map with one refiner and a fixed number of eigenvectors.
 
     **Attributes:**
 
-    - `reference`: see `Method`.
-    - `refiner`: the refiner.
-    - `number_of_eigenvectors`: k of both shapes.
+    - `reference`: the publication and the settings, as text; see `Method`.
+    - `refiner`: the refiner; `WaveletPreservation()`, the refiner of MWP, by default.
+    - `number_of_eigenvectors`: the number of eigenvectors of both shapes.
     - `iterations`: the number of iterations.
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates; None for all
       vertices.
@@ -42,7 +42,7 @@ class Refined(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         stage = Stage(
             self.refiner,
             number_of_eigenvectors=self.number_of_eigenvectors,
@@ -55,11 +55,11 @@ class Refined(Method):
 
 @dataclass(frozen=True)
 class Chosen(Method):
-    """Refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
+    """A method that refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
 
     **Attributes:**
 
-    - `reference`: see `Method`.
+    - `reference`: the publication and the settings, as text; see `Method`.
     - `preset`: the name of the preset.
     """
 
@@ -68,16 +68,16 @@ class Chosen(Method):
 
     @property
     def number_of_eigenvectors(self) -> int:  # type: ignore[override]
-        """The largest number of eigenvectors of any stage."""
+        """The largest number of eigenvectors that a stage of the preset uses."""
         return PRESETS[self.preset].number_of_eigenvectors
 
     @property
     def number_of_descriptors(self) -> int:  # type: ignore[override]
-        """The largest number of descriptors of any stage."""
+        """The largest number of descriptors that a stage of the preset uses."""
         return PRESETS[self.preset].number_of_descriptors
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         assert pair.prepared is not None
         preset = PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
         outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
@@ -85,5 +85,5 @@ class Chosen(Method):
 
 
 MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")
-MWP_SAMPLED = Refined("Hu, Li, Liu, Liu 2021: as mwp, but on 500 samples", number_of_samples=500)
+MWP_SAMPLED = Refined("Hu, Li, Liu, Liu 2021: the method mwp, but on 500 samples", number_of_samples=500)
 ACCURATE = Chosen("this library's preset accurate, which continues from the result of mwp", "accurate")

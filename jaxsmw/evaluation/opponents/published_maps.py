@@ -21,12 +21,12 @@ from jaxsmw.runtime.padding import pad_rows
 
 @dataclass(frozen=True)
 class PublishedMaps(Method):
-    """Reads the map of each pair from a directory; see `read_published_map`.
+    """A method that reads the map of each pair from a directory; see `read_published_map`.
 
     **Attributes:**
 
     - `directory`: the directory that contains the files `X_Y.map`.
-    - `number_of_eigenvectors`: see `Method`; the method uses no eigenvectors.
+    - `number_of_eigenvectors`: 1, the smallest number, because the method uses no eigenvectors.
     """
 
     directory: Path
@@ -34,11 +34,11 @@ class PublishedMaps(Method):
 
     @property
     def reference(self) -> str:  # type: ignore[override]
-        """The name of the directory, in a phrase for the results."""
+        """The text that is printed with the results. It contains the name of the directory."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None
         pointwise_map = read_published_map(self.directory, pair.names, pair.meshes)
         padded = jnp.asarray(pad_rows(pointwise_map, pair.spectrum_x.mask.shape[0]), jnp.int32)
@@ -53,12 +53,12 @@ class PublishedMaps(Method):
         if missing:
             raise InputError(
                 f"{published_file(self.directory, missing[0].names)}: is missing ({len(missing)} of "
-                f"{len(pairs)} maps are missing): add the maps, or choose pairs with --pairs FILE."
+                f"{len(pairs)} maps are missing): add the maps, or list the other pairs in a file and pass --pairs FILE."
             )
 
 
 def published_file(directory: Path, names: tuple[str, str]) -> Path:
-    """Returns the path of the map between two shapes, given the names of source and target."""
+    """Returns the path of the map between two shapes, given the names of the source and the target."""
     return directory / f"{'_'.join(names)}.map"
 
 
@@ -69,9 +69,9 @@ def read_published_map(
 
     **Arguments:**
 
-    - `directory`: the directory of the file.
-    - `names`: the names of X and Y, which give the name of the file.
-    - `meshes`: X with m vertices, and Y.
+    - `directory`: the directory that contains the file.
+    - `names`: the names of X and Y, from which the file name is formed.
+    - `meshes`: the meshes of X, with m vertices, and of Y.
 
     **Returns:** The map (m,), 0-based vertices of Y.
 

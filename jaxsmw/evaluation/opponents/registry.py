@@ -1,4 +1,4 @@
-"""The methods by name. The command line and the results use these names."""
+"""The names of the compared methods on the command line and in results."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ METHODS: dict[str, Method] = {
     "zoomout": ZOOMOUT,
     "zoomout-sampled": ZOOMOUT_SAMPLED,
 }
-"""The methods that need no other library, by name, in the order of the tables."""
+"""The methods that need no other library, as a dictionary by name, in the order of the rows of tables."""
 
 MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
 """The largest number of eigenvectors that any of `METHODS` uses."""
 
 
 def known_methods() -> dict[str, Method]:
-    """Returns `METHODS` and the methods of other libraries that are installed, by name."""
+    """Returns `METHODS` and the methods of installed other libraries, as a dictionary by name."""
     return METHODS | installed_peers()
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Returns the known methods that are defined on all of the pairs, by name."""
+    """Returns the known methods that can match all pairs, as a dictionary by name."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 
@@ -54,9 +54,9 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     **Arguments:**
 
     - `names`: names of known methods, or directories with maps of other programs (files `X_Y.map`).
-      Repeated names count once.
+      Repeated names are used once.
 
-    **Returns:** The methods, each under its own name or under the name of its directory.
+    **Returns:** A dictionary of the methods by name. Maps in a directory have the name of the directory.
 
     **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would get
     the same name.
@@ -66,7 +66,7 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
         if name in known:
             found[name] = known[name]
             continue
-        # Unlike `Path.is_dir`, this also takes names that are too long for the file system.
+        # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):
             raise InputError(
                 f"{name!r} is not a method: choose from {', '.join(known)}, or give a directory with maps "

@@ -1,13 +1,13 @@
-"""Spectral ICP, and nearest neighbours without any constraint on the functional map.
+"""Spectral ICP, and refinement without any constraint on the functional map.
 
 M. Ovsjanikov, M. Ben-Chen, J. Solomon, A. Butscher, L. Guibas, *Functional maps: a flexible representation of
 maps between shapes*, ACM Transactions on Graphics 31(4), 2012, describe spectral ICP as post-processing by
-iterative refinement. Each iteration replaces the functional map of the pointwise map by the nearest
-orthogonal matrix, then searches nearest neighbours. Both methods run in the loop of `jaxsmw.refine` with 100
-eigenvectors, the number that MWP uses.
+iterative refinement. Each iteration encodes the pointwise map as a functional map, replaces the functional map
+by the nearest orthogonal matrix, and then searches for nearest neighbours. Both methods run in the loop of
+`jaxsmw.refine` with 100 eigenvectors, the number that MWP uses.
 
-- `SPECTRAL_ICP`: 10 iterations.
-- `NO_FILTER`: MWP without filters, so the encoded functional map is used unchanged; 3 iterations, as for MWP.
+- `SPECTRAL_ICP`: spectral ICP with 10 iterations.
+- `NO_FILTER`: MWP without filters, with 3 iterations like MWP. The encoded functional map is used unchanged.
 """
 
 from __future__ import annotations

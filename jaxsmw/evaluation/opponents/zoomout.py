@@ -2,10 +2,10 @@
 
 S. Melzi, J. Ren, E. Rodolà, A. Sharma, P. Wonka, M. Ovsjanikov, *ZoomOut: spectral upsampling for efficient
 shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration encodes the pointwise map as a
-functional map of size k, searches nearest neighbours, and enlarges k.
+functional map of size k, searches for nearest neighbours, and increases k.
 
-- `ZOOMOUT`: k = 20, 25, ..., 120, all vertices in every iteration.
-- `ZOOMOUT_SAMPLED`: the same sizes, on 1000 samples of each shape (section 4.3 of the paper).
+- `ZOOMOUT` has the sizes k = 20, 25, ..., 120, and uses all vertices in every iteration.
+- `ZOOMOUT_SAMPLED` has the same sizes, and iterates on 1000 samples of each shape (section 4.3 of the paper).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxsmw.evaluation.opponents.base import MOST_SAMPLES, Method, MethodInput
 from jaxsmw.runtime.compilation import compiled
 
 FIRST_EIGENVECTORS, ZOOMOUT_STEP, LAST_EIGENVECTORS = 20, 5, 120
-"""The first size k of the functional map, the step from one size to the next, and the last size."""
+"""The first size k of the functional map, the step from each size to the next, and the largest size."""
 
 _UNFILTERED = WaveletPreservation(Identity())
 _UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_inverse="least_squares"))
@@ -34,15 +34,16 @@ _UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_invers
 
 @dataclass(frozen=True)
 class ZoomOut(Method):
-    """ZoomOut (Melzi et al. 2019): encodes and decodes the map with more eigenvectors in each iteration.
+    """The method ZoomOut (Melzi et al. 2019), which refines a map with more eigenvectors in each iteration.
 
-    With samples (section 4.3 of the paper), both half-steps of an iteration use the samples only. The last
-    search uses all vertices.
+    With samples (section 4.3 of the paper), each iteration computes the functional map and the pointwise map
+    from the samples only. After the last iteration, one search finds the matches of all vertices.
 
     **Attributes:**
 
-    - `reference`: see `Method`.
-    - `first`, `step`, `number_of_eigenvectors`: the first size k, the step between sizes, and the last size.
+    - `reference`: the publication and the settings, as text; see `Method`.
+    - `first`, `step`, `number_of_eigenvectors`: the first size k of the functional map, the step between
+      sizes, and the largest size.
     - `number_of_samples`: the number of samples of each shape; None for all vertices.
     """
 
@@ -53,7 +54,7 @@ class ZoomOut(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """See `Method`."""
+        """Returns the map X -> Y and the status code; see `Method`."""
         pointwise_map, refiner = pair.initial_map, _UNFILTERED
         samples_x, samples_y = pair.sampled(self.number_of_samples)
         if samples_x is not None:
