@@ -1,4 +1,4 @@
-"""Descriptors of a pair: SHOT at all vertices or at samples, and principal components of SHOT."""
+"""Descriptors of a pair, which are SHOT at all vertices or at samples, and principal components of SHOT."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
 
-# Descriptors do not distinguish vertices whose distance is a few hundredths of the square root of the area.
-# Ten thousand vertices are dense enough for this resolution.
+# A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors do not
+# distinguish vertices whose distance is a few hundredths of the square root of the area. For this resolution,
+# 10 000 samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
-# On meshes with at least this number of vertices, the smaller neighbourhoods contain about ten vertices.
+# On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# The number of samples for larger neighbourhoods, whose descriptors vary more slowly over the surface.
+# The number of samples for neighbourhoods above the usual radius. Their descriptors vary more slowly over the
+# surface than descriptors with the usual radius.
 _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
-    """A shape with the vertices at which descriptors are compared, called the compared vertices.
+    """A shape with its compared vertices, which are the vertices at which descriptors are compared.
 
-    The compared vertices are all vertices of the mesh, or samples of a large mesh.
+    The compared vertices of a large mesh are samples. Those of any other mesh are all its vertices.
 
     **Attributes:**
 
     - `mesh`: the mesh with n vertices.
-    - `samples`: the samples, or None if all vertices are compared.
+    - `samples`: the samples, or None if all vertices are compared vertices.
     - `spectrum`: the spectrum at the compared vertices.
     """
 
@@ -60,20 +62,21 @@ class SampledShape(NamedTuple):
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """Return the rows of given vertices (v,) in arrays over the compared vertices.
+        """Return the row numbers of given vertices (v,) in arrays with one row per compared vertex.
 
-        The row of a vertex is that of the nearest sample, or that of the vertex itself without samples.
+        The row of a vertex is the row of the nearest sample. On a shape without samples, it is the vertex
+        itself.
         """
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
 
 class SampledPair(NamedTuple):
-    """A pair with the vertices at which descriptors are compared.
+    """A pair with its compared vertices, which are the vertices at which descriptors are compared.
 
     **Attributes:**
 
     - `pair`: the source X and the target Y.
-    - `x`, `y`: X and Y with their compared vertices.
+    - `x`, `y`: X and Y with their compared vertices, each a `SampledShape`.
     """
 
     pair: Pair
@@ -89,8 +92,8 @@ class SampledPair(NamedTuple):
 def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
     """Choose the vertices of both shapes at which descriptors are compared.
 
-    These are about 10 000 evenly spread samples of a mesh with more than 15 000 vertices, and all vertices of
-    any other mesh.
+    On a mesh with more than 15 000 vertices, descriptors are compared at about 10 000 evenly spread samples.
+    On any other mesh, descriptors are compared at all vertices.
 
     **Arguments:**
 
@@ -116,19 +119,21 @@ def _samples(mesh: Mesh) -> SurfaceSamples | None:
 def describe(
     pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum, number_of_descriptors: int
 ) -> tuple[Spectrum, Spectrum]:
-    """Add descriptors to both spectra: principal components of SHOT, computed for both shapes together.
+    """Add vertex descriptors, which are principal components of SHOT, to the spectra of both shapes.
 
-    SHOT is computed with the usual radius. If both meshes have at least 2000 vertices, SHOT is also computed
-    with two thirds of this radius. Each component has mean square 1 over the areas of both shapes.
+    SHOT is computed with a radius of 0.06 times the square root of the area. If both meshes have at least
+    2000 vertices, SHOT is also computed with two thirds of this radius, if neither mesh is too coarse for it.
+    The principal components are computed for both shapes together, and each component is scaled to mean
+    square 1 over both shapes.
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y; see `paired_spectra`.
-    - `number_of_descriptors`: the number d of components, from 1 to 352. These are the components of largest
-      variance.
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
+    - `number_of_descriptors`: the number d of components, from 1 to 352. The components of largest variance
+      are taken.
 
-    **Returns:** Both spectra with `descriptors`, (m, d) and (n, d), without unit.
+    **Returns:** The spectra of X and Y with the attribute `descriptors`, (m, d) and (n, d), without unit.
 
     **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT, or a
     spectrum of another mesh.
@@ -155,7 +160,7 @@ def describe(
 def _shot_at_all_radii(
     sampled: SampledPair,
 ) -> list[tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]]:
-    """Compute SHOT of both shapes with the usual radius, and if possible with the smaller radius."""
+    """Compute SHOT of both shapes with the usual radius and, if the meshes are fine enough, a smaller radius."""
     shot = [paired_shot(sampled)]
     if min(len(mesh.vertices) for mesh in sampled.pair.meshes) >= _FINE:
         with suppress(InputError), warnings.catch_warnings():
@@ -168,7 +173,7 @@ def _shot_at_all_radii(
 def _principal_components(
     values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
 ) -> Float[np.ndarray, "n d"]:
-    """Compute the first principal components of weighted rows, scaled to mean square 1."""
+    """Compute the first principal components of weighted rows. Each is scaled to weighted mean square 1."""
     centered = values - weight @ values
     covariance = centered.T @ (weight[:, None] * centered)
     variances, directions = np.linalg.eigh(covariance.astype(np.float64))
@@ -184,7 +189,7 @@ def paired_shot(
 
     **Arguments:**
 
-    - `sampled`: the pair.
+    - `sampled`: the pair with its compared vertices.
     - `radius`: the radius of the neighbourhoods, in `Pair.units_of_length`.
 
     **Returns:** The descriptors of X (m, 352) and of Y (n, 352), where m and n are the numbers of compared

@@ -13,22 +13,25 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
 from jaxsmw.runtime.threads import side_by_side
 
-# The smallest number of vertices with two eigenvectors, because presets use at most half as many eigenvectors
-# as vertices.
+# The smallest number of vertices for which presets use two eigenvectors. Presets use at most half as many
+# eigenvectors as vertices.
 _FEWEST_VERTICES = 4
-# The smallest ratio of the areas of a partial pair. A thousandth of a body's area does not show its shape.
+# The smallest allowed ratio of the smaller area to the larger area of a partial pair. A thousandth of a
+# body's area does not show the shape of the body.
 _SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """The source X and the target Y, and whether one of them is a partial shape.
+    """The meshes of a source X and a target Y, and the information whether one of them is a partial shape.
+
+    `Pair.make` makes a pair and checks its arguments; the constructor checks nothing.
 
     **Attributes:**
 
-    - `mesh_x`, `mesh_y`: the meshes X (m vertices) and Y (n vertices).
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
-      length.
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), each a `Mesh`.
+    - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the full
+      shape, in the same unit of length.
     """
 
     mesh_x: Mesh
@@ -43,8 +46,10 @@ class Pair:
 
         - `mesh_x`, `mesh_y`: the source X and the target Y, each as a `Mesh` or as any mesh that
           `jaxsmw.make_mesh` accepts.
-        - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit
-          of length.
+        - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the
+          full shape, in the same unit of length.
+
+        **Returns:** A `Pair`.
 
         **Raises:** `InputError` if `jaxsmw.make_mesh` refuses a mesh, or `partial` is not a Boolean.
         """
@@ -68,25 +73,27 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The lengths that count as 1 on X and on Y, in the units of the meshes.
+        """The lengths on X and on Y that count as 1, in the units of the meshes.
 
-        For two full shapes, these are the square roots of the areas of X and of Y, which compensates for a
-        difference in size. For a partial pair, both lengths are the square root of the larger area.
+        For two full shapes, these lengths are the square roots of the areas of X and of Y. Such units
+        compensate for a difference in size. For a partial pair, both lengths are the square root of the
+        larger area.
         """
         roots = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         return (max(roots),) * 2 if self.partial else roots
 
     def fewest_vertices(self) -> int:
-        """Return the smaller of the numbers of referenced vertices of X and of Y.
+        """Return the number of referenced vertices of the mesh that has fewer of them.
 
-        **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which is too few for a match.
+        **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which are too few for
+        matching.
         """
         used = [int(mesh.referenced_vertices.sum()) for mesh in self.meshes]
         for mesh, number in zip(self.meshes, used, strict=True):
             if number < _FEWEST_VERTICES:
                 raise InputError(
                     f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a "
-                    f"mesh with at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
+                    f"mesh with at least {_FEWEST_VERTICES} vertices, or with hundreds for a meaningful result."
                 )
         return min(used)
 
@@ -102,21 +109,25 @@ def paired_spectra(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Spectrum, Spectrum]:
-    """Compute the spectra of both meshes in comparable units.
+    """Compute the spectra of the two meshes of a pair in comparable units.
 
     Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by the same factor, which gives the larger shape area 1. The spectra of a partial
-    pair are then cut to their `common_range`, so k_X and k_Y usually differ.
+    partial pair are scaled by the same factor, so that the larger shape has area 1. In the spectra of a
+    partial pair, the eigenpairs above the smaller of the two largest eigenvalues are then removed. Therefore
+    k_X and k_Y usually differ for a partial pair.
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh.
-    - `laplacian`, `eigensolver`: the method; see `jaxsmw.compute_spectrum`. For `eigensolver="auto"`, both
-      meshes get the same eigensolver.
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
+    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh, at least 1 and
+      less than the number of referenced vertices.
+    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization, `"robust"`
+      also handles non-manifold and badly shaped meshes. `"auto"` chooses between both for each mesh.
+    - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
+      `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
 
-    **Returns:** The spectra of X (m vertices, k_X eigenvectors) and of Y (n vertices, k_Y eigenvectors), in
-    `Pair.units_of_length`.
+    **Returns:** The `Spectrum` of X (m vertices, k_X eigenvectors) and that of Y (n vertices, k_Y
+    eigenvectors), with positions and normals, in `Pair.units_of_length`. For two full shapes, k_X = k_Y = k.
 
     **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if the area
     of one mesh of a partial pair is less than a thousandth of the other area.
@@ -144,13 +155,16 @@ def paired_spectra(
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Remove the eigenpairs above the smaller of the two largest eigenvalues (MWP paper, partial shapes).
+    """Remove the eigenpairs whose eigenvalues are not in the range of both spectra.
+
+    The largest eigenvalue of each spectrum is taken, and eigenpairs above the smaller of these two values are
+    removed. The MWP paper uses this rule for partial shapes.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
 
-    **Returns:** The spectra with k_X and k_Y eigenvectors. At least one of the spectra is unchanged.
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. At least one spectrum is unchanged.
     """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)

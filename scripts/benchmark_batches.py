@@ -10,8 +10,8 @@ turns in one process:
 - `jax.vmap` with several batch sizes;
 - `jaxsmw.refine_pairs`, the function for users. Its time includes the transfer of initial maps and results.
 
-The lower bound is the time of the matrix products of all iterations, in full float32 precision. The table also
-has the temporary memory of each compiled program, which excludes the memory of the program's arguments.
+The lower bound is the time of the matrix products of all iterations, in full float32 precision. The table
+also has the temporary memory of each compiled program, which excludes the memory of the program's arguments.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def main() -> None:
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
     batch = x, y, jnp.stack(initial_maps)
 
-    # These are the matrix products of one iteration, in batches of pairs. Only the maximum of each column is kept.
+    # These are the matrix products of one iteration, in batches of pairs. Only the maximum of each column is
+    # kept.
     @jax.jit
     def products(a: Array, b: Array) -> Array:
         return lax.map(

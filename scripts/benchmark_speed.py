@@ -6,8 +6,8 @@
   sizes. The candidates are exhaustive search, search in patches, refinement on samples, and a plain argmin
   over stored distances. The lower bound is the time of three matrix products (m x k) (k x n), in the fastest
   of several implementations.
-- `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert `eigsh`
-  with default settings. The note above the table states the errors of the approximate eigenvalues.
+- `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert
+  `eigsh` with default settings. The note above the table states the errors of the approximate eigenvalues.
 - `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
   compared with the time to compute one eigenbasis.
 - `stages`: the times of other computations on the host for one shape, such as SHOT and samples.
@@ -15,8 +15,8 @@
   cached compiled programs.
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
-- `scale`: the time from two mesh files of up to a million vertices to the refined map. Each size runs in a new
-  process. The table has times, peak memory, errors, and the exponents with which time and memory grow.
+- `scale`: the time from two mesh files of up to a million vertices to the refined map. Each size runs in a
+  new process. The table has times, peak memory, errors, and the exponents with which time and memory grow.
 
 The candidates of a comparison run in turns in one process, so other load on the machine affects all
 candidates. Each ratio compares two medians. The shapes are procedural creatures. To obtain the large shapes,
@@ -130,7 +130,7 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table with the seconds of each candidate, and the ratio to the seconds of the candidate `of`."""
+    """Return a table of the seconds of each candidate, and of their ratio to those of the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
@@ -238,9 +238,9 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
         excess = ours("approximate")[1:] / ours("exact")[1:] - 1
         yield (
             f"Eigenbasis, {len(mesh.vertices)} vertices",
-            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the assembly of the Laplacian "
-            f"and a check of the result. Approximate eigenvalues are {excess.mean():.2%} too large on average, "
-            f"and at most {excess.max():.2%} too large.",
+            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the assembly of the "
+            f"Laplacian and a check of the result. Approximate eigenvalues are {excess.mean():.2%} too large "
+            f"on average, and at most {excess.max():.2%} too large.",
             compared(seconds, "SciPy's eigsh"),
             {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
         )
@@ -272,7 +272,8 @@ def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
         m, n = (len(mesh.vertices) for mesh in meshes)
         yield (
             f"Eigenbases side by side, {m} and {n} vertices",
-            f"Wall-clock time of {EIGENVECTORS} eigenpairs for each shape, with one BLAS thread for each shape.",
+            f"Wall-clock time of {EIGENVECTORS} eigenpairs for each shape, with one BLAS thread for each "
+            "shape.",
             compared(seconds, "one"),
             {"vertices": [m, n], "seconds": seconds},
         )
@@ -424,8 +425,8 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
     """Split the longest edges of a mesh until there are `number_of_vertices`, and add noise to the positions.
 
-    The standard deviation of the noise is 10 % of the mean edge length. The given vertices keep their numbers.
-    A mesh that already has enough vertices gets no noise.
+    The standard deviation of the noise is 10 % of the mean edge length. The given vertices keep their
+    numbers. A mesh that already has enough vertices gets no noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -493,13 +494,13 @@ def matched_from_files(
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
     """Match two mesh files, and measure the stages.
 
-    **Returns:** A list with the name, the seconds and the peak memory in GiB of each stage, and a list with the
-    initial map and the refined map.
+    **Returns:** A list with the name, the seconds and the peak memory in GiB of each stage, and a list with
+    the initial map and the refined map.
     """
     stages = [("start", time.perf_counter(), 0.0)]
 
     class Watch(logging.Handler):
-        """Records the time of each log message. A message marks the end of one stage and the start of the next."""
+        """Records the times of log messages. A message marks the end of a stage and the start of the next."""
 
         def emit(self, record: logging.LogRecord) -> None:
             if not record.args:  # messages with arguments report results and start no stage
@@ -557,8 +558,8 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
         rows.append(["exponent", *stages, total, memory, "", ""])
     return (
         f"Scale, {preset}",
-        f"Times of the preset {preset} from two PLY files to the map, including compilation. The peak memory is "
-        "the memory of the whole process. The errors are mean geodesic errors x10^-3.",
+        f"Times of the preset {preset} from two PLY files to the map, including compilation. The peak memory "
+        "is the memory of the whole process. The errors are mean geodesic errors x10^-3.",
         [["vertices", *columns], *rows],
         {"measured": measured},
     )
@@ -572,7 +573,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     truth = pair_with_truth(options)
     missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
     if missing:
-        print(f"\npeers: {' and '.join(missing)} not installed and left out: run pip install 'jaxsmw[peers]'.")
+        print(f"\npeers: {' and '.join(missing)} not installed: install with pip install 'jaxsmw[peers]'.")
     with tempfile.TemporaryDirectory() as directory:
         files = [str(Path(directory) / f"{side}.off") for side in range(2)]
         for file, mesh in zip(files, truth.meshes, strict=True):
@@ -620,8 +621,8 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     yield (
         f"Peers, {m} x {n} vertices",
         "Times are medians of runs in one process. Only the first time includes compilation. Our rows use "
-        f"k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. Rows from our start begin with our initial "
-        "map, and leave out the time to compute this map.",
+        f"k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. Rows from our start begin with our "
+        "initial map, and leave out the time to compute this map.",
         table,
         {"measured": measured},
     )
@@ -641,7 +642,7 @@ def ours_from_files(
 
 @cache
 def our_initial_map(*files: str) -> np.ndarray:
-    """Return the initial map of `match`. A cache excludes its computation from the times of other libraries."""
+    """Return the initial map of `match`. The cache keeps its time out of the times of other libraries."""
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 

@@ -5,12 +5,12 @@
 
 The script draws pairs at random from each data set (see `docs/datasets.md`) and prints three tables:
 
-- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. It states
-  the rank correlation of both errors and the share of gross errors. A gross error exceeds 0.1 times the square
-  root of the area. The last column states how many of the gross errors belong to the 10 % of the vertices with
-  the largest expected errors.
-- The second table divides the vertices of all pairs into ten groups of equal size by expected error, and states
-  the true errors of each group.
+- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. It
+  states the rank correlation of both errors and the share of gross errors. A gross error exceeds 0.1 times
+  the square root of the area. The last column states how many of the gross errors belong to the 10 % of the
+  vertices with the largest expected errors.
+- The second table divides the vertices of all pairs into ten groups of equal size by expected error, and
+  states the true errors of each group.
 - The third table states for how many pairs a score is better for the result than for a mirrored map. It needs
   the preset `accurate`, and covers only full shapes whose mirrored ground truth consists of vertices. The
   stages after the first compute the mirrored map from the mirrored ground truth, without repair. The
@@ -120,7 +120,8 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
             ]
         )
     yield (
-        "Errors x 10⁻³ √area. The last column is the share of all gross errors that belong to the 10 % of each "
+        "Errors x 10⁻³ √area. The last column is the share of all gross errors that belong to the 10 % of "
+        "each "
         "pair's vertices with the largest expected errors.\n\n" + markdown(rows)
     )
 
@@ -152,14 +153,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
-    parser.add_argument("--pairs", metavar="N", default="20", help="number of pairs from each data set (default: 20)")
+    parser.add_argument(
+        "--pairs", metavar="N", default="20", help="number of pairs from each data set (default: 20)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     parser.add_argument(
-        "--preset", choices=PRESETS, default="accurate", help="preset that matches the pairs (default: accurate)"
+        "--preset",
+        choices=PRESETS,
+        default="accurate",
+        help="preset that matches the pairs (default: accurate)",
     )
-    parser.add_argument(
-        "--output", metavar="FILE.md", type=Path, help="also write the tables to this file"
-    )
+    parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # hides warnings about the quality of each mesh
 

@@ -4,9 +4,9 @@
     python scripts/draw_documentation.py [DATA_DIRECTORY]
 
 The script runs the code of the tutorial to draw the tutorial's pictures. The failure cases use procedural
-shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes: a pair
-of SHREC'16 topology (`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The script
-takes several minutes.
+shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes: a
+pair of SHREC'16 topology (`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The
+script takes several minutes.
 """
 
 import argparse
@@ -33,8 +33,8 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# With dithering, this number of colours is enough for smoothly coloured bodies. It reduces the size of the files
-# to a third.
+# With dithering, this number of colours is enough for smoothly coloured bodies. It reduces the size of the
+# files to a third.
 COLORS = 256
 
 
@@ -93,7 +93,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Returns a body with five equal hanging arms, and the point of the unit sphere for each vertex (n, 3)."""
+    """Returns a body with five equal hanging arms, and for each vertex a point of the unit sphere (n, 3)."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)

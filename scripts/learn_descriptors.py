@@ -6,9 +6,9 @@
 The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). A `DescriptorNetwork` computes descriptors
-of vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` computes a functional map and
-a soft map from the descriptors of two shapes. Gradients pass through the layer and the network. Each step of
-Adam (optax) uses one pair of the first five people of FAUST. The script trains one network with the loss
+of vertices from SHOT and the wave kernel signature. A `WaveletPreservationLayer` computes a functional map
+and a soft map from the descriptors of two shapes. Gradients pass through the layer and the network. Each step
+of Adam (optax) uses one pair of the first five people of FAUST. The script trains one network with the loss
 `labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
 The script then tests both networks on pairs of the other people and of TOSCA. The preset `paper` refines each
@@ -120,9 +120,9 @@ class WaveletBlock(eqx.Module):
     """A residual block that combines the features of each vertex with features of its neighbourhood.
 
     The block filters every channel on the surface. The filter of a channel is a weighted sum of the squared
-    filters of a Meyer frame, with learned weights. At each vertex, two dense layers take the normalised and the
-    filtered features, and the block adds the output of these layers to the features. The result does not depend
-    on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
+    filters of a Meyer frame, with learned weights. At each vertex, two dense layers take the normalised and
+    the filtered features, and the block adds the output of these layers to the features. The result does not
+    depend on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
     """
 
     shares: Float[Array, "filters width"]
@@ -152,8 +152,8 @@ class WaveletBlock(eqx.Module):
 class DescriptorNetwork(eqx.Module):
     """A network that computes descriptors of the n vertices of a shape.
 
-    The spectrum of the shape must contain SHOT descriptors (`Spectrum.descriptors`). `described` computes such
-    a spectrum.
+    The spectrum of the shape must contain SHOT descriptors (`Spectrum.descriptors`). `described` computes
+    such a spectrum.
 
     **Raises:** `ValueError` if the spectrum has no descriptors, or descriptors of another dimension.
     """
@@ -197,7 +197,7 @@ def layer() -> WaveletPreservationLayer:
 
 
 class Shape(NamedTuple):
-    """A shape for training: its spectrum with SHOT descriptors, and its positions, both at s sampled vertices."""
+    """A shape for training: the spectrum with SHOT descriptors, and the positions, at s sampled vertices."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
@@ -237,7 +237,7 @@ def prepared(pair: DataPair) -> TrainingPair:
 
 
 def described(mesh: Mesh) -> Spectrum:
-    """Return the input of a `DescriptorNetwork`: a mesh's padded spectrum with SHOT descriptors, for area 1."""
+    """Return the padded spectrum of a mesh of area 1 with SHOT descriptors, for a `DescriptorNetwork`."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
     return padded(spectrum.with_descriptors(jnp.asarray(shot)))
@@ -251,8 +251,8 @@ class Matched(NamedTuple):
     - `by_descriptors`: the soft map between the descriptors.
     - `by_layer`: the soft map that the layer recovers from its functional map.
     - `functional_map`: the functional map of the layer.
-    - `energy`: the wavelet-preservation energy of the functional map under the soft map `by_layer`, divided by
-      the number of eigenvectors.
+    - `energy`: the wavelet-preservation energy of the functional map under the soft map `by_layer`, divided
+      by the number of eigenvectors.
     """
 
     by_descriptors: SoftMap | SparseSoftMap
@@ -273,7 +273,7 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
 
 
 def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
-    """Return the loss `labels`: a weighted sum of the distances of both soft maps of `Matched` from the truth."""
+    """Return the loss `labels`: a weighted sum of the errors of both soft maps of `Matched`."""
     found = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
         root_mean_square(soft_map.pull_back, pair.y.positions, pair.truth)
@@ -372,10 +372,11 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
     """Yield the parts of `summary.md`."""
     yield "# Learned descriptors\n"
     yield (
-        f"Training takes {steps} steps of Adam for each loss. Each step uses one pair with {SAMPLES} samples per "
-        "shape. The numbers are mean geodesic errors x 10⁻³ √area. The initial map takes nearest neighbours of "
-        f"descriptors. The preset `paper` (k = {EIGENVECTORS}, {ITERATIONS} iterations) refines this map. "
-        "Parentheses contain the mean paired difference from SHOT with its 95 % bootstrap interval.\n"
+        f"Training takes {steps} steps of Adam for each loss. Each step uses one pair with {SAMPLES} samples "
+        "per shape. The numbers are mean geodesic errors x 10⁻³ √area. The initial map takes nearest "
+        f"neighbours of descriptors. The preset `paper` (k = {EIGENVECTORS}, {ITERATIONS} iterations) "
+        "refines this map. Parentheses contain the mean paired difference from SHOT with its 95 % bootstrap "
+        "interval.\n"
     )
     first_pair = next(iter(measured.values()))[0]
     names = [name.removesuffix(START) for name in first_pair if name.endswith(START)]

@@ -5,10 +5,10 @@
 
 The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
-DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which is
-a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step of
-Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on samples
-of both shapes. The script trains one frame with each of these losses:
+DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which
+is a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step
+of Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on
+samples of both shapes. The script trains one frame with each of these losses:
 
 - `labels`: the distance between matches and the ground truth;
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
@@ -17,10 +17,11 @@ of both shapes. The script trains one frame with each of these losses:
 The distance of a point is a root mean square, weighted by the shares of the soft maps.
 
 The script then tests the frames on pairs of the five other people and of TOSCA. `jaxsmw.refine` refines each
-pair with the Meyer frame and with both trained frames, from the same initial map. The script writes `summary.md`
-with the errors, and `frames.png` with the filters and losses. It also writes the logits of the trained frames,
-`Warped(SoftmaxFrame(logits), Power())`, to `frame_labels.npz` and `frame_cycles.npz`. After an interruption, the
-same command continues from the saved state.
+pair with the Meyer frame and with both trained frames, from the same initial map. The script writes
+`summary.md` with the errors, and `frames.png` with the filters and losses. It also writes the logits of the
+trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
+`Warped(SoftmaxFrame(logits), Power())`. After an interruption, the same command continues from the saved
+state.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ class Sampled(NamedTuple):
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of both shapes at the samples.
-    - `positions_x`, `positions_y`: the positions of the samples, in units of the square root of the shape's area.
+    - `positions_x`, `positions_y`: the positions of the samples, in units of the square root of the shape's
+      area.
     - `initial_map`: the initial map from the samples of X to the samples of Y.
     - `reverse_initial_map`: the initial map from the samples of Y to the samples of X.
     - `truth`: the position of the true match on Y for each sample of X, in the unit of `positions_y`.
@@ -151,7 +153,7 @@ def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
 
 
 def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """Return the loss `cycles`: the mean distance of points of X from their images under both soft maps in turn."""
+    """Return the loss `cycles`: the mean distance from points of X to their images under both soft maps."""
     forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
     return root_mean_square(
@@ -190,10 +192,10 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
     """Yield the parts of `summary.md`."""
     yield "# Learned frames\n"
     yield (
-        f"The frames have {FILTERS} filters and {KNOTS} knots. Training takes {steps} steps of Adam. Refinement "
-        f"uses k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. The numbers are mean geodesic errors "
-        "x 10⁻³ √area. Parentheses contain the mean paired difference from the Meyer frame with its 95 % "
-        "bootstrap interval.\n"
+        f"The frames have {FILTERS} filters and {KNOTS} knots. Training takes {steps} steps of Adam. "
+        f"Refinement uses k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. The numbers are mean "
+        "geodesic errors x 10⁻³ √area. Parentheses contain the mean paired difference from the Meyer frame "
+        "with its 95 % bootstrap interval.\n"
     )
     yield comparison(measured, list(next(iter(measured.values()))[0]), seed)
     yield begun_with + "\n"

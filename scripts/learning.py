@@ -57,7 +57,7 @@ class Data(NamedTuple):
 
 
 def person(shape: str) -> int:
-    """Return the number of the person in a shape. FAUST numbers the ten poses of each person consecutively."""
+    """Return the number of the person of a shape. FAUST numbers the ten poses of a person consecutively."""
     return int(shape.rsplit("_", 1)[1]) // POSES
 
 
@@ -168,9 +168,11 @@ def train(
     - `steps`: the number of steps.
     - `seed`: the seed of the draws.
     - `directory`: an existing directory for the saved state.
-    - `unit`: a function of a prepared pair. Each recorded loss is divided by the value of this function, because
-      losses vary more between pairs than between models. The default None records losses without division.
-    - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence training.
+    - `unit`: a function of a prepared pair. Each recorded loss is divided by the value of this function,
+      because losses vary more between pairs than between models. The default None records losses without
+      division.
+    - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence
+      training.
 
     **Raises:** `InputError` if the saved state is damaged or has other settings; `ArithmeticError` if a loss
     is not finite.
@@ -249,8 +251,8 @@ def _evaluate(
 def reading(path: Path) -> Iterator[BinaryIO]:
     """Open a file of arrays that equinox wrote. The body of the `with` statement must read the whole file.
 
-    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if the body leaves data
-    unread.
+    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if the body leaves
+    data unread.
     """
     try:
         with open(path, "rb") as stream:
@@ -306,8 +308,8 @@ def measure(
     """Measure random pairs of the other people and of TOSCA.
 
     The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the file
-    already contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset of
-    the pairs that a larger number selects.
+    already contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset
+    of the pairs that a larger number selects.
 
     **Arguments:**
 
@@ -357,7 +359,9 @@ def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentPar
     """Return the parser for the arguments of a training script."""
     made = argparse.ArgumentParser(description=description)
     made.add_argument("data", type=Path, help="directory that contains faust_r and tosca_r")
-    made.add_argument("--output", type=Path, default=Path(output), help=f"output directory (default: {output})")
+    made.add_argument(
+        "--output", type=Path, default=Path(output), help=f"output directory (default: {output})"
+    )
     made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
     made.add_argument(
         "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
@@ -392,8 +396,8 @@ class Run(NamedTuple):
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
     """Read the arguments, open the data, and reserve the output directory for this process.
 
-    `jaxsmw.evaluation.journal.claimed_directory` writes the provenance of the results to `provenance.json` in the
-    output directory. Bad input and interruptions end the process with a message of one sentence.
+    `jaxsmw.evaluation.journal.claimed_directory` writes the provenance of the results to `provenance.json` in
+    the output directory. Bad input and interruptions end the process with a message of one sentence.
 
     **Arguments:**
 

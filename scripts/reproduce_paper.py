@@ -13,12 +13,12 @@ experiment uses only the data sets that suit this experiment:
 - `fig9`: targets with other triangulations and resolutions, and other initial maps;
 - `nonisometric`: pairs of different classes, compared with published results. The initial maps are published
   maps if the data set contains any, and SHOT otherwise;
-- `settings`: MWP and the other methods with settings that differ from the published settings, on the data sets
-  of `table1`.
+- `settings`: MWP and the other methods with settings that differ from the published settings, on the data
+  sets of `table1`.
 
-For each run, the script creates a directory with the same files as `jaxsmw benchmark` in the output directory.
-It writes all tables to `README.md`. After an interruption, the same command continues from the saved results.
-With `--quick`, the script takes minutes on shapes with 5000 vertices.
+For each run, the script creates a directory with the same files as `jaxsmw benchmark` in the output
+directory. It writes all tables to `README.md`. After an interruption, the same command continues from the
+saved results. With `--quick`, the script takes minutes on shapes with 5000 vertices.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
 
 
 def is_isometric(data_set: DataSet) -> bool:
-    """Returns whether each pair of a data set consists of two full shapes of one class without topological noise."""
+    """Returns whether all pairs consist of two full shapes of one class without topological noise."""
     special = ("SHREC'16 partial", "SHREC'16 topology")
     within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
     return within and data_set.layout not in special
@@ -153,8 +153,8 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # Published results come from initial maps in another directory. The name of the directory with the results
-        # begins with the name of the directory with these initial maps.
+        # Published results come from initial maps in another directory. The name of the directory with the
+        # results begins with the name of the directory with these initial maps.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -233,7 +233,8 @@ def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# A new mesh, and for each of its vertices the old vertex at the same position, or -1 if there is no such vertex.
+# A new mesh, and for each of its vertices the old vertex at the same position, or -1 if there is no such
+# vertex.
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 
@@ -333,7 +334,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
-    parser.add_argument("--quick", action="store_true", help="use only two pairs, three methods and 200 points")
+    parser.add_argument(
+        "--quick", action="store_true", help="use only two pairs, three methods and 200 points"
+    )
     options = parser.parse_args()
     if options.quick:
         options.pairs = min(options.pairs or 2, 2)

@@ -409,6 +409,6 @@ def test_too_little_memory_is_reported_in_one_sentence(run, pair, tmp_path, monk
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert outcome.code == 1
     assert outcome.errors == (
-        "jaxsmw: this machine has too little memory (Unable to allocate 75.0 GiB): give smaller meshes or "
-        "smaller numbers.\n"
+        "jaxsmw: this machine has too little memory (Unable to allocate 75.0 GiB): give smaller meshes, or "
+        "request fewer eigenvectors or samples.\n"
     )

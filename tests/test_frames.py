@@ -174,5 +174,5 @@ def test_responses_of_a_wrong_shape_are_refused(shape):
         def __call__(self, points, eigenvalues):
             return jnp.ones(shape(points))
 
-    with pytest.raises(ValueError, match=r"Misshapen gave responses of shape .* \(filters, 40\) is needed"):
+    with pytest.raises(ValueError, match=r"Misshapen returned responses of shape .* \(filters, 40\) is needed"):
         frame_bounds(Misshapen(), EIGENVALUES)

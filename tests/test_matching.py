@@ -269,7 +269,7 @@ def test_landmarks_are_matched_to_each_other(pair):
             ),
         ),
     ],
-    ids=str,
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
 def test_every_option_has_its_effect(pair, options, is_as_requested):
     mesh_x, mesh_y, _ = pair

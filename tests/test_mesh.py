@@ -160,9 +160,9 @@ def test_cleaning_drops_faces_and_keeps_vertices():
     assert len(mesh.vertices) == 5 and mesh.referenced_vertices.tolist() == [True] * 4 + [False]
     assert mesh.notes == (
         "From afar.",
-        "1 face with a repeated vertex dropped.",
-        "3 faces with the vertices of an earlier face dropped.",
-        "1 unreferenced vertex (in no face) of 5.",
+        "1 face dropped because of a repeated vertex.",
+        "3 faces dropped because of an earlier face with equal vertices.",
+        "1 unreferenced vertex (in no face) among 5 vertices.",
     )
 
 

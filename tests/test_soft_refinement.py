@@ -462,7 +462,7 @@ def test_iterations_must_be_an_integer(pair, loop):
     for other in (2.0, np.float64(2), "2", None):
         with pytest.raises(TypeError, match=f"{loop.__name__} needs a whole number of iterations"):
             loop(x, y, initial_map, iterations=other)
-    with pytest.raises(TypeError, match="known when it is compiled"):
+    with pytest.raises(TypeError, match="known at compile time"):
         jax.jit(lambda number: loop(x, y, initial_map, iterations=number).functional_map)(2)
     for few in (0, np.int64(-1)):
         with pytest.raises(ValueError, match=f"{loop.__name__} needs at least 1 iteration, not {few}"):

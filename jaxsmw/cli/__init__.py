@@ -13,8 +13,8 @@ def main() -> NoReturn:
     The exit code is 0 for success, 2 for bad input and 1 for any other failure. After an interruption
     (Ctrl-C), the signal SIGINT terminates the process.
     """
-    # Interruptions are handled before anything else is imported, because Ctrl-C in an import leaves a
-    # traceback.
+    # The handler of interruptions is installed before all other imports, because Ctrl-C during an import
+    # prints a traceback.
     from jaxsmw.cli.interruption import end_when_interrupted
 
     end_when_interrupted()

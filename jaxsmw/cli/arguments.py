@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and argument types for `argparse`."""
+"""Command-line arguments that several commands share, and argument types for `argparse`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxsmw.errors import InputError
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
-MAP_FORMS = "one target vertex per line, or a .npy file, or a .mat file counted from 1"
+MAP_FORMS = "a text file with one target vertex per line, a .npy file, or a .mat file with vertices from 1"
 
 
 def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int]:
@@ -84,16 +84,17 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         choices=get_args(Laplacian),
         default="auto",
         help="discretization of the Laplacian: robust accepts degenerate triangles and non-manifold edges; "
-        "auto chooses robust for meshes that need it and cotangent for all other meshes (default: "
+        "auto chooses robust for meshes that need it, and cotangent for all other meshes (default: "
         "%(default)s)",
     )
     parser.add_argument(
         "--eigensolver",
         choices=get_args(Eigensolver),
         default="auto",
-        help="method that computes eigenvectors: approximate is fast on large meshes, and on even "
-        "triangles its eigenvalues are accurate to a few tenths of a per cent; if approximate would be "
-        "inaccurate, exact is used with a warning; auto chooses approximate for meshes with at least "
+        help="method that computes eigenvectors: approximate is fast on large meshes, and its eigenvalues "
+        "have errors of a few tenths of a per cent if triangles have similar sizes and shapes; if "
+        "approximate would be inaccurate, a warning is printed and exact is used instead; auto chooses "
+        "approximate for meshes with at least "
         f"{APPROXIMATE_FROM} vertices and exact for smaller meshes (default: %(default)s)",
     )
 
@@ -135,14 +136,14 @@ def add_up(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *names: str) -> None:
-    """Check that no option is given that has no effect without another option.
+    """Refuse options that have no effect because another option is missing.
 
     **Arguments:**
 
     - `options`: the parsed options.
-    - `needed`: the name of the other option in the message.
+    - `needed`: the name of the other option, for the message.
     - `is_given`: whether the other option is given.
-    - `names`: the options that need the other option, as attribute names of `options`.
+    - `names`: the options that have no effect without the other option, as attribute names of `options`.
 
     **Raises:** `InputError` that names the first option without effect.
     """

@@ -11,7 +11,8 @@ from jaxsmw.errors import InputError
 if TYPE_CHECKING:
     from jaxsmw.core.banks import FilterBank
 
-# The class of each bank in `jaxsmw.core.banks`. The first bank is that of the MWP paper.
+# The class name of each filter bank in `jaxsmw.core.banks`. The first filter bank is the bank of the MWP
+# paper.
 BANKS = {
     "meyer": "Meyer",
     "simple-tight": "SimpleTight",
@@ -31,7 +32,8 @@ BANKS = {
 _PAPER_BANK = next(iter(BANKS))
 # Banks whose names have this prefix are warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# Eigenbases have fewer eigenvalues than this number, and more filters than eigenvalues are useless.
+# The largest accepted number of filters. More filters than eigenvalues are useless, and eigenbases have fewer
+# eigenvalues than this number.
 _MOST_FILTERS = 10_000
 
 
@@ -57,7 +59,7 @@ def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
     **Arguments:**
 
     - `name`: a key of `BANKS`; None for the bank of the MWP paper.
-    - `number_of_filters`: the number of filters; None for the default of the bank.
+    - `number_of_filters`: the number of filters; None for the default number of the bank.
 
     **Raises:** `InputError` if the bank cannot have this number of filters.
     """
@@ -84,12 +86,12 @@ def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
 
     from jaxsmw.core.banks import frame_bounds
 
-    # Evenly spaced numbers represent the eigenvalues of a surface, which are nearly evenly spaced. The
-    # function is compiled as a whole, which replaces forty small programs.
+    # The eigenvalues of a surface are nearly evenly spaced, so the bounds are computed for evenly spaced
+    # numbers. `filter_jit` compiles the function as one program, instead of forty small programs.
     lower, upper = map(float, eqx.filter_jit(frame_bounds)(bank, jnp.arange(101.0), over="interval"))
     return None if upper < _TIGHT * lower else (lower, upper)
 
 
-# The bounds of tight frames differ only by rounding errors. The bounds of all other banks differ by a third
-# or more.
+# A frame counts as tight if the upper bound is less than this multiple of the lower bound. The bounds of
+# tight frames differ only by rounding errors. The bounds of all other banks differ by a third or more.
 _TIGHT = 1.01

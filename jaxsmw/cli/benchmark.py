@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help=f"methods to measure: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if "
         "these libraries are installed; or directories with maps X_Y.map of other programs (default: all "
-        "methods that suit the pairs). cpd takes 30 seconds per pair, bcicp takes 15 seconds per pair. pfm "
-        "matches partial shapes only",
+        "methods that suit the pairs). cpd takes 30 seconds per pair, and bcicp takes 15 seconds per pair. "
+        "pfm matches partial shapes only",
     )
     parser.add_argument(
         "--pairs",
@@ -88,10 +88,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match and measure all pairs without results, then write and print the tables of all pairs.
+    """Match and measure all pairs that have no results yet, then write and print the tables of all pairs.
 
-    **Raises:** `InputError` if an option cannot be used, a needed package is not installed, or a pair cannot
-    be measured. All other results are written first.
+    **Raises:** `InputError` if an option cannot be used, if a needed package is not installed, or if a pair
+    cannot be measured. The results of all other pairs are written before the error is raised.
     """
     from jaxsmw.report.figures import check_drawable
 
@@ -102,7 +102,8 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.evaluation.measurement import Settings
     except ModuleNotFoundError as error:
         raise InputError(
-            f"benchmarks need {error.name}, which is not installed: pip install 'jaxsmw[benchmark]'"
+            f"benchmarks need {error.name}, which is not installed: install it with pip install "
+            "'jaxsmw[benchmark]'."
         ) from error
     from jaxsmw.evaluation.datasets import open_data_set
     from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods

@@ -1,4 +1,4 @@
-"""Final steps after a match: measurement of errors, report, and printed times."""
+"""The final steps of a command that matches: the measurement of errors, the report and the printed times."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def measure_match(
 
     - `correspondence`: the result of `match`.
     - `truth`: the ground truth, or None.
-    - `settings`: the options of `jaxsmw.geodesic_error`; see `evaluation_settings`.
+    - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
     - `stopwatch`: the stopwatch of the command.
-    - `others`: further maps by name.
+    - `others`: maps by name, which are measured in addition to the initial map and the refined map.
 
     **Returns:** The errors by the names of the maps: `initial`, the names in `others`, and `refined`. The
-    result is empty if there is no ground truth.
+    dictionary is empty if there is no ground truth.
     """
     if truth is None:
         return {}

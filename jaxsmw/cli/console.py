@@ -1,4 +1,4 @@
-"""The output of commands: results on standard output, all messages on standard error."""
+"""The output of commands, which print results on standard output and all messages on standard error."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python flushes the buffer again at exit. Without this redirection, the same error would be reported
-        # again.
+        # Python flushes the buffer again at exit. Without this redirection to the null device, Python would
+        # then report the same error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise
@@ -64,7 +64,7 @@ def report_progress(message: str) -> None:
 
 
 def log_to_console(*, quiet: bool) -> None:
-    """Print the library's log messages on standard error; with `quiet`, only warnings and errors."""
+    """Print the library's log messages on standard error. With `quiet`, print only warnings and errors."""
     _logger.handlers, _logger.propagate = [_Handler()], False
     _logger.setLevel(logging.WARNING if quiet else logging.INFO)
 
@@ -83,7 +83,10 @@ class Stopwatch:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Return a context manager that measures its block as a step. Times under the same name are added."""
+        """Return a context manager that measures the time of its block, as a step with the given name.
+
+        If several steps have the same name, their times are added up.
+        """
         began = time.perf_counter()
         yield
         self.add({name: time.perf_counter() - began})

@@ -14,7 +14,7 @@ from jaxsmw.cli.outputs import check_outputs, report_written
 HELP = "generate a creature in two poses, match the poses and write a report"
 
 _FILES = ("source.off", "target.off", "truth.baryc_gt", "map.txt")
-# A creature with a tenth of this number of vertices takes 0.6 GiB of memory.
+# The largest accepted number of vertices. A creature with 100 000 vertices takes 0.6 GiB of memory.
 _MOST_VERTICES = 1_000_000
 
 
@@ -39,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=whole_number(0),
         default=0,
-        help="seed of the creature; different seeds give different individuals (default: %(default)s)",
+        help="seed of the creature; creatures with different seeds have different shapes (default: "
+        "%(default)s)",
     )
     add_method(parser)
 

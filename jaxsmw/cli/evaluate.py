@@ -35,19 +35,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps to measure: {MAP_FORMS}")
     add_ground_truth(parser, required=True, purpose="true map")
     parser.add_argument(
-        "--output", metavar="FILE", type=path, help="write the errors and their quality curves here, as JSON"
+        "--output", metavar="FILE", type=path, help="write the errors and quality curves to this JSON file"
     )
     parser.add_argument(
         "--figure",
         metavar="FILE",
         type=path,
-        help="draw the correspondence quality curves here (.png, .pdf or .svg)",
+        help="draw the correspondence quality curves to this file (.png, .pdf or .svg)",
     )
     parser.add_argument(
         "--page",
         metavar="FILE.html",
         type=path,
-        help="write an interactive page here, which shows one map at a time with its errors",
+        help="write an interactive page to this file; the page shows one map at a time with its errors",
     )
     add_partial(parser)
     add_up(parser)

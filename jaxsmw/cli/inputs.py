@@ -1,4 +1,4 @@
-"""The files that commands read."""
+"""Functions that read the input files of commands."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def read_mesh_file(file: str, *, weld: bool) -> Mesh:
 
 
 def describe_mesh(mesh: Mesh) -> list[str]:
-    """Return sentences that describe a mesh: the notes of its reader, its size, and its defects."""
+    """Return sentences that describe a mesh: notes on its file, its size, and its defects."""
     from jaxsmw.geometry.mesh import diagnose
 
     return [*mesh.notes, *diagnose(mesh).sentences()]
@@ -41,7 +41,7 @@ def describe_mesh(mesh: Mesh) -> list[str]:
 def read_truth(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> GroundTruth:
-    """Read the ground truth of a pair; see `jaxsmw.read_ground_truth`.
+    """Read the ground truth of a pair with `jaxsmw.read_ground_truth`.
 
     **Raises:** `InputError` if the files cannot be read or do not fit the meshes.
     """
@@ -55,9 +55,9 @@ def read_truth(
 def read_maps(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Read pointwise maps X -> Y; see `jaxsmw.read_pointwise_map`.
+    """Read pointwise maps X -> Y with `jaxsmw.read_pointwise_map`.
 
-    **Returns:** The maps (m,), 0-based, by the names of their files.
+    **Returns:** The maps (m,), as 0-based vertices of Y, by the names of their files.
 
     **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
     """
@@ -95,7 +95,7 @@ def initial_map_file(init: str) -> str | None:
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
     """Return the argument `init` of `jaxsmw.match` for a value of `--init`.
 
-    **Returns:** The name of an initial map, landmarks (l, 2), or a pointwise map (m,), both 0-based.
+    **Returns:** The name of an initial map, landmarks (l, 2), or a pointwise map (m,). Vertices are 0-based.
 
     **Raises:** `InputError` if the file cannot be read or does not fit the meshes.
     """

@@ -1,4 +1,4 @@
-"""Termination on Ctrl-C: the process ends at once, prints one line and leaves no unfinished files.
+"""Termination on Ctrl-C: the process ends immediately, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
 code returns to Python. Functions that run during garbage collection suppress the exception, and imports of
@@ -20,8 +20,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# The main thread ends the process as soon as it runs Python code. If it does not do so within this number of
-# seconds, the second thread ends the process.
+# The main thread ends the process as soon as it runs Python code. If the main thread does not run Python code
+# within this number of seconds, the second thread ends the process.
 _PATIENCE = 0.2
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
@@ -63,8 +63,8 @@ def quiet_children() -> Iterator[None]:
 
     The context manager applies to processes that this thread starts in the block. A terminal also sends
     SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the processes inherit this
-    setting. Another thread of this process receives the signal. Python's resource tracker, which removes
-    leaked semaphores, prints no warning.
+    setting. Another thread of this process receives the signal. The context manager also silences the warning
+    with which Python's resource tracker reports leaked semaphores.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
@@ -77,10 +77,11 @@ def quiet_children() -> Iterator[None]:
 
 def _wait_for_signal(reading: int) -> None:
     while os.read(reading, 1) != bytes([signal.SIGINT]):
-        pass  # another signal
+        pass  # ignore other signals
     time.sleep(_PATIENCE)
     _end()
-    # The main thread has begun to end the process but is stuck, for example because its message is not read.
+    # The main thread has begun to end the process but is stuck, for example because no process reads its
+    # message from a pipe.
     time.sleep(1)
     _die()
 
@@ -91,7 +92,8 @@ def _end(*_: object) -> None:
     console = -1
     with suppress(OSError):  # standard error may be closed
         console = os.dup(2)
-        # Other threads still run for a moment, and their output would be mixed with the message.
+        # Other threads still run for a moment. Their output is discarded, because it would be mixed with the
+        # message.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
@@ -115,7 +117,7 @@ def _die() -> None:
     with suppress(Exception):
         try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        except ValueError:  # refused outside of the main thread
+        except ValueError:  # `signal.signal` is allowed only in the main thread
             import ctypes
 
             ctypes.pythonapi.PyOS_setsig(signal.SIGINT, signal.SIG_DFL)

@@ -37,44 +37,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         type=path,
         required=True,
-        help="write the map here: the target vertex of each source vertex, one per line, counted from 0; "
-        "with the suffix .npy as an array for numpy.load, counted from 0; with the suffix .mat as the "
-        "column T12 for MATLAB, counted from 1",
+        help="write the map to this file: the target vertex of each source vertex, one per line, counted "
+        "from 0; if the suffix is .npy, a NumPy array, counted from 0; if the suffix is .mat, the column "
+        "vector T12 for MATLAB, counted from 1",
     )
     parser.add_argument(
         "--surface-points",
         metavar="FILE.baryc_gt",
         type=path,
-        help="write a point on the target surface for each source vertex: a face, counted from 1, and the "
-        "barycentric weights of its corners",
+        help="write a point on the target surface for each source vertex to this file: a face, counted from "
+        "1, and the barycentric weights of the face's corners",
     )
     parser.add_argument(
         "--expected-error",
         metavar="FILE",
         type=path,
-        help="write the expected error of each match, one per line: an estimate of the geodesic error "
-        "without ground truth, divided by the square root of the target's area",
+        help="write the expected error of each match to this file, one per line: an estimate of the geodesic "
+        "error without ground truth, divided by the square root of the target's area",
     )
     parser.add_argument(
         "--one-to-one",
         metavar="FILE",
         type=path,
-        help="write a map in which no two source vertices share a target vertex, in the formats of "
-        "--output; use this map for meshes with the same triangulation, because it is much less accurate "
-        "for other meshes",
+        help="write a map in which no two source vertices share a target vertex to this file, in the formats "
+        "of --output; use this map only for meshes with the same triangulation, because it is much less "
+        "accurate for other meshes",
     )
     parser.add_argument(
         "--texture",
         metavar="DIR",
         type=path,
-        help="write both meshes here as OBJ files with a common texture, which is projected onto the "
-        "target and transferred to the source by the map",
+        help="write both meshes to this directory as OBJ files with a common texture, which is projected "
+        "onto the target and transferred to the source by the map",
     )
     parser.add_argument(
-        "--report", metavar="DIR", type=path, help="write pictures, an interactive 3D page and a summary here"
+        "--report",
+        metavar="DIR",
+        type=path,
+        help="write pictures, an interactive 3D page and a summary to this directory",
     )
     add_up(parser)
-    add_ground_truth(parser, required=False, purpose="true map; measure errors before and after refinement")
+    add_ground_truth(parser, required=False, purpose="true map, with which errors before and after refinement are measured")
     add_partial(parser)
     add_method(parser)
     add_weld(parser)
@@ -112,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check options and outputs before the long computation, and import the libraries."""
+    """Check the options and outputs before the long computation, and import the libraries."""
     init_file = initial_map_file(options.init)
     check_preset(options)
     check_evaluation(options)

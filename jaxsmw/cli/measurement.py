@@ -31,8 +31,9 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
         type=path,
         nargs="+",
         required=required,
-        help=f"{purpose}; accepted files: target vertices, one per line; or two .vts files, for the source "
-        "and for the target; or a .baryc_gt file; or a file with a source and a target vertex per line",
+        help=f"{purpose}; accepted files: a file with one target vertex per line; two .vts files, the first "
+        "for the source and the second for the target; a .baryc_gt file; or a file with a source and a "
+        "target vertex per line",
     )
 
 
@@ -52,13 +53,13 @@ def add_evaluation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--geodesics",
         choices=get_args(GeodesicMethod),
-        help="method for geodesic distances: strips is much faster than exact, and nearly always within "
-        f"0.5 %% of it (default: {default})",
+        help="method for geodesic distances: strips is much faster than exact, and its distances nearly "
+        f"always differ from the exact distances by less than 0.5 %% (default: {default})",
     )
 
 
 def check_evaluation(options: argparse.Namespace) -> None:
-    """Check that no option of `add_evaluation` is given that has no effect.
+    """Refuse options of `add_evaluation` that have no effect because another option is missing.
 
     **Raises:** `InputError` that names the first option without effect.
     """
@@ -87,9 +88,9 @@ def measure_errors(
     - `mesh_y`: the target Y.
     - `maps`: maps X -> Y by name, each as vertices of Y (m,) or m `SurfacePoints` on Y.
     - `truth`: the ground truth.
-    - `settings`: the result of `evaluation_settings`.
+    - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
 
-    **Returns:** The errors by the names of the maps.
+    **Returns:** The geodesic errors by the names of the maps.
     """
     from jaxsmw.evaluation.metrics import geodesic_error
 

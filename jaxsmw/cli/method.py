@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jaxsmw.matching import Correspondence
     from jaxsmw.stage import Stage
 
-# The class and the arguments of each solution. The first solution is that of the MWP paper.
+# The class name and the arguments of each solution. The first solution is the solution of the MWP paper.
 _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "filtering": ("Filtering", ()),
     "least-squares": ("LeastSquares", ()),
@@ -60,16 +60,18 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         type=initial_map,
         default=DEFAULT_INITIAL_MAP,
         help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE or map:FILE (default: "
-        "%(default)s). shot, wks, hks and wavelet match nearest neighbours in this descriptor. functional "
-        "computes a functional map that preserves shot. A landmarks file has a source and a target vertex "
-        "per line. Only shot, functional and landmarks distinguish left from right",
+        "%(default)s). shot, wks, hks and wavelet match each source vertex to the target vertex with the "
+        "most similar descriptor of this kind. functional computes a functional map that preserves SHOT "
+        "descriptors. A landmarks file has a source and a target vertex per line. Of these initial maps, "
+        "only shot, functional and landmarks distinguish left from right",
     )
     group.add_argument(
         "--preset",
         choices=get_args(PresetName),
         help="method of refinement: paper is the method of the MWP paper; fast is the same method on "
         "samples; accurate has more stages and repairs maps, and its refinement takes three to four times as "
-        f"long (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is given)",
+        f"long as that of paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
+        "given)",
     )
     group.add_argument(
         "--precision",
@@ -94,9 +96,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--solution",
         choices=tuple(_SOLUTIONS),
         help="computation of the functional map: filtering is meant for banks that are tight frames; "
-        "least-squares is exact for all banks; least-squares-frobenius is the same with equal weights of all "
-        "vertices; regularized adds commutativity with the Laplacian and orthogonality (default: "
-        f"{_PAPER_SOLUTION})",
+        "least-squares is exact for all banks; least-squares-frobenius is exact too, but gives all vertices "
+        "the same weight; regularized is least-squares with additional terms for commutativity with the "
+        f"Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
         "--iterations",
@@ -108,14 +110,14 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--samples",
         metavar="N",
         type=whole_number(1),
-        help="number of samples per shape on which to iterate; the last step searches all vertices "
-        "(default: iterate on all vertices)",
+        help="number of samples per shape on which the refiner iterates; the last step matches all vertices "
+        "(default: the refiner iterates on all vertices)",
     )
     default_search, *_ = get_args(Search)
     group.add_argument(
         "--search",
         choices=get_args(Search),
-        help="search for nearest neighbours: exhaustive and patches give the same result, and patches is "
+        help="method of nearest-neighbour search: exhaustive and patches give the same result; patches is "
         f"faster on large meshes; auto chooses the faster search (default: {default_search})",
     )
     group.add_argument(
@@ -127,9 +129,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Check that options that change the paper's method are not combined with another preset.
+    """Check that options that change the MWP paper's method are not combined with another preset.
 
-    **Raises:** `InputError` that names the first such option.
+    **Raises:** `InputError` that names the first option that changes the method.
     """
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
@@ -141,7 +143,8 @@ def check_preset(options: argparse.Namespace) -> None:
 def preset_name(options: argparse.Namespace) -> PresetName:
     """Return the name of the preset to use.
 
-    This is the given preset, `paper` if an option changes the paper's method, or else the default preset.
+    If no preset is given, the preset is `paper` if an option changes the paper's method. Otherwise it is the
+    default preset.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
@@ -168,7 +171,8 @@ def match_meshes(
     - `mesh_x`, `mesh_y`: the source X and the target Y.
     - `stopwatch`: the stopwatch of the command, to which the times of the match are added.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
-    - `index_base`: the index of the first vertex in a file of `--init`; None for the default of the file.
+    - `index_base`: the index of the first vertex in a file of `--init`, 0 or 1; None for the default of the
+      file's format.
 
     **Raises:** `InputError` if an option does not fit the meshes. `ArithmeticError` if a computation fails.
     """
@@ -197,7 +201,7 @@ def match_meshes(
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
-    """Return a stage with the paper's method and the given changes."""
+    """Return a stage with the MWP paper's method, changed by the given options."""
     from jaxsmw.stage import Stage
 
     settings: dict[str, Any] = {

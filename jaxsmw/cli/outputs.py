@@ -117,17 +117,17 @@ def write_comparison_page(
     partial: bool,
     up: Axis | None,
 ) -> None:
-    """Write an interactive page that compares maps; see `jaxsmw.report.summary.write_comparison`.
+    """Write an interactive page that compares maps with `jaxsmw.report.summary.write_comparison`.
 
-    The page labels each map with its file name without suffix, its file name, or its full path: the shortest
-    of these for which the labels are unique.
+    The page labels each map with its file name without suffix. If two maps would have the same label, the
+    page uses the file names with suffix, or else the full paths.
 
     **Arguments:**
 
     - `path`: the page to write.
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
     - `maps`: maps X -> Y (m,), by the paths of their files.
-    - `errors`: the geodesic errors of the maps, by the same paths; may be empty.
+    - `errors`: the geodesic errors of the maps, by the same paths; empty if errors are unknown.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
     - `up`: the axis of the meshes that points up; None to guess the axis.
     """

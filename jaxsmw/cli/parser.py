@@ -26,14 +26,15 @@ class Parser(argparse.ArgumentParser):
     """A parser that prints one sentence for bad arguments and exits with code 2."""
 
     def __init__(self, **settings: Any) -> None:
-        # Abbreviations are not allowed, because a new option with the same beginning would make them
-        # ambiguous.
+        # Abbreviated options are not allowed, because a new option with the same beginning would make an
+        # abbreviation ambiguous.
         super().__init__(allow_abbrev=False, **settings)
 
     def print_help(self, file: Any = None) -> None:
         """Print the help on standard output.
 
-        Unlike in argparse, an error of standard output is raised. The argument `file` is ignored.
+        Unlike the method of argparse, this method raises an error if standard output cannot be written. The
+        argument `file` is ignored.
         """
         show(self.format_help().rstrip())
 
@@ -44,7 +45,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> Parser:
-    """Return the parser of all commands. The attribute `run` of parsed options is the command's function."""
+    """Return the parser of all commands. Parsed options contain the command's function as attribute `run`."""
     parser = Parser(
         prog="jaxsmw",
         description="Match two triangle meshes (OFF, OBJ, PLY, STL or MATLAB's MAT) of the same kind of body "
@@ -61,7 +62,7 @@ def make_parser() -> Parser:
 
 
 class _Version(argparse.Action):
-    """An action that prints the version. The look-up of the version is slow, so it runs only on demand."""
+    """An action that prints the version. The slow look-up of the version runs only if it is requested."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(

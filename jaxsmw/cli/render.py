@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         type=path,
         required=True,
-        help="write a picture here (.png, .pdf or .svg), or an interactive page (.html) of a correspondence",
+        help="file to write: a picture (.png, .pdf or .svg), or an interactive page (.html) of a "
+        "correspondence",
     )
     add_partial(parser)
     add_up(parser)

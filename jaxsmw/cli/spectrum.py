@@ -34,11 +34,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="FILE",
         type=path,
-        help="write the eigenbasis of the surface scaled to area 1 here: as .npz with eigenvalues, "
-        "eigenvectors and vertex_areas; or as .mat with a struct S with evals, evecs, A and surface",
+        help="write the eigenbasis of the surface, scaled to area 1, to this file: a .npz file with the "
+        "arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file with a struct S with the fields "
+        "evals, evecs, A and surface",
     )
     parser.add_argument(
-        "--figure", metavar="FILE", type=path, help="draw the filter bank over the eigenvalues here"
+        "--figure",
+        metavar="FILE",
+        type=path,
+        help="draw the filters as functions of the eigenvalue to this file (.png, .pdf or .svg)",
     )
     add_bank(parser)
     add_eigenproblem(parser)

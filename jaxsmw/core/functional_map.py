@@ -21,15 +21,15 @@ eq. (5), all vertices have the same weight. The following table defines the weig
 | pushforward | area      | area_X(x)  | Phi_X(x)           | area_Y(T(x)) Phi_Y(T(x)) / area_X(x) |
 | pushforward | frobenius | 1          | area_X(x) Phi_X(x) | area_Y(T(x)) Phi_Y(T(x))             |
 
-In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the
-paper. The energy of eq. (5) of the paper, with the filters g_l of a bank, is
+In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in
+the paper. The energy of eq. (5) of the paper, with the filters g_l of a bank, is
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
 Lambda contains the eigenvalues, and the rows of G are the responses of the filters at the eigenvalues. For
 every matrix M, the sum over scales equals an elementwise product:
-`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on two matrices and a
-constant. Their computation needs no loop over scales and no array of size m x n:
+`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on two matrices and
+a constant. Their computation needs no loop over scales and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
@@ -37,9 +37,9 @@ constant. Their computation needs no loop over scales and no array of size m x n
 The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
 orthonormal if `sum_x w a a^T` is the identity. Then the gram matrix is diagonal, its diagonal is the frame
 function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval frame
-this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always orthonormal
-in the pushforward convention. In the pullback convention they are orthonormal if T preserves area.
-`docs/frames.md` derives these results.
+this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always
+orthonormal in the pushforward convention. In the pullback convention they are orthonormal if T preserves
+area. `docs/frames.md` derives these results.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class QuadraticEnergy(eqx.Module):
     def minimizer(self) -> Float[Array, "k_out k_in"]:
         """Returns the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
-        If the gram matrix is singular, the returned map is NaN or meaningless. `is_regular` detects this case.
+        If the gram matrix is singular, the returned map is NaN or meaningless; `is_regular` detects this.
         """
         return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
 
@@ -311,7 +311,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns w_x, a_x and b_x of all vertices of X, which the table at the top of this module defines."""
+        """Returns w_x, a_x and b_x of all vertices of X. The table at the top of this module defines them."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

@@ -20,20 +20,25 @@ def spectral_embeddings(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns two point sets in which each vertex of X is close to its match on Y.
+    """Returns two point sets in which the point of each vertex of X is close to the point of its match on Y.
 
-    The embeddings are `Phi_X` and `Phi_Y C^T` in the pullback convention, and `Phi_X C^T` and `Phi_Y` in the
-    pushforward convention. The convention matters because a filtered C shrinks the vectors that it maps. In
-    the pushforward convention the *queries* shrink. All queries then come close to the few database points of
-    small norm, which become hubs that attract most queries. In the pullback convention the *database*
-    shrinks, which hardly changes the order of the distances from a query. On real pairs pullback maps are
-    good, and pushforward maps fail.
+    With the eigenvectors Phi_X and Phi_Y as columns, the points are the rows of two matrices. These are
+    `Phi_X` and `Phi_Y C^T` in the pullback convention, and `Phi_X C^T` and `Phi_Y` in the pushforward
+    convention.
+
+    The convention matters because a filtered C shrinks the vectors that it maps. In the pushforward
+    convention it shrinks the *queries*. The nearest points of most queries are then the few database points
+    of small norm, which become hubs. In the pullback convention it shrinks the *database*, which hardly
+    changes the order of the distances from a query. On real pairs pullback maps are good, and pushforward
+    maps fail.
 
     **Arguments:**
 
     - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `convention`: the direction of C, `"pullback"` or `"pushforward"`.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
+      vertices, k_Y eigenvectors).
+    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
+      `"pushforward"` if C maps functions on X to functions on Y.
 
     **Returns:** The queries (m, d), one row per vertex of X, and the database (n, d), one row per vertex of
     Y. d is the number of rows of C. Both are in the unit of the eigenvectors.
@@ -50,16 +55,24 @@ def decode(
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
 ) -> Int32[Array, " m"]:
-    """Returns the pointwise map T: X -> Y of a functional map, by nearest neighbours (Algorithm 1, step 3).
+    """Returns the pointwise map T: X -> Y of a functional map C, by a nearest-neighbour search.
 
-    T maps each vertex of X to the unmasked vertex of Y that is nearest in `spectral_embeddings`.
+    This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
+    of Y that is nearest in spectral space. In the pullback convention, the query of a vertex of X is its row
+    of `Phi_X`, and the targets are the rows of `Phi_Y C^T`. In the pushforward convention, they are the rows
+    of `Phi_X C^T` and of `Phi_Y`.
 
     **Arguments:**
 
-    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: see `spectral_embeddings`.
-    - `patches`: the `search_patches` of X and Y, which make the search faster on large shapes.
+    - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
+      vertices, k_Y eigenvectors).
+    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
+      `"pushforward"` if C maps functions on X to functions on Y.
+    - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
+      large shapes. None (the default) compares all vertices of X with all vertices of Y.
 
-    **Returns:** One vertex of Y per vertex of X, (m,).
+    **Returns:** T, one vertex of Y per vertex of X, as an integer array (m,).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_vertices(queries, database, spectrum_y.mask, patches)
@@ -73,33 +86,50 @@ def decode_to_triangles(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Returns the map from vertices of X to points on the triangles of Y that follows from a functional map.
+    """Returns the map of a functional map C from the vertices of X to points on the triangles of Y.
 
-    Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The triangles of Y span a
-    surface in the `spectral_embeddings` of Y. Each vertex of X is mapped to the nearest point of this
-    surface. Neighbouring vertices of a fine X need not share a vertex of a coarse Y, so textures and other
-    functions stay smooth when the map transfers them. The function takes about ten times as long as an
-    exhaustive `decode`: one second for shapes of 5000 vertices. The time grows with the product of the
-    numbers of vertices.
+    The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
+    vertices of both shapes become points in spectral space: the rows of `Phi_X` and `Phi_Y C^T` in the
+    pullback convention, or the rows of `Phi_X C^T` and `Phi_Y` in the pushforward convention. The triangles
+    of Y span a surface in this space. The map sends each vertex of X to the nearest point of this surface.
+
+    If X is finer than Y, `decode` sends neighbouring vertices of X to the same vertex of Y. This map sends
+    them to different points, so textures and other functions stay smooth when the map transfers them. The
+    function takes about ten times as long as `decode` without patches, which is one second for shapes of 5000
+    vertices. The time grows with the product of the numbers of vertices.
 
     **Arguments:**
 
-    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: see `spectral_embeddings`.
+    - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
+      vertices, k_Y eigenvectors).
+    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
+      `"pushforward"` if C maps functions on X to functions on Y.
     - `faces_y`: the triangles of Y (f, 3), as vertex indices.
 
-    **Returns:** A face of Y for each vertex of X (m,), and the barycentric weights (m, 3) of its corners.
+    **Returns:** For each vertex of X, the index of a triangle of Y (m,) and the barycentric weights of the
+    three corners of this triangle (m, 3).
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_point_on_triangles(queries, database, faces_y)
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Returns patches of both shapes for `decode`. The same patches serve all functional maps.
+    """Returns patches of both shapes, with which `decode` is faster on large shapes.
 
-    The patches of Y grow with the square root of its number of vertices. This size balances the work per
-    patch and the work per point. So the time of a search grows with the number of vertices to the power 1.5.
+    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. The
+    patches can be used for all functional maps between X and Y.
 
-    **Returns:** The `Patches` of X, for the queries, and the `Patches` of Y, for the database.
+    The number of vertices per patch of Y grows with the square root of Y's number of vertices. This size
+    balances the work per patch and the work per vertex. So the time of a search grows with the number of
+    vertices to the power 1.5.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
+
+    **Returns:** The patches of X, for the queries, and the patches of Y, for the database. Pass this pair to
+    the argument `patches` of `decode`.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
@@ -112,10 +142,10 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 def chosen_patches(
     search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Patches, Patches] | None:
-    """Returns the `search_patches` of a `search` setting, or None for an exhaustive search.
+    """Returns the `search_patches` of both shapes if the setting `search` needs them, and None otherwise.
 
-    The setting `"patches"` always uses patches, and `"exhaustive"` never does. `"auto"` uses patches if the
-    default backend is a CPU and the geometric mean of the numbers of vertices is at least 15 000.
+    `"patches"` always uses patches, and `"exhaustive"` never uses patches. `"auto"` uses patches if the
+    default backend is a CPU and the geometric mean of both numbers of vertices is at least 15 000.
     """
     sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
     pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
@@ -124,10 +154,11 @@ def chosen_patches(
     return None
 
 
-# Above this number of vertices (the geometric mean of both shapes), patches save more time than their
+# From this number of vertices on (the geometric mean of both shapes), patches save more time than their
 # compilation takes.
 _PATCHES_FROM = 15_000
-# The best sizes as measured with scripts/benchmark_speed.py: vertices per patch of X, and the rank and size
-# of patches of Y.
+# These sizes were the fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices per patch of
+# X. _RANK is the rank of the patches of Y. A patch of Y has _SMALLEST_PATCH vertices if Y has
+# _VERTICES_OF_SMALLEST vertices or fewer.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

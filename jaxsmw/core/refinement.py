@@ -312,7 +312,8 @@ def _check_arguments(
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
             raise ValueError(
-                "samples must be a pair: give a tuple of the sampled vertices of X and the sampled vertices of Y"
+                "samples must be a pair: give a tuple of the sampled vertices of X and the sampled vertices "
+                "of Y"
             )
         check_kind("samples of X", samples[0], np.ndarray, jax.Array)
         check_kind("samples of Y", samples[1], np.ndarray, jax.Array)

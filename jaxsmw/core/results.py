@@ -1,4 +1,4 @@
-"""The status codes of computations, which work under `jax.jit` and `jax.vmap`, with a sentence for each code."""
+"""Status codes that work under `jax.jit` and `jax.vmap`, with a sentence for each code."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class RESULTS(eqx.Enumeration):
     nonfinite_functional_map = (
         "The functional map became NaN or infinite. Check the responses of the filter bank, the weights, the "
         "descriptors, and the temperature of soft maps, which must be positive. Numbers can overflow in "
-        "float32: scale the surfaces to area 1, or use float64. With samples, use at least as many samples as "
-        "eigenvectors, and spread the samples so that the eigenvectors are linearly independent on them."
+        "float32: scale the surfaces to area 1, or use float64. With samples, use at least as many samples "
+        "as eigenvectors, and spread the samples so that the eigenvectors are linearly independent on them."
     )
     undetermined_functional_map = (
         "A part of the functional map is undetermined to working precision. If the solution uses wavelets, "
-        "all filters of the bank vanish at some eigenvalue: use a filter bank that covers the whole spectrum. "
-        "Usually the lowest band is missing, which a low-pass filter adds, or the highest band. If the "
-        "solution uses only descriptors, the descriptors do not determine the map: use descriptors of zero "
-        "mean and similar size. In both cases it may help to use fewer eigenvectors, float64, or "
+        "all filters of the bank vanish at some eigenvalue: use a filter bank that covers the whole "
+        "spectrum. Usually the lowest band is missing, which a low-pass filter adds, or the highest band. If "
+        "the solution uses only descriptors, the descriptors do not determine the map: use descriptors of "
+        "zero mean and similar size. In both cases it may help to use fewer eigenvectors, float64, or "
         "solution=Filtering(), which solves no linear system."
     )
     singular_system = (

@@ -40,8 +40,8 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
     The signature is that of Aubry, Schlickewei, Cremers 2011. The weights are Gaussians in the logarithm of
     the eigenvalue. Their centres run in even steps from `log lambda_min + 2 width` to
-    `log lambda_max - 2 width`, and their width (standard deviation) is 7 steps. Here lambda_max is the largest
-    and lambda_min the smallest positive eigenvalue of the spectrum.
+    `log lambda_max - 2 width`, and their width (standard deviation) is 7 steps. Here lambda_max is the
+    largest and lambda_min the smallest positive eigenvalue of the spectrum.
 
     **Arguments:**
 

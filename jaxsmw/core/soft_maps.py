@@ -77,8 +77,8 @@ class SoftMap(eqx.Module):
         functions = jnp.asarray(functions_on_y, self.database.dtype)
         if functions.ndim != 2 or functions.shape[0] != self.database.shape[0]:
             raise ValueError(
-                f"functions on Y have shape {functions.shape}, but ({self.database.shape[0]}, p) is needed: give "
-                "one row for each vertex of Y"
+                f"functions on Y have shape {functions.shape}, but ({self.database.shape[0]}, p) is needed: "
+                "give one row for each vertex of Y"
             )
         weights = _log(self.database_areas) + self.potentials
 
@@ -135,8 +135,8 @@ class SparseSoftMap(eqx.Module):
                 f"functions on Y have shape {functions.shape}, but (n, p) is needed: give one row for each "
                 "vertex of Y"
             )
-        # The t rows of a query are processed one after another, because all t rows together would need t times
-        # the memory.
+        # The t rows of a query are processed one after another, because all t rows together would need t
+        # times the memory.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 

@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""One iteration: from a functional map to the next functional map and a member of `RESULTS`."""
+"""The function of one iteration: it takes a functional map and returns the next one and a member of `RESULTS`."""
 
 
 class SoftRefinement(eqx.Module):
@@ -30,11 +30,13 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: C, in the convention of the refiner (k_out, k_in).
-    - `soft_map`: the soft map X -> Y that is recovered from C.
-    - `result`: a member of `RESULTS`; compare it with `RESULTS.successful`.
-    - `iterations`: the number of functional maps after the first.
-    - `change`: the Frobenius norm of the change of C in the last iteration, relative to the Frobenius norm of
+    - `functional_map`: the final functional map C (k_out, k_in). C is a pullback (k_X, k_Y) or a pushforward
+      (k_Y, k_X), depending on the refiner.
+    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C.
+    - `result`: a member of `RESULTS`. Compare it with `RESULTS.successful`; `RESULTS[result]` explains it in
+      words.
+    - `iterations`: the number of functional maps that were computed after the first functional map.
+    - `change`: the Frobenius norm of the change of C in the last iteration, divided by the Frobenius norm of
       C. It is 0 at a fixed point.
     """
 
@@ -58,39 +60,45 @@ def refine_softly(
     differentiation: Differentiation = "checkpointed",
     tolerance: float = 1e-4,
 ) -> SoftRefinement:
-    """Refines a map by Algorithm 1 with soft maps instead of nearest neighbours.
+    """Refines a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
 
-    The outcome is differentiable in the spectra, a soft initial map, the parameters of the bank, the weights
-    and descriptors of the solution, and the temperature. No array of size m x n is stored, not even for
-    derivatives.
+    The outcome is differentiable with respect to the spectra, the parameters of the filter bank, the weights
+    and descriptors of the solution, and the temperature. If the initial map is a soft map, the outcome is
+    also differentiable with respect to this map. No array of size m x n is stored, not even for derivatives.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_map`: the initial map: a pointwise map (m,), or a soft map from X to Y.
-    - `refiner`: the computation of functional maps from soft maps. The `search` of the refiner is not used.
-    - `recovery`: the computation of soft maps from functional maps. Lower temperatures give results closer to
-      those of `jaxsmw.refine`, but larger and less informative derivatives.
-    - `iterations`: the number of functional maps after the first, at least 1. With `"implicit"` this is the
-      largest number of such maps.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
+    - `pointwise_map`: the initial map X -> Y: an integer array (m,) with one vertex of Y per vertex of X, or
+      a `SoftMap`, or a `SparseSoftMap`.
+    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. Its attribute
+      `search` has no effect.
+    - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
+      `Sinkhorn()`. With lower temperatures, the results are closer to the results of `jaxsmw.refine`. The
+      derivatives are then larger and less informative.
+    - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
+      With `"implicit"`, this is the largest number of these maps.
     - `differentiation`: how derivatives are computed.
         - `"unrolled"`: automatic differentiation through all iterations.
-        - `"checkpointed"`: the same derivatives with less memory. Intermediate values within an iteration are
-          computed again.
-        - `"implicit"`: iterations up to a fixed point C = F(C, θ), where `dC = (I - dF/dC)^-1 dF/dθ dθ` by
-          the implicit function theorem. `optimistix.fixed_point` iterates, and GMRES solves the linear system
-          with derivatives of one iteration. The memory does not grow with the number of iterations. The
-          outcome has no derivative with respect to the initial map.
-    - `tolerance`: with `"implicit"`, the tolerance of the fixed point, relative to the largest entry of C,
-      and of the linear solver; positive.
+        - `"checkpointed"` (the default): the same derivatives with less memory. The backward pass computes
+          the intermediate values of each iteration again.
+        - `"implicit"`: the iterations run up to a fixed point C = F(C, θ), where F is one iteration and θ are
+          its parameters. The derivatives follow from the implicit function theorem: `dC = (I - dF/dC)^-1
+          dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the linear system with
+          derivatives of one iteration. The memory does not grow with the number of iterations. The outcome
+          has no derivative with respect to the initial map.
+    - `tolerance`: a positive number, which only `"implicit"` uses. It is the tolerance of the fixed point,
+      relative to the largest entry of C, and also the tolerance of GMRES.
 
-    **Returns:** A `SoftRefinement`. Numerical failures raise no error: check the attribute `result`. With
-    `"implicit"` and too few `iterations`, the result is `RESULTS.fixed_point_not_reached`.
+    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in) and `soft_map`.
+    Numerical failures raise no error, so compare its attribute `result` with `RESULTS.successful`. If
+    `"implicit"` has too few `iterations`, `result` is `RESULTS.fixed_point_not_reached`.
 
-    **Raises:** `ValueError` for fewer than one iteration, a tolerance that is not positive, an unknown
-    `differentiation`, an initial map of the wrong size, or spectra of different float types; `TypeError` for
-    an argument of the wrong type. With `"implicit"`, reverse-mode derivatives raise equinox's runtime error
-    after too few iterations, or if GMRES does not reach its tolerance. Forward-mode derivatives are then NaN.
+    **Raises:** `ValueError` if `iterations` is below 1, `tolerance` is not positive, `differentiation` is
+    unknown, the initial map has the wrong size, or the spectra have different float types. `TypeError` if an
+    argument has the wrong type. With `"implicit"`, reverse-mode derivatives raise equinox's runtime error if
+    there were too few iterations, or if GMRES does not reach its tolerance. In these cases, forward-mode
+    derivatives are NaN.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
@@ -128,14 +136,15 @@ def refine_softly(
 def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
     """Returns the vertices of Y that an initial map contains, or None for a dense soft map.
 
-    **Raises:** `ValueError` if the map is not between m and n points; `TypeError` if it is not a map.
+    **Raises:** `ValueError` if the map does not fit shapes with m and n vertices; `TypeError` if it is not a
+    map.
     """
     if isinstance(pointwise_map, SoftMap):
         sizes = pointwise_map.queries.shape[0], pointwise_map.database.shape[0]
         if sizes != (m, n):
             raise ValueError(
-                f"the initial map is from {sizes[0]} to {sizes[1]} points, but the shapes have {m} and {n} "
-                "vertices"
+                f"the initial map is a soft map from {sizes[0]} to {sizes[1]} points, but X has {m} vertices "
+                f"and Y has {n}: give a soft map from the vertices of X to the vertices of Y"
             )
         return None
     sparse = isinstance(pointwise_map, SparseSoftMap)
@@ -143,23 +152,35 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
     check_kind("initial map", matches, np.ndarray, jax.Array)
     if matches.shape[0] != m or matches.ndim != 1 + sparse:
         raise ValueError(
-            f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each vertex"
+            f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each vertex "
+            "of X"
         )
     return matches
 
 
 class WaveletPreservationLayer(eqx.Module):
-    """A layer for neural networks: from features of both shapes to a functional map and a soft map.
+    """A neural-network layer that matches two shapes by features of their vertices.
 
-    The layer computes a soft map between the features and refines this map by `refine_softly`. Its parameters
-    are the leaves of its modules, as in any equinox module. Train all parameters, or freeze some of them with
-    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can use it as well.
+    The layer computes a soft map from the distances between the features. Then it refines this soft map by
+    `refine_softly`. Call the layer with features (m, d) and (n, d) and with two spectra. The layer returns a
+    `SoftRefinement`, which contains a functional map and a soft map.
+
+    As in any equinox module, the parameters of the layer are the leaves of its modules. Train all parameters,
+    or freeze some of them with `equinox.partition`. The layer is a pure function of arrays, so flax and haiku
+    models can use it as well.
 
     **Arguments:**
 
-    - `refiner`: the computation of functional maps from soft maps.
-    - `recovery_of_features`: the computation of the initial soft map from the features.
-    - `recovery`, `iterations`, `differentiation`, `tolerance`: see `refine_softly`.
+    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps.
+    - `recovery_of_features`: the `Recovery` that computes the initial soft map from the features:
+      `Softmax()`, `NearestFew()` or `Sinkhorn()`.
+    - `recovery`: the `Recovery` that computes soft maps from functional maps. It accepts the same classes.
+    - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
+      With `"implicit"`, this is the largest number of these maps.
+    - `differentiation`: how derivatives are computed, `"unrolled"`, `"checkpointed"` or `"implicit"`; see
+      `refine_softly`.
+    - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES with `"implicit"`. The
+      other ways to compute derivatives do not use it.
     """
 
     refiner: WaveletPreservation = WaveletPreservation()
@@ -184,16 +205,17 @@ class WaveletPreservationLayer(eqx.Module):
           Corresponding vertices should be close to each other in feature space.
         - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
 
-        **Returns:** The `SoftRefinement` of `refine_softly`.
+        **Returns:** The `SoftRefinement` that `refine_softly` returns.
 
-        **Raises:** `ValueError` if the features do not have one row per vertex, or differ in width between
-        the shapes; see also `refine_softly`.
+        **Raises:** `ValueError` if the features do not have one row per vertex, or if X and Y have different
+        numbers of features. The layer also raises the errors of `refine_softly`.
         """
         needed = [(s.mask.shape[0], features_x.shape[-1]) for s in (spectrum_x, spectrum_y)]
         found = [features_x.shape, features_y.shape]
         if found != needed:
             raise ValueError(
-                "the features have shapes {} and {}, where {} and {} are needed".format(*found, *needed)
+                "the features have shapes {} and {}, but {} and {} are needed: give one row for each vertex, and "
+                "the same number of features on X and Y".format(*found, *needed)
             )
         return refine_softly(
             spectrum_x,

@@ -1,4 +1,4 @@
-"""The spectrum of a shape, which is the only form in which the traced code of `jaxsmw.core` receives a shape."""
+"""The spectrum of a shape, the only form in which the traced code of `jaxsmw.core` receives a shape."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class Spectrum(eqx.Module):
-    """A shape in spectral form: the first k eigenpairs of its Laplace–Beltrami operator, as a pytree of arrays.
+    """The first k eigenpairs of a shape's Laplacian and the vertex areas, as a pytree of arrays.
 
     `compute_spectrum` computes the spectrum of a mesh. The eigenpairs solve `W phi = lambda A phi`. W is the
-    positive semi-definite cotangent stiffness matrix, and the diagonal matrix A contains the vertex areas.
+    positive semi-definite stiffness matrix of cotangent weights (the Laplace–Beltrami operator), and the
+    diagonal matrix A contains the vertex areas.
     The eigenvectors are orthonormal with respect to A: `Phi^T A Phi = I`.
 
     A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks several shapes, which gives every

@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks
 
-# The number of queries per block. Distances from one block to all triangles are in memory at once.
+# The number of queries per block. The distances from the queries of a block to all triangles are in memory
+# together.
 _BLOCK = 32
 
 
@@ -19,21 +20,24 @@ def nearest_point_on_triangles(
     *,
     face_mask: Bool[Array, " f"] | None = None,
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Returns the point on a set of triangles that is nearest to each query, exactly, in Euclidean distance.
+    """Returns, for each query, the nearest point on a set of triangles in a space of any dimension.
 
-    Every query is compared with all triangles, but no array of size m x f is stored. In any dimension, the
-    distance to a triangle follows from the products of the query with the corners. If the nearest point
-    belongs to several triangles, such as a corner, one of these triangles is returned.
+    The nearest point is exact, in Euclidean distance. Every query is compared with all triangles, but no
+    array of size m x f is stored. The distance to a triangle is computed from the inner products of the query
+    with the corners. If the nearest point belongs to several triangles, for example a common corner, one of
+    these triangles is returned.
 
     **Arguments:**
 
-    - `queries`: points (m, d) in d dimensions, in any unit.
-    - `points`: the corners (n, d) of the triangles, in the same unit.
-    - `faces`: three indices into `points` per triangle (f, 3).
-    - `face_mask`: False for triangles to be ignored. If all triangles are ignored, the result is meaningless.
+    - `queries`: (m, d), points in d dimensions, in any unit.
+    - `points`: (n, d), the corners of the triangles, in the same unit.
+    - `faces`: (f, 3), three indices into `points` per triangle.
+    - `face_mask`: (f,), False for triangles to be ignored. None (the default) uses all triangles. If all
+      triangles are ignored, the result is meaningless.
 
-    **Returns:** The triangle of each nearest point (m,), and the barycentric weights (m, 3) of its corners.
-    The weights are not negative and sum to 1.
+    **Returns:** For each query, the index of the triangle that contains the nearest point (m,) and the
+    barycentric weights of the three corners of this triangle (m, 3). The weights are not negative and sum
+    to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
@@ -54,7 +58,8 @@ def nearest_point_on_triangles(
         return jnp.argmin(squared, axis=0).astype(jnp.int32)
 
     found = in_blocks(search, queries, _BLOCK)
-    # The weights are computed from differences, which are precise where products would cancel.
+    # The weights are computed from the differences `queries - corners`, because the difference of inner
+    # products would lose digits by cancellation.
     away = queries - corners[found, 0]
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
     _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
@@ -75,7 +80,7 @@ def _closest(
 
     **Arguments:**
 
-    - `squared`: `|q - a|²` up to an additive constant, which the returned distance keeps.
+    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. The returned distance contains the same constant.
     - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`.
     - `uu`, `uv`, `vv`: the products `u·u`, `u·v` and `v·v`.
     """

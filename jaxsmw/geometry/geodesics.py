@@ -73,7 +73,7 @@ class SurfacePoints:
         return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
 
     def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """Return for each point the nearest of the three corners of its face, as vertices of the mesh (p,)."""
+        """Return for each point the nearest corner of its face, as an array of vertices (p,)."""
         corners = mesh.faces[self.faces]
         distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
         return corners[np.arange(len(corners)), distances.argmin(axis=1)]
@@ -221,7 +221,10 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """Return the lengths of lines as a square matrix. Of several lines between two nodes, the shortest counts."""
+    """Return the lengths of lines as a square matrix.
+
+    If several lines connect the same nodes, the matrix contains the length of the shortest line.
+    """
     origins, ends, lengths = (np.concatenate(part) for part in zip(*lines, strict=True))
     key = origins.astype(np.int64) * size + ends
     order = np.lexsort([lengths, key])
@@ -541,7 +544,9 @@ def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray,
     outside = (indices < 0) | (indices >= count)
     if outside.any():
         at = int(outside.argmax())
-        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct the index"
+        cure = "correct the index"
+        if indices.max() == count:
+            cure = "subtract 1, because they seem to count from 1"
         raise InputError(
             f"{name} indices must lie between 0 and {count - 1}, but number {at} is {indices[at]}: {cure}."
         )

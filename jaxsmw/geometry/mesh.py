@@ -21,13 +21,13 @@ from jaxsmw.errors import InputError
 # because the other libraries are not imported.
 MeshLike: TypeAlias = Any
 
-# A triangle whose height is at most this fraction of its longest edge is degenerate. The fraction is far above
-# the rounding errors of positions, unless the mesh is many times its extent away from the origin. The fraction
+# A triangle whose height is at most this fraction of its longest edge is degenerate. The fraction is far
+# above the rounding errors of a mesh whose distance from the origin is a few times its extent. The fraction
 # is far below the relative height of any intended triangle.
 DEGENERATE_HEIGHT = 1e-10
 
-# The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit. Within
-# the limits, squares of areas, which occur in descriptors, neither overflow nor underflow.
+# The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit.
+# Within the limits, squares of areas, which occur in descriptors, neither overflow nor underflow.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
 # The limits for distances of vertices, in units of the median edge length. At `LARGEST_COORDINATE` from the
 # origin, float64 rounds positions by 1e-4 edge lengths. At `LARGEST_DISTANCE` from the middle of a mesh,
@@ -423,8 +423,9 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
         )
     unreferenced = int((~mesh.referenced_vertices).sum())
     if unreferenced:
-        total = count_of(len(mesh.vertices), "vertex")
-        notes.append(f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) of {total} in all.")
+        notes.append(
+            f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} vertices."
+        )
     return notes
 
 

@@ -1,4 +1,4 @@
-"""The initial maps, from which refinement begins. Each kind of initial map has its own module."""
+"""Initial maps, from which refinement begins."""
 
 from jaxsmw.initial_maps.initial_map import INITIAL_MAPS, InitialMap, initial_map
 

@@ -1,4 +1,4 @@
-"""The initial map `functional`: the functional map that preserves SHOT and commutes with the Laplacian."""
+"""The initial map `functional`, from a functional map that preserves SHOT and commutes with the Laplacian."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.descriptors import SampledPair, paired_shot
 
-# The weight of commutativity with the Laplacian relative to preservation of SHOT. On eight real pairs the
-# mean error of the initial map was 0.055 for 10, 0.052 for 100, 0.076 for 1, and 0.313 without commutativity.
+# The weight of commutativity with the Laplacian relative to preservation of SHOT. On eight pairs of real
+# bodies, the mean geodesic error of the initial map is 0.313 for a weight of 0, 0.076 for 1, 0.055 for 10, and
+# 0.052 for 100.
 _COMMUTATIVITY = 10.0
 
 
 def functional_features(
     sampled: SampledPair,
 ) -> tuple[Float[np.ndarray, "m k_x"], Float[np.ndarray, "n k_x"]]:
-    """Compute a functional map by least squares, and the spectral embeddings of both shapes.
+    """Compute spectral embeddings of both shapes that a functional map aligns.
 
-    The functional map preserves SHOT and commutes with the Laplacian (section 3.2 of the MWP paper).
+    The functional map is computed by least squares from two conditions: it should preserve SHOT and commute
+    with the Laplacian (section 3.2 of the MWP paper).
 
     **Arguments:**
 
-    - `sampled`: the pair. Rows of the result belong to the vertices of its sampled spectra.
+    - `sampled`: the pair with its compared vertices.
 
-    **Returns:** The embeddings of X (m, k_X) and of Y (n, k_X).
+    **Returns:** The embeddings of X (m, k_X) and of Y (n, k_X), with one row per compared vertex.
 
     **Raises:** `ArithmeticError` if the functional map cannot be computed. `InputError` if a mesh is too
     coarse for SHOT.

@@ -1,4 +1,4 @@
-"""The choice of an initial map."""
+"""The computation of the initial map of a pair."""
 
 from __future__ import annotations
 
@@ -34,20 +34,25 @@ def initial_map(
     """Compute the pointwise map T: X -> Y from which refinement begins.
 
     On a mesh with more than 15 000 vertices, descriptors are computed and compared only at about 10 000
-    evenly spread samples. Each other vertex of X gets the match of the nearest sample. An unreferenced vertex
-    of X gets the match of the nearest referenced vertex.
+    evenly spread samples. Every other vertex of X gets the match of the nearest sample. An unreferenced
+    vertex of X gets the match of the nearest referenced vertex.
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units; see `paired_spectra`.
-    - `init`: one of the following; `match` explains the choices.
-        - a name: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`.
-        - a pointwise map: vertices of Y (m,), or m `SurfacePoints` on Y, which are moved to the nearest
-          corner of their face.
-        - landmarks (l, 2): a vertex of X and its match on Y in each row.
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units, from `paired_spectra`.
+    - `init`: the name of a method, a given map, or landmarks.
+        - `"shot"`: nearest neighbours in SHOT descriptors, which distinguish left from right.
+        - `"wks"`, `"hks"`, `"wavelet"`: nearest neighbours in the wave kernel signature, the heat kernel
+          signature or the wavelet signature, which do not distinguish left from right.
+        - `"functional"`: the pointwise map of a functional map that preserves SHOT and commutes with the
+          Laplacian.
+        - an integer array (m,): a pointwise map, as 0-based vertices of Y. It is checked and returned.
+        - m `SurfacePoints` on Y: a map to points, each of which is moved to the nearest corner of its face.
+        - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The map is
+          given by nearest neighbours in SHOT and in geodesic distances to the landmarks.
 
-    **Returns:** The initial map (m,), 0-based vertices of Y.
+    **Returns:** The initial map as an integer array (m,), 0-based vertices of Y.
 
     **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, indices out of
     range, a spectrum of another mesh, or a mesh that is too coarse for SHOT. `ArithmeticError` if the
@@ -61,7 +66,7 @@ def initial_map(
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
         raise InputError(
-            f"the initial map has type {given.dtype}, but must be integer vertex indices: convert it."
+            f"the initial map has type {given.dtype}, but must contain vertex indices: convert it to integers."
         )
     if given.ndim == 1:
         return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
@@ -75,7 +80,7 @@ _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 
 
 def _features(sampled: SampledPair, init: str) -> _Features:
-    """Compute the features of both shapes by which a named initial map compares vertices."""
+    """Compute the features of both shapes for a named initial map, which matches nearest neighbours."""
     if init == "shot":
         features = paired_shot(sampled)
     elif init in SIGNATURES:
@@ -90,7 +95,7 @@ def _features(sampled: SampledPair, init: str) -> _Features:
 
 
 def _finite(sampled: SampledPair, init: str, features: _Features) -> _Features:
-    """Return the features after a check that all of their numbers are finite."""
+    """Return the features, after a check that all entries are finite."""
     if all(np.isfinite(of_shape).all() for of_shape in features):
         return features
     raise InputError(
@@ -112,6 +117,7 @@ def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     if unused.any():
         raise InputError(
             f"the initial map sends {unused.sum()} vertices to unreferenced vertices of {mesh_y.name} (in no "
-            f"face), for example {np.flatnonzero(unused)[0]} to {given[unused][0]}: choose vertices in faces."
+            f"face), for example vertex {np.flatnonzero(unused)[0]} to vertex {given[unused][0]}: choose "
+            "vertices in faces."
         )
     return given

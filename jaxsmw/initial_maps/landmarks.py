@@ -1,4 +1,4 @@
-"""Features of initial maps from landmarks: SHOT and geodesic distances to the landmarks."""
+"""Features for initial maps from landmarks, which are SHOT and geodesic distances to the landmarks."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
 # The weight of distances to landmarks relative to SHOT descriptors, which are unit vectors. With this weight,
-# a distance of half the square root of the area has the norm of a SHOT descriptor. Weights from 1 to 3 give
-# nearly the same maps of real pairs.
+# a distance of half the square root of the area counts as much as the length of a SHOT descriptor. On pairs
+# of real bodies, weights from 1 to 3 give nearly the same maps.
 _WEIGHT = 2.0
-# The distance between two connected components, larger than any distance within a component.
+# This finite value replaces infinite distances between two connected components. It is larger than any
+# distance within a component.
 _ELSEWHERE = 100.0
 
 
 def landmark_features(
     sampled: SampledPair, landmarks: np.ndarray
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """Compute SHOT and weighted geodesic distances to each landmark, on both shapes.
+    """Compute SHOT and the weighted geodesic distances to all landmarks, on both shapes.
 
     **Arguments:**
 
-    - `sampled`: the pair. Rows of the result belong to the vertices of its sampled spectra.
-    - `landmarks`: integers (l, 2), a vertex of X and its match on Y in each row.
+    - `sampled`: the pair with its compared vertices.
+    - `landmarks`: integers (l, 2), with a vertex of X and its match on Y in each row.
 
-    **Returns:** The features of X (m, d) and of Y (n, d): 352 columns of SHOT, then l columns of distances.
+    **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex. The first 352
+    columns are SHOT, and the other l columns are distances.
 
     **Raises:** `InputError` if `landmarks` has another shape, gives two matches to one vertex of X, or
     contains a number that is not a referenced vertex; or if a mesh is too coarse for SHOT.
@@ -61,16 +63,16 @@ def landmark_features(
 def distance_features(
     side: SampledShape, vertices: Int64[np.ndarray, " l"], unit: float
 ) -> Float[np.ndarray, "n l"]:
-    """Compute weighted geodesic distances to some vertices, as additional features to SHOT.
+    """Compute weighted geodesic distances to some vertices, as features that are appended to SHOT.
 
     **Arguments:**
 
-    - `side`: the shape.
+    - `side`: the shape with its compared vertices.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
     - `unit`: the length that counts as 1, in the unit of the mesh; see `Pair.units_of_length`.
 
-    **Returns:** The distances (n, l), multiplied by their weight relative to SHOT. Rows belong to the samples
-    of the shape, or to all vertices of a shape without samples.
+    **Returns:** The distances (n, l), multiplied by their weight relative to SHOT, with one row per compared
+    vertex.
     """
     distances = geodesic_distances(side.mesh, vertices).T / unit
     distances = _WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)

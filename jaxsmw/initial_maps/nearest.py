@@ -1,4 +1,4 @@
-"""Pointwise maps by nearest neighbours of features, extended from samples to all vertices."""
+"""Pointwise maps by nearest-neighbour search in feature space, extended from samples to all vertices."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 def nearest_map(
     sampled: SampledPair, features_x: Float[np.ndarray, "a d"], features_y: Float[np.ndarray, "b d"]
 ) -> Int64[np.ndarray, " m"]:
-    """Compute a pointwise map of all vertices of X by nearest neighbours of features.
+    """Compute a pointwise map of all vertices of X by nearest-neighbour search in feature space.
 
     **Arguments:**
 
-    - `sampled`: the pair.
-    - `features_x`, `features_y`: the features (a, d) and (b, d). Rows belong to the samples of a shape, or to
-      all vertices of a shape without samples.
+    - `sampled`: the pair with its compared vertices.
+    - `features_x`, `features_y`: the features (a, d) and (b, d), with one row per compared vertex.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
     """
@@ -35,11 +34,11 @@ def nearest_among_compared(
 
     **Arguments:**
 
-    - `features_x`, `features_y`: the features (a, d) and (b, d). Rows belong to the samples of a shape, or to
-      all vertices of a shape without samples.
-    - `y`: the shape Y. Rows that its spectrum masks are never chosen.
+    - `features_x`: features (a, d) of X.
+    - `features_y`: features (b, d) of Y, with one row per compared vertex.
+    - `y`: the shape Y. Rows of masked vertices are never chosen.
 
-    **Returns:** The row numbers (a,).
+    **Returns:** The row numbers in `features_y` (a,), 0-based.
     """
     dtype = y.spectrum.eigenvectors.dtype
 
@@ -54,13 +53,12 @@ def nearest_among_compared(
 
 
 def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int64[np.ndarray, " m"]:
-    """Extend a map between samples to a pointwise map of all vertices of X.
+    """Extend a map between compared vertices to a pointwise map of all vertices of X.
 
     **Arguments:**
 
-    - `sampled`: the pair.
-    - `found`: for each sample of X (a,), the number of a sample of Y. On a shape without samples, all
-      vertices count as samples.
+    - `sampled`: the pair with its compared vertices.
+    - `found`: for each compared vertex of X (a,), the 0-based number of a compared vertex of Y.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
     """

@@ -1,6 +1,6 @@
-"""Features of the initial maps `wks`, `hks` and `wavelet`: spectral signatures.
+"""Spectral signatures, the features of the initial maps `wks`, `hks` and `wavelet`.
 
-Spectral signatures do not tell left from right.
+Spectral signatures do not distinguish left from right.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ def signature_features(
 
     **Arguments:**
 
-    - `sampled`: the pair. Rows of the result belong to the vertices of its sampled spectra.
-    - `name`: a key of `SIGNATURES`.
+    - `sampled`: the pair with its compared vertices.
+    - `name`: a key of `SIGNATURES`: `"wks"`, `"hks"` or `"wavelet"`.
 
-    **Returns:** The features of X (m, d) and of Y (n, d).
+    **Returns:** The signatures of X (m, d) and of Y (n, d), with one row per compared vertex.
     """
     signature = SIGNATURES[name]
     return np.asarray(signature(sampled.x.spectrum)), np.asarray(signature(sampled.y.spectrum))

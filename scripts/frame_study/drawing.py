@@ -34,7 +34,8 @@ def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings)
     mesh_x, mesh_y, truth = read_pair(data, pair)
     meshes = mesh_x, mesh_y
     spectra = [compute_spectrum(mesh, settings.number_of_eigenvectors) for mesh in meshes]
-    # The wavelets are centred at the point of the source nearest to the viewer, because this point is visible.
+    # The wavelets are centred at the point of the source nearest to the viewer, because this point is
+    # visible.
     standing = [stand(mesh) for mesh in meshes]
     towards = camera_axes(choose_azimuth(standing))[2]
     row = np.argmax(standing[0].vertices[truth.source_vertices] @ towards)
@@ -71,7 +72,7 @@ def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
 
 
 def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings) -> None:
-    """Draw heat maps of the errors: eigenvectors x filters (last iteration), and eigenvectors x iterations."""
+    """Draw heat maps of errors: eigenvectors x filters (last iteration), and eigenvectors x iterations."""
     ks, filters = settings.parameter_eigenvectors, settings.parameter_filters
     iterations = range(1, settings.parameter_iterations + 1)
     errors = {}

@@ -59,7 +59,7 @@ _TIMED_RUNS = 9
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings that influence the results, apart from data and code. `provenance.json` stores every field."""
+    """All settings that influence the results, except data and code. `provenance.json` stores all fields."""
 
     pairs: int = 40
     seed: int = 0
@@ -91,8 +91,8 @@ class MeasuredPair:
     - `spectra`: the padded spectra of source and target.
     - `start`: the initial map, padded like the source.
     - `sources`, `targets`: the evaluated vertices of X and their true matches on Y (p,).
-    - `distances`: the geodesic distances from `targets` to all vertices of Y (p, n), in units of the square root
-      of the area of Y.
+    - `distances`: the geodesic distances from `targets` to all vertices of Y (p, n), in units of the square
+      root of the area of Y.
     """
 
     mesh_x: Mesh
@@ -158,11 +158,11 @@ class Diagnosis(NamedTuple):
 
     **Attributes:**
 
-    - `energy`: the energy of the last functional map under the last pointwise map, in the area norm (eq. (5) of
-      the MWP paper).
+    - `energy`: the energy of the last functional map under the last pointwise map, in the area norm (eq. (5)
+      of the MWP paper).
     - `energy_of_zero`: the energy of the functional map C = 0 under the same pointwise map.
-    - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve no
-      least-squares problem.
+    - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
+      no least-squares problem.
     """
 
     energy: Float[Array, ""]
@@ -226,7 +226,8 @@ def measure_variants(
 
 
 def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
-    """Return the error of each map, the share of changed matches, and the share of matches moved beyond `MOVE`.
+    """Return the error of each map, the share of changed matches, and the share of matches moved beyond
+    `MOVE`.
 
     If the refinement failed, all values except the error of the initial map are NaN.
     """
@@ -282,8 +283,8 @@ def measure_invariance(
     The values of two wavelets a and b at corresponding points are compared.
 
     **Returns:** Rows of `invariance.csv`. Each row contains the median correlation and the median relative
-    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. It is 0
-    for equal wavelets and sqrt(2) for unrelated wavelets.
+    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. It is
+    0 for equal wavelets and sqrt(2) for unrelated wavelets.
     """
     banks = _frames(settings.number_of_filters)
     vertices = pair.sources, pair.targets

@@ -22,8 +22,8 @@ SETTLED = 0.05
 class Comparison(NamedTuple):
     """A comparison of one variant with the default on the same pairs.
 
-    Errors are in thousandths of the square root of the area. Means and medians leave out failed pairs, so they
-    must be read together with the number of failures.
+    Errors are in thousandths of the square root of the area. Means and medians leave out failed pairs, so
+    they must be read together with the number of failures.
 
     **Attributes:**
 
@@ -159,35 +159,36 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
     start = {name: 1e3 * study.numbers(DEFAULT, name, "error_0").mean() for name in study.pairs}
     parts = [
         "# Frames compared",
-        f"The pairs ({counts}) are evenly spread over the lists of the data sets. All variants start from the "
-        "same SHOT matches (mean error "
+        f"The pairs ({counts}) are evenly spread over the lists of the data sets. All variants start from "
+        "the same SHOT matches (mean error "
         + ", ".join(f"{error:.1f} on {name}" for name, error in start.items())
         + f"). They use {settings.number_of_eigenvectors} eigenvectors per shape and {settings.iterations} "
         f"iterations. Banks of any size have {settings.number_of_filters} filters. "
-        "`scripts/compare_frames.py` wrote this page. `provenance.json` has versions, seeds and settings, and "
-        "`results.csv` has the results of every pair.",
+        "`scripts/compare_frames.py` wrote this page. `provenance.json` has versions, seeds and settings, "
+        "and `results.csv` has the results of every pair.",
         _list(
-            "**error**: the mean geodesic error, in units of 10⁻³ times the square root of the target's area. All "
-            f"variants are evaluated at the same {settings.evaluated_points} points of the ground truth.",
-            "**difference**: the mean over the pairs of a paired difference. The paired difference is the error "
-            "of the variant minus the error of the default (Meyer, filtering, pullback) on the same pair. "
-            f"Brackets contain the {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} resamples of pairs). "
-            "Pairs share shapes, so the intervals are somewhat too narrow. If there were no true differences, "
-            f"{1 - CONFIDENCE:.0%} of the intervals would still miss zero by chance.",
+            "**error**: the mean geodesic error, in units of 10⁻³ times the square root of the target's "
+            f"area. All variants are evaluated at the same {settings.evaluated_points} points of the ground "
+            "truth.",
+            "**difference**: the mean over the pairs of a paired difference. The paired difference is the "
+            "error of the variant minus the error of the default (Meyer, filtering, pullback) on the same "
+            f"pair. Brackets contain the {CONFIDENCE:.0%} bootstrap interval (BCa, {RESAMPLES} resamples of "
+            "pairs). Pairs share shapes, so the intervals are somewhat too narrow. If there were no true "
+            f"differences, {1 - CONFIDENCE:.0%} of the intervals would still miss zero by chance.",
             "**better**: the share of pairs on which the error is smaller than the error of the default. A "
             "failure counts as not better.",
-            "**energy**: the ratio E(C) / E(0) for the last C. E is the energy of eq. (5) of the MWP paper under "
-            "the last pointwise map, in the area norm and with the variant's own frame. The band mask uses the "
-            "energy of the Meyer frame.",
+            "**energy**: the ratio E(C) / E(0) for the last C. E is the energy of eq. (5) of the MWP paper "
+            "under the last pointwise map, in the area norm and with the variant's own frame. The band mask "
+            "uses the energy of the Meyer frame.",
             f"**settles**: the first iteration in which fewer than {SETTLED:.0%} of the matches move by more "
-            f"than {MOVE} times the square root of the area, which is about the length of an edge. The table has "
-            "the median over the pairs.",
-            "**update**: the milliseconds to compute a functional map from a pointwise map, without the search, "
-            f"which takes {search:.0f} ms. The table has the median of runs in turns on one core, for one pair "
-            "of each data set.",
-            "**condition**: the condition number of the first least-squares problem. For the regularized update, "
-            "the problem is its wavelet term. The table has the median over the pairs. In float32, a matrix with "
-            "a condition number above 10⁵ is numerically singular.",
+            f"than {MOVE} times the square root of the area, which is about the length of an edge. The table "
+            "has the median over the pairs.",
+            "**update**: the milliseconds to compute a functional map from a pointwise map, without the "
+            f"search, which takes {search:.0f} ms. The table has the median of runs in turns on one core, "
+            "for one pair of each data set.",
+            "**condition**: the condition number of the first least-squares problem. For the regularized "
+            "update, the problem is its wavelet term. The table has the median over the pairs. In float32, a "
+            "matrix with a condition number above 10⁵ is numerically singular.",
             "**failed**: the number of pairs on which the update reported a failure. Means and medians leave "
             "these pairs out.",
             "`=`: the variant provably equals filtering, so it is not computed again. In the pushforward "
@@ -207,9 +208,9 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "The table has paired differences: the error with one update minus the error with another update.",
         _updates_within_frames(study),
         "## What scaling and tightening change, pullback",
-        "The table has paired differences of the error. A scaled bank is multiplied by a number that gives its "
-        "frame function a mean of 1. A tightened bank is replaced by its canonical tight frame, whose frame "
-        "function is 1 everywhere.",
+        "The table has paired differences of the error. A scaled bank is multiplied by a number that gives "
+        "its frame function a mean of 1. A tightened bank is replaced by its canonical tight frame, whose "
+        "frame function is 1 everywhere.",
         _tightening(study),
         "## The height of C",
         "The table has the mean error of filtering with the Meyer frame if every iteration multiplies C by a "
@@ -224,10 +225,10 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             ]
     parts += [
         "## Invariance of wavelets under near-isometry",
-        "The table compares wavelets around corresponding vertices of the two shapes, at corresponding vertices. "
-        "It has the relative difference, which is 0 for equal and 1.41 for unrelated wavelets, and the "
-        f"correlation. Both are medians over {settings.wavelet_centers} centres and over the pairs. Scale 0 is "
-        "the scaling function, and the last scale is the finest.",
+        "The table compares wavelets around corresponding vertices of the two shapes, at corresponding "
+        "vertices. It has the relative difference, which is 0 for equal and 1.41 for unrelated wavelets, and "
+        f"the correlation. Both are medians over {settings.wavelet_centers} centres and over the pairs. "
+        "Scale 0 is the scaling function, and the last scale is the finest.",
         _invariance(study, invariance),
         "## Failures",
         _failures(study),

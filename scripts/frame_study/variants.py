@@ -110,8 +110,8 @@ QUICK_FRAMES = (
 )
 
 # The ablations are pairs of a frame and an update that are not in the grid of frames and updates. They are
-# measured in both conventions. The gains are factors of C. Such a factor changes the matches, because only one
-# of the two point sets in the nearest-neighbour search is mapped by C.
+# measured in both conventions. The gains are factors of C. Such a factor changes the matches, because only
+# one of the two point sets in the nearest-neighbour search is mapped by C.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -175,7 +175,8 @@ class BandMask(Filtering):
 class Scaled(FilterBank):
     """A bank multiplied by a number that gives the frame function a mean of 1 over a shape's eigenvalues.
 
-    Scaling and tightening both change the height of the bank. Only tightening changes the shapes of the filters.
+    Scaling and tightening both change the height of the bank. Only tightening changes the shapes of the
+    filters.
     """
 
     bank: FilterBank
@@ -261,9 +262,9 @@ def band_mask(
 ) -> Float64[np.ndarray, "k_out k_in"]:
     """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
 
-    Here d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for d <= 0.5,
-    0.5 at d = 1, and 0 for d >= 1.5. In between, the mask falls like a cosine. Because of its flat top, the mask
-    is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
+    Here d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for d <=
+    0.5, 0.5 at d = 1, and 0 for d >= 1.5. In between, the mask falls like a cosine. Because of its flat top,
+    the mask is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
     """
     distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
     return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))

@@ -149,9 +149,13 @@ class Method(abc.ABC):
         **Raises:** `InputError` if the method cannot match a pair.
         """
         if self.full_only and any(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: cannot match partial shapes: remove this method from --methods.")
+            raise InputError(
+                f"{self.reference}: cannot match partial shapes: remove this method from --methods."
+            )
         if self.partial_only and not all(pair.partial for pair in pairs):
-            raise InputError(f"{self.reference}: matches partial shapes only: remove this method from --methods.")
+            raise InputError(
+                f"{self.reference}: matches partial shapes only: remove this method from --methods."
+            )
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
         """Returns whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""

@@ -1,27 +1,30 @@
-"""BCICP: refines the maps of both directions together, towards bijective and continuous maps.
+"""BCICP: refines the maps X -> Y and Y -> X together, towards bijective and continuous maps.
 
 J. Ren, A. Poulenard, P. Wonka, M. Ovsjanikov, *Continuous and orientation-preserving correspondences via
 functional maps*, ACM Transactions on Graphics 37(6), 2018, section 5. Neither the authors' program nor the
-text of the paper was available for this reconstruction. Its steps are those of the paper. The docstring of
-each step names the choices that are ours. One iteration consists of four steps:
+text of the paper was available for this reconstruction. The reconstruction has the steps of the paper. The
+docstrings of the steps mark choices that may differ from the paper as "our choice". One iteration consists of
+four steps:
 
-1. `_bijective_step`: spectral ICP of both directions at once.
-2. `_improve_coverage`: a vertex without a preimage gets one from the reverse map. Steps 1 and 2 run twice.
+1. `_bijective_step`: spectral ICP improves both maps together.
+2. `_improve_coverage`: vertices without a preimage get a preimage from the reverse map, where possible. Steps
+   1 and 2 run twice in each iteration.
 3. `_smooth`: the images of neighbouring vertices are averaged in space.
-4. `_repair`: small regions that discontinuous edges separate from the rest are mapped again, from the images
-   of their surroundings.
+4. `_repair`: vertices in small regions that discontinuous edges separate from the rest get new images. The new
+   images are interpolated from the images of the surrounding vertices.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
-The reconstruction has larger errors than the authors' program. On the 45 non-isometric TOSCA pairs, from the
-authors' initial maps (mean geodesic error 0.373), the reconstruction has a mean error of 0.169. The authors'
-published maps have 0.110. On 5 pairs the reconstruction is better. The numbers of iterations and of smoothing
-rounds and the order of the steps were chosen on 8 of these pairs.
+The reconstruction has larger errors than the authors' program. Both start from the authors' initial maps of
+the 45 non-isometric TOSCA pairs, which have a mean geodesic error of 0.373. The mean geodesic error is 0.169
+for the reconstruction and 0.110 for the maps that the authors published. On 5 of the 45 pairs the
+reconstruction has the smaller error. The number of iterations, the number of smoothing rounds and the order
+of the steps were chosen on 8 of these pairs.
 
-`BCICP` has the settings in use: 50 eigenvectors, 10 iterations.
+`BCICP` has the settings of the benchmark: 50 eigenvectors and 10 iterations.
 
-All steps work on referenced vertices only, which are renumbered, and on shapes of area 1. Functional maps are
-in the pullback convention of `jaxsmw.core.functional_map`.
+All steps use only referenced vertices, which are renumbered from 0, and scale each shape to area 1. Functional
+maps have the pullback convention of `jaxsmw.core.functional_map`.
 """
 
 from __future__ import annotations
@@ -43,16 +46,17 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge is discontinuous if the images of its ends are farther apart than 0.1 square roots of the area, and
-# farther apart than two edges. The first length is a few edges of a mesh with thousands of vertices, and
-# short compared to a limb. On coarse meshes the second length is larger.
+# An edge of X is discontinuous if the distance between the images of its ends exceeds two thresholds: 0.1 times
+# the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands of vertices
+# the first threshold is the length of a few edges, and is short compared with a limb. On coarse meshes the
+# second threshold is larger.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
-# A region that discontinuous edges separate from the rest is an outlier if it has less than this share of the
-# area.
+# A region that discontinuous edges separate from the rest of X is an outlier if its area is less than this
+# share of the area of X.
 _SMALL_REGION = 0.05
-# The number of spectral steps in one iteration. A step that improves coverage follows each of them.
+# The number of times that `_bijective_step` runs in one iteration, each time followed by `_improve_coverage`.
 _SPECTRAL_STEPS = 2
-# The number of vertices from which distances are computed at once.
+# The number of vertices from which one call of Dijkstra's algorithm computes distances.
 _SOURCES_AT_ONCE = 256
 
 
@@ -62,12 +66,12 @@ class _Surface:
 
     **Attributes:**
 
-    - `vertices`: the numbers of the n vertices in the mesh (n,).
+    - `vertices`: the indices of the n remaining vertices in the mesh (n,).
     - `positions`: the positions (n, 3), scaled to area 1.
     - `edges`: the ends of each edge (e, 2).
-    - `component`: the number of the connected component of each vertex (n,).
-    - `near`: a sparse matrix (n, n), True between vertices whose distance along edges is at most the largest
-      distance between the images of the ends of a continuous edge.
+    - `component`: the index of the connected component that contains each vertex (n,).
+    - `near`: a sparse Boolean matrix (n, n), True for two vertices whose distance along edges is at most 0.1
+      or at most twice the mean edge length. The images of the ends of a continuous edge are such vertices.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -82,7 +86,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Returns the surface of a mesh, without vertices that the spectrum masks.
+        """Returns the surface of a mesh, without unreferenced vertices and vertices that the spectrum masks.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -107,7 +111,7 @@ class _Surface:
         )
 
     def adjacency(self, kept: Bool[np.ndarray, " e"] | None = None) -> csr_array:
-        """Returns a matrix (n, n) with ones between neighbours, by all edges or by the kept edges only."""
+        """Returns the adjacency matrix (n, n) of the graph of all edges, or only of the kept edges."""
         tail, head = (self.edges if kept is None else self.edges[kept]).T
         places = np.concatenate([tail, head]), np.concatenate([head, tail])
         return csr_array((np.ones(len(places[0])), places), shape=(len(self.areas), len(self.areas)))
@@ -124,27 +128,27 @@ def bcicp(
     iterations: int = 10,
     smoothing: int = 50,
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
-    """Refines the maps of both directions together (Ren et al. 2018, section 5).
+    """Refines the maps X -> Y and Y -> X together with BCICP (Ren et al. 2018, section 5).
 
-    The result is deterministic and does not depend on the signs of eigenvectors. JAX searches nearest
-    neighbours in the float type of the spectra. All other steps run in NumPy.
+    The result is deterministic and does not depend on the signs of eigenvectors. JAX searches for nearest
+    neighbours, in the floating-point type of the spectra. All other computations run in NumPy and SciPy.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: X with m vertices and Y with n. Boundaries, several connected components,
       non-manifold edges and unreferenced vertices are allowed.
-    - `spectrum_x`, `spectrum_y`: spectra with the same number of eigenvectors (50 in all measurements here),
-      padded or not.
-    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based; longer if padded.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not, with the same number of eigenvectors.
+      The benchmark uses 50 eigenvectors.
+    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. Padded maps may be longer.
     - `iterations`: the number of iterations, at least 1.
-    - `smoothing`: the number of rounds of averaging over neighbours in the first iteration, at least 0. The
-      number decreases to one in the last iteration. With 0 no map is smoothed.
+    - `smoothing`: the number of smoothing rounds in the first iteration, at least 0. The number decreases to
+      1 in the last iteration. If `smoothing` is 0, no map is smoothed.
 
-    **Returns:** The maps X -> Y and Y -> X, as long as the initial maps. Unreferenced and masked vertices
-    keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
+    **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and masked
+    vertices keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
 
-    **Raises:** `InputError` if a number is too small, if the arguments do not fit each other, or if an
-    initial map contains unreferenced, masked or missing vertices.
+    **Raises:** `InputError` if `iterations` or `smoothing` is too small, if the arguments do not fit each
+    other, or if an initial map sends a vertex to an unreferenced, masked or missing vertex.
     """
     if iterations < 1 or smoothing < 0:
         raise InputError(
@@ -174,7 +178,7 @@ def _schedule(iterations: int, smoothing: int) -> list[int]:
     """Returns the number of smoothing rounds of each iteration.
 
     The numbers decrease geometrically to one (our choice). Many rounds remove the folds of a poor initial
-    map, but they shrink limbs if every iteration has many.
+    map. If every iteration had many rounds, limbs would shrink.
     """
     if smoothing == 0:
         return [0] * iterations
@@ -184,7 +188,7 @@ def _schedule(iterations: int, smoothing: int) -> list[int]:
 def _restrict(
     pointwise_map: Int64[np.ndarray, " m"], x: _Surface, y: _Surface, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, " n"]:
-    """Converts a map between the vertices of two meshes to a map between the vertices of two surfaces.
+    """Converts a map between the vertices of two meshes to a map between the vertices of two `_Surface`s.
 
     **Raises:** `InputError` if the map has the wrong type or length, or maps a vertex of `x` to a vertex that
     `y` does not contain.
@@ -206,7 +210,7 @@ def _restrict(
 
 
 def _within(graph: csr_array, radius: float) -> csr_array:
-    """Returns a matrix (n, n), True where the distance between two nodes is at most a radius."""
+    """Returns a sparse matrix (n, n), True for two nodes of a graph whose distance is at most `radius`."""
     n, rows, columns = graph.shape[0], [], []
     for first in range(0, n, _SOURCES_AT_ONCE):
         sources = np.arange(first, min(first + _SOURCES_AT_ONCE, n))
@@ -218,7 +222,7 @@ def _within(graph: csr_array, radius: float) -> csr_array:
 
 
 def _nearest(queries: Float[np.ndarray, "m d"], database: Float[np.ndarray, "n d"]) -> np.ndarray:
-    """Returns the number of the database row nearest to each query."""
+    """Returns, for each query, the index of the nearest row of the database."""
     dtype = jnp.asarray(database).dtype
     found = compiled(nearest_neighbor)(jnp.asarray(queries, dtype), jnp.asarray(database))
     return np.asarray(found).astype(np.int64)
@@ -233,20 +237,22 @@ def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 def _bijective_step(
     x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
-    """Spectral ICP of both directions and of both cycles, in one search (bijective ICP).
+    """Computes both maps by one step of spectral ICP for both directions and both cycles (bijective ICP).
 
     There are four functional maps: one for each direction, and one for each of the cycles X -> Y -> X and
-    Y -> X -> Y. Each is replaced by the nearest orthogonal matrix. For y = T(x),
+    Y -> X -> Y. Each functional map is replaced by the nearest orthogonal matrix. The step seeks pointwise
+    maps such that, for y = T(x),
 
         Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
-    The second matrix in each line is the first matrix, rotated such that its cycle closes: `C_XX = C_XY C_YX`
-    should be the identity.
+    The functional map of a closed cycle is the identity, so `C_XX = C_XY C_YX` should be the identity. The
+    second matrix in each line is the first matrix, rotated such that the cycle closes.
 
-    The four embeddings are concatenated, and one search gives the new map X -> Y. The same search with
-    queries and targets exchanged gives the new map Y -> X. The equal weights and the form of the cycle
-    conditions are our choice. The condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps on six pairs.
+    The embeddings of the four conditions are concatenated with equal weights, and one search for nearest
+    neighbours gives the new map X -> Y. The same search with queries and targets exchanged gives the new map
+    Y -> X. The equal weights and the form of the cycle conditions are our choice. On six pairs the
+    alternative condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps.
     """
     phi_x, phi_y = x.eigenvectors, y.eigenvectors
     dual_x, dual_y = phi_x * x.areas[:, None], phi_y * y.areas[:, None]
@@ -261,10 +267,10 @@ def _bijective_step(
 def _improve_coverage(
     y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
-    """Gives vertices of Y without a preimage the preimage that the reverse map assigns.
+    """Gives vertices of Y without a preimage the preimage that the reverse map assigns to them.
 
     An uncovered vertex y becomes the image of x = T_YX(y), provided that the current image of x keeps another
-    preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their numbers (our
+    preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their indices (our
     choice).
     """
     improved, preimages = t_xy.copy(), np.bincount(t_xy, minlength=len(y.areas))
@@ -280,8 +286,8 @@ def _improve_coverage(
 def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int) -> Int64[np.ndarray, " m"]:
     """Averages the images of neighbouring vertices in space, then takes the nearest vertices of Y.
 
-    In each round every vertex takes the mean of its own point and the points of its neighbours. Points are
-    moved back to the surface only after the last round, so that displacements shorter than an edge
+    In each round the point of every vertex becomes the mean of this point and the points of its neighbours.
+    Points are moved back to the surface only after the last round, so that displacements shorter than an edge
     accumulate. The uniform weights are our choice.
     """
     if rounds == 0:
@@ -297,9 +303,9 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
     """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
-    Two vertices are far apart if their distance along edges exceeds both a tenth of the square root of the
-    area and two edges of average length, or if no path connects them. The thresholds and the distance along
-    edges are our choice.
+    Two vertices of Y are far apart if their distance along edges exceeds both 0.1 times the square root of the
+    area of Y and twice the mean edge length of Y, or if no path connects them. The thresholds and the distance
+    along edges are our choice.
     """
     tail, head = t_xy[x.edges].T
     return ~np.asarray(y.near[tail, head], dtype=bool).ravel()
@@ -309,8 +315,8 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
     """Returns a mask (m,) of the vertices in small regions that discontinuous edges separate from the rest.
 
     A region is a connected component of the graph of continuous edges. It is small if it has less than 5 % of
-    the area (our choice). Whole limbs are larger and are left to `_bijective_step`. The largest region of a
-    connected component of X is never an outlier.
+    the area of X (our choice). Whole limbs are larger, and only `_bijective_step` corrects their images. The
+    largest region of a connected component of X is never an outlier.
     """
     _, region = connected_components(x.adjacency(~_discontinuous_edges(x, y, t_xy)), directed=False)
     area = np.bincount(region, weights=x.areas)
@@ -322,11 +328,11 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
 
 
 def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    """Maps outliers again, from the images of the vertices around them.
+    """Gives outliers new images, which are interpolated from the images of the surrounding vertices.
 
-    The images are interpolated harmonically in the spectral embedding of Y (our choice). The point of every
-    outlier is the mean of the points of its neighbours, and its new image is the vertex nearest to that
-    point.
+    The interpolation is harmonic, in the spectral embedding of Y (our choice). The point of every outlier in
+    this embedding is the mean of the points of its neighbours. The new image of the outlier is the vertex of
+    Y nearest to this point.
     """
     outlier = _outliers(x, y, t_xy)
     if not outlier.any():
@@ -342,9 +348,9 @@ def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np
 
 @dataclass(frozen=True)
 class BijectiveContinuousICP(Method):
-    """Refines both initial maps with `bcicp` and returns the map X -> Y.
+    """A method that refines both initial maps with `bcicp` and returns the map X -> Y.
 
-    **Attributes:** those of `Method`; `number_of_eigenvectors` is k of both spectra.
+    **Attributes:** those of `Method`. `number_of_eigenvectors` is the number of eigenvectors of both spectra.
     """
 
     reference: str
@@ -365,6 +371,6 @@ class BijectiveContinuousICP(Method):
 
 
 BCICP = BijectiveContinuousICP(
-    "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (maps published for "
-    "tosca_nonisometric are better)"
+    "our reconstruction of Ren, Poulenard, Wonka, Ovsjanikov 2018: k = 50, 10 iterations (the maps that the "
+    "authors published for tosca_nonisometric have smaller errors)"
 )

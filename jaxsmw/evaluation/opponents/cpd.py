@@ -1,35 +1,37 @@
 r"""Pointwise maps by Coherent Point Drift: the recovery of Rodolà, Moeller and Cremers (2015).
 
-Implemented from two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement from
-functional correspondence*, VMV 2015, arXiv 1506.05603; and A. Myronenko, X. Song, *Point set registration:
-Coherent Point Drift*, IEEE TPAMI 32 (2010).
+This module implements two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement
+from functional correspondence*, VMV 2015, arXiv 1506.05603; and A. Myronenko, X. Song, *Point set
+registration: Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
-Nearest neighbours recover a good pointwise map if the functional map is nearly a rotation of one spectral
-embedding onto the other. For non-isometric shapes the functional map is not a rotation. The recovery is then
-a non-rigid registration of two point sets in k dimensions. The embedding that C maps (`Phi_Y C^T`, the
-"centroids") moves smoothly, and the other embedding (`Phi_X`, the "data") stays fixed. Each data point is
-drawn from a mixture of isotropic Gaussians around the centroids with a common variance s, and a share w of
-uniform noise. All vertices have equal weight; their areas are ignored. The displacement is a combination of
-Gaussian kernels `G` (n, n) at the centroids `Y`. For moved centroids T, expectation maximisation (EM)
-alternates
+A search for nearest neighbours recovers a good pointwise map if the functional map is nearly a rotation of
+one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. The
+recovery is then a non-rigid registration of two point sets in k dimensions. The embedding of Y (`Phi_Y C^T`,
+the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed. In the statistical
+model, a data point is uniform noise with probability w. Otherwise it is drawn from a mixture of isotropic
+Gaussians around the centroids with a common variance s. All vertices have equal weight; their areas are
+ignored. The displacement of the centroids is a linear combination of Gaussian kernels at the initial centroids
+`Y`, with the kernel matrix `G` (n, n). With d dimensions and moved centroids T, expectation maximisation (EM)
+alternates between the steps
 
     P_ji proportional to exp(-||x_i - t_j||^2 / 2 s), the noise to (2 pi s)^(d/2) w n / ((1 - w) m)
     (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y,    T = Y + G W
     s = sum_ij P_ji ||x_i - t_j||^2 / (d sum P)
 
-until the penalised likelihood no longer changes. The match of x is its most probable centroid, which is the
-nearest centroid.
+until the penalised likelihood no longer changes. The match of a data point is its most probable centroid,
+which is the nearest centroid.
 
 No matrix of size m x n or n x n is stored. P is computed for one block of data points at a time. G is
-replaced by a factorisation `L L^T` of low rank (`kernel_factor`). Then `G W = L b`, and the M-step is a ridge
+replaced by a factorisation `L L^T` of low rank (`kernel_factor`). With `G W = L b`, the M-step is a ridge
 regression of the displacements on the columns of L,
 
     (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
 
-This is Woodbury's identity in a form that never divides by small numbers. The result is exact if L has full
-rank.
+This system follows from Woodbury's identity, in a form that never divides by small numbers. Its solution is
+exact if L has full rank.
 
-`CPD` has the settings in use: 30 eigenvectors, and 3 iterations of the functional map and its recovery.
+`CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a functional
+map and recovers a pointwise map.
 """
 
 from __future__ import annotations
@@ -53,10 +55,10 @@ from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.opponents.presets import Refined
 
-# The number of data points whose probabilities are in memory at once.
+# The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
-# The threshold of Myronenko's program. For point sets of unit variance, a smaller variance is a rounding
-# error.
+# EM stops when the variance s is below this threshold of Myronenko's program. For point sets of unit variance, a
+# smaller variance is a rounding error.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -67,9 +69,9 @@ class Drift(eqx.Module):
 
     - `centroids`: the moved centroids (n, d), in the coordinate system and unit of the data. Masked rows are
       meaningless.
-    - `variance`: the final variance s, in the unit in which the root mean square distance of the data from
-      their mean is 1.
-    - `iterations`: the number of iterations that were run.
+    - `variance`: the final variance s of the Gaussians, after the data have been scaled such that their root
+      mean square distance from their mean is 1.
+    - `iterations`: the number of EM iterations that were run.
     """
 
     centroids: Float[Array, "n d"]
@@ -93,10 +95,11 @@ def coherent_point_drift(
     """Moves centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
 
     Each point set is first scaled to zero mean and unit variance. The defaults are those of Myronenko's
-    program, except for the rank. His program uses the exact kernel, or on request the rank sqrt(n). On a real
-    pair with 5000 vertices the map had mean geodesic errors (x 10^-3) of 22.4, 20.8 and 20.8 with rank 70,
-    300 and 1200 at k = 30. At k = 100 the errors were 17.2, 11.4 and 11.3 with rank 150, 600 and 1200. The
-    docstring of this module has the equations.
+    program, except for the rank. His program uses the exact kernel matrix by default, and optionally the rank
+    sqrt(n). The rank was varied on a real pair with 5000 vertices. With 30 eigenvectors and ranks 70, 300 and
+    1200, the mean geodesic errors are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors and ranks 150, 600 and
+    1200, the mean geodesic errors are 17.2, 11.4 and 11.3 x 10^-3. The docstring of this module contains the
+    equations.
 
     **Arguments:**
 
@@ -104,13 +107,13 @@ def coherent_point_drift(
       points.
     - `data_mask`, `centroids_mask`: masks (m,) and (n,), False for rows that are ignored; by default all rows
       are used.
-    - `width`: beta of the papers, the standard deviation of the kernel for point sets of unit variance. A
-      wider kernel moves more points together.
-    - `stiffness`: lambda of the papers, the weight of smoothness.
-    - `outliers`: w of the papers, the share of the data that no centroid explains; at least 0 and below 1.
-    - `rank`: the number of columns of the kernel factor; see `kernel_factor`.
-    - `iterations`: the largest number of iterations, at least 1.
-    - `tolerance`: the iteration stops when the relative change of the objective is below this number.
+    - `width`: beta of the papers, a positive number: the standard deviation of the Gaussian kernel for point
+      sets of unit variance. A wider kernel moves more points together.
+    - `stiffness`: lambda of the papers, a positive number: the weight of the smoothness of the displacement.
+    - `outliers`: w of the papers, the expected share of uniform noise in the data; at least 0 and below 1.
+    - `rank`: the number of columns of the kernel factor, at least 1; see `kernel_factor`.
+    - `iterations`: the largest number of EM iterations, at least 1.
+    - `tolerance`: EM stops when the relative change of the objective is at most this number.
 
     **Returns:** A `Drift`.
 
@@ -119,7 +122,8 @@ def coherent_point_drift(
     if not (width > 0 and stiffness > 0 and 0 <= outliers < 1 and rank >= 1 and iterations >= 1):
         raise ValueError(
             "coherent point drift needs a positive width, stiffness, rank and number of iterations, and "
-            f"outliers from 0 to below 1, not {width}, {stiffness}, {rank}, {iterations} and {outliers}"
+            f"outliers from 0 to below 1, but got width={width}, stiffness={stiffness}, rank={rank}, "
+            f"iterations={iterations} and outliers={outliers}"
         )
     data_mask = jnp.ones(data.shape[0], bool) if data_mask is None else data_mask
     centroids_mask = jnp.ones(centroids.shape[0], bool) if centroids_mask is None else centroids_mask
@@ -130,17 +134,18 @@ def coherent_point_drift(
 def kernel_factor(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float | Float[Array, ""], rank: int
 ) -> Float[Array, "n rank"]:
-    """Returns a factor L of the Gaussian kernel: `exp(-||p_i - p_j||^2 / 2 width^2)` is nearly `L L^T`.
+    """Returns a low-rank factor L of the Gaussian kernel matrix, so that `L L^T` approximates the matrix.
 
-    The factor is a pivoted Cholesky factorisation that stops at the given rank. Each step eliminates the
-    point with the largest residual on the diagonal. The result is a Nyström approximation on points spread
-    over the set. No point is drawn at random. The factorisation computes `rank` rows of the kernel matrix and
-    takes about `n rank^2` operations.
+    Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. A pivoted Cholesky factorisation
+    that stops at the given rank computes L. Each step eliminates the point with the largest residual on the
+    diagonal. The result is a Nyström approximation from points that are spread over the whole set. The choice
+    of these points is deterministic. The factorisation computes `rank` rows of the kernel matrix and takes
+    about `n rank^2` operations.
 
     **Arguments:**
 
     - `points`: points in d dimensions, (n, d).
-    - `mask`: False for points that are ignored, (n,).
+    - `mask`: a mask (n,), False for points that are ignored.
     - `width`: the standard deviation of the kernel, in the unit of the points.
     - `rank`: the number of columns of L.
 
@@ -175,20 +180,20 @@ def recover_by_drift(
     rank: int = 300,
     iterations: int = 50,
 ) -> Int32[Array, " m"]:
-    """Recovers a pointwise map from a functional map by Coherent Point Drift, in place of `decode`.
+    """Recovers a pointwise map from a functional map by Coherent Point Drift, as an alternative to `decode`.
 
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
     with the nearest unmasked vertex of Y.
 
-    The settings are those of a published run of the method on FAUST (k = 30, C from spectral ICP;
-    `exp_teaser` of github.com/daviddao/GPU-Programming-TUM). They are the defaults of `coherent_point_drift`
-    and 50 iterations, after which the centroids hardly move.
+    The settings are those of a published run of the method on FAUST, with 30 eigenvectors and a functional map
+    from spectral ICP (`exp_teaser` of github.com/daviddao/GPU-Programming-TUM). The run has 50 iterations, after
+    which the centroids hardly move. The other settings are the defaults of `coherent_point_drift`.
 
     **Arguments:**
 
     - `functional_map`: C (k_X, k_Y) in the pullback convention, `Phi_X^+ P Phi_Y`; C need not be orthogonal.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not.
-    - `rank`, `iterations`: see `coherent_point_drift`.
+    - `rank`, `iterations`: the arguments of `coherent_point_drift`, each at least 1.
 
     **Returns:** The pointwise map X -> Y (m,), 0-based vertices of Y.
 
@@ -210,9 +215,10 @@ class DriftRecovery(WaveletPreservation):
     """A refiner for `jaxsmw.refine` that recovers pointwise maps by Coherent Point Drift.
 
     By default there is no filter, and the functional map is the least-squares solution `Phi_X^+ P Phi_Y`,
-    which is not orthogonal. A single iteration is the recovery of the paper. Several iterations are the
-    refinement of the paper, which updates C and T alternately. (The exact update of C in the paper was not
-    available. Least squares is our choice.)
+    which is not orthogonal. A single iteration is the recovery of the paper (Rodolà, Moeller and Cremers
+    2015). Several iterations are the refinement of the paper, which updates the functional map and the
+    pointwise map alternately. The update of the functional map in the paper was not available, so least
+    squares is our choice.
 
     **Arguments:** those of `WaveletPreservation`, and
 
@@ -228,11 +234,12 @@ class DriftRecovery(WaveletPreservation):
     def __check_init__(self) -> None:
         if self.convention != "pullback":
             raise ValueError(
-                f"the convention of DriftRecovery is {self.convention}, but it moves Phi_Y C^T: use pullback"
+                f"DriftRecovery moves Phi_Y C^T, for which C must be a pullback, but the convention is "
+                f"{self.convention}: use pullback"
             )
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Returns the pointwise map X -> Y (m,) of the state's functional map; see `recover_by_drift`."""
+        """Recovers the pointwise map X -> Y (m,) from the state's functional map; see `recover_by_drift`."""
         return recover_by_drift(
             state.functional_map,
             prepared.spectrum_x,
@@ -256,7 +263,7 @@ def _drift(
     *,
     rank: int,
 ) -> Drift:
-    """`coherent_point_drift` as one compiled program for each combination of sizes and rank."""
+    """Computes `coherent_point_drift`. JAX compiles one program for each combination of sizes and rank."""
     x, mean, scale = _normalized(data, data_mask)
     y, _, _ = _normalized(centroids, centroids_mask)
     factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
@@ -286,7 +293,8 @@ def _drift(
     infinite = jnp.asarray(jnp.inf, x.dtype)
     initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The mean of all squared distances, as both sets have zero mean and a mean squared norm of 1.
+        # The mean squared distance between data and centroids, divided by d. It is 2 / d, because both sets
+        # have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,
@@ -300,7 +308,8 @@ def _drift(
 class _State(NamedTuple):
     """The state of EM between two iterations.
 
-    `objective` is the value before the last M-step, and `change` is its relative change.
+    `objective` is the value of the objective before the most recent M-step. `change` is the relative change of
+    `objective` in the most recent iteration.
     """
 
     coefficients: Float[Array, "rank d"]
@@ -311,7 +320,10 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """Sums over the probabilities P (n, m) for the M-step: `P X`, `P 1`, `P^T 1`, and the log likelihood."""
+    """The sums over the probabilities P (n, m) that the M-step needs, and the log-likelihood.
+
+    The sums are `P X`, `P 1` and `P^T 1`.
+    """
 
     weighted_data: Float[Array, "n d"]
     per_centroid: Float[Array, " n"]
@@ -322,7 +334,7 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Scales points to zero mean and mean squared norm 1, and returns the points, the mean and the scale.
+    """Shifts and scales points to zero mean and mean squared norm 1; returns them, the mean and the scale.
 
     Masked points become zero.
     """
@@ -341,7 +353,7 @@ def _expectation(
     variance: Float[Array, ""],
     outliers: Float[Array, ""],
 ) -> _Expected:
-    """The E-step, for one block of data points at a time. Shifted logarithms prevent underflow."""
+    """Computes the E-step for one block of data points at a time. Shifted logarithms prevent underflow."""
     (m, d), n = data.shape, centroids.shape[0]
     dtype, blocks = data.dtype, -(-m // _BLOCK)
     density = jnp.sum(centroids_mask).astype(dtype) / jnp.sum(data_mask).astype(dtype)
@@ -378,7 +390,7 @@ def _maximization(
     factor: Float[Array, "n rank"],
     ridge: Float[Array, ""],
 ) -> Float[Array, "rank d"]:
-    """The M-step: returns the displacement as coefficients (rank, d) of the columns of the kernel factor."""
+    """Computes the M-step. Returns the coefficients (rank, d) of the displacement in the kernel factor."""
     weights = expected.per_centroid[:, None]
     gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
     wanted = product(factor.T, expected.weighted_data - weights * centroids)
@@ -386,7 +398,7 @@ def _maximization(
 
 
 def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array, "n d"]) -> Float[Array, ""]:
-    """Returns the mean squared distance of data from centroids, weighted by probability, per dimension."""
+    """Returns the mean squared distance between data and centroids, weighted by P and divided by d."""
     squares = (
         jnp.sum(expected.per_point[:, None] * data**2)
         + jnp.sum(expected.per_centroid[:, None] * moved**2)
@@ -397,7 +409,7 @@ def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array
 
 
 CPD = Refined(
-    "Rodolà, Moeller, Cremers 2015: k = 30, 3 iterations of C and its recovery by Coherent Point Drift",
+    "Rodolà, Moeller, Cremers 2015: k = 30, 3 iterations, recovery by Coherent Point Drift",
     DriftRecovery(),
     number_of_eigenvectors=30,
 )

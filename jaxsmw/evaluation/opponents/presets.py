@@ -1,9 +1,9 @@
 """This library's own methods: MWP with a fixed number of eigenvectors, and the presets of `jaxsmw.PRESETS`.
 
 MWP is Algorithm 1 of Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
-manifold wavelets preservation*, CVPR 2021. `MWP` has the settings of the paper: 100 eigenvectors, a Meyer frame
-of 6 filters, and 3 iterations. `MWP_SAMPLED` has the same settings, but iterates on 500 samples of each shape,
-like the fast variant of the paper's authors.
+manifold wavelets preservation*, CVPR 2021. `MWP` has the settings of the paper: 100 eigenvectors, a Meyer
+frame of 6 filters, and 3 iterations. `MWP_SAMPLED` has the same settings, but iterates on 500 samples of each
+shape, like the fast variant of the paper's authors.
 """
 
 from __future__ import annotations

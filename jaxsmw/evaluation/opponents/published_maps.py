@@ -53,7 +53,7 @@ class PublishedMaps(Method):
         if missing:
             raise InputError(
                 f"{published_file(self.directory, missing[0].names)}: is missing ({len(missing)} of "
-                f"{len(pairs)} maps are missing): add the maps, or list the other pairs in a file and pass --pairs FILE."
+                f"{len(pairs)} maps are missing): add the maps, or choose pairs that have maps with --pairs FILE."
             )
 
 
