@@ -25,15 +25,15 @@ from jaxsmw.runtime.threads import side_by_side
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# The number of samples for neighbourhoods above the usual radius. Their descriptors vary more slowly over the
-# surface than descriptors with the usual radius.
+# The number of samples for descriptors with more than the usual radius. Such descriptors vary more slowly
+# over the surface than descriptors with the usual radius.
 _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
     """A shape with its compared vertices, which are the vertices at which descriptors are compared.
 
-    The compared vertices of a large mesh are samples. Those of any other mesh are all its vertices.
+    On a large mesh, the compared vertices are samples. On any other mesh, all vertices are compared vertices.
 
     **Attributes:**
 
@@ -64,8 +64,8 @@ class SampledShape(NamedTuple):
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
         """Return the row numbers of given vertices (v,) in arrays with one row per compared vertex.
 
-        The row of a vertex is the row of the nearest sample. On a shape without samples, it is the vertex
-        itself.
+        The row of a vertex is the row of the nearest sample. On a shape without samples, the row number of a
+        vertex is the vertex index itself.
         """
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
@@ -122,9 +122,9 @@ def describe(
     """Add vertex descriptors, which are principal components of SHOT, to the spectra of both shapes.
 
     SHOT is computed with a radius of 0.06 times the square root of the area. If both meshes have at least
-    2000 vertices, SHOT is also computed with two thirds of this radius, if neither mesh is too coarse for it.
-    The principal components are computed for both shapes together, and each component is scaled to mean
-    square 1 over both shapes.
+    2000 vertices and are fine enough, SHOT is also computed with two thirds of this radius. The principal
+    components are computed for both shapes together. Each component is scaled so that its mean square over
+    the areas of both shapes is 1.
 
     **Arguments:**
 
@@ -160,7 +160,7 @@ def describe(
 def _shot_at_all_radii(
     sampled: SampledPair,
 ) -> list[tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]]:
-    """Compute SHOT of both shapes with the usual radius and, if the meshes are fine enough, a smaller radius."""
+    """Compute SHOT of both shapes with the usual radius and, on fine meshes, also with the smaller radius."""
     shot = [paired_shot(sampled)]
     if min(len(mesh.vertices) for mesh in sampled.pair.meshes) >= _FINE:
         with suppress(InputError), warnings.catch_warnings():
@@ -173,7 +173,7 @@ def _shot_at_all_radii(
 def _principal_components(
     values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
 ) -> Float[np.ndarray, "n d"]:
-    """Compute the first principal components of weighted rows. Each is scaled to weighted mean square 1."""
+    """Compute the first principal components of weighted rows, each scaled to a weighted mean square of 1."""
     centered = values - weight @ values
     covariance = centered.T @ (weight[:, None] * centered)
     variances, directions = np.linalg.eigh(covariance.astype(np.float64))

@@ -2,8 +2,9 @@
 
 
 class InputError(ValueError):
-    """The error for input that cannot be used.
+    """The exception that functions raise for input that cannot be used; a subclass of `ValueError`.
 
     The message is one sentence that names the input, its fault and a remedy. The command line prints this
-    sentence and exits with code 2 before it writes a map. (A benchmark keeps the pairs that are finished.)
+    sentence and exits with code 2. Commands that match one pair check their input before they write a map. A
+    benchmark keeps the results of pairs that are finished.
     """

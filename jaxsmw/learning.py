@@ -1,4 +1,7 @@
-"""Differentiable soft maps and differentiable refinement; see `docs/gradients.md`."""
+"""Differentiable soft maps and differentiable refinement.
+
+`docs/gradients.md` explains them.
+"""
 
 from jaxsmw.core.soft_maps import (
     NearestFew,

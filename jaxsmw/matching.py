@@ -42,23 +42,26 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correspondence:
-    """The result of `match`: for every vertex of X its match, which is a vertex of Y.
+    """The result of `match`, which contains a match on Y for every vertex of X.
 
     **Attributes:**
 
-    - `pair`: the source X (m vertices), the target Y (n vertices), and whether one of them is a partial
-      shape.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `initial_map`: the map from which refinement started (m,), 0-based vertices of Y.
-    - `preset`: the stages of refinement and the settings of the repair, adapted to the size of the meshes.
-    - `spectrum_x`, `spectrum_y`: the spectra of the last stage, in `Pair.units_of_length`.
-    - `refinement`: the outcome of the last stage, with its history if requested.
+    - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
+    - `pointwise_map`: T: X -> Y (m,). Entry i is the match of vertex i of X, as a 0-based vertex of Y.
+    - `initial_map`: the map from which refinement started (m,), as 0-based vertices of Y.
+    - `preset`: the `Preset` with the stages of refinement and the settings of the repair. Their sizes are
+      adapted to small meshes, unless stages were given to `match`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the k_X and k_Y eigenvectors of the last stage.
+      Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by the same factor;
+      see `Pair.units_of_length`.
+    - `refinement`: the `Refinement` that the last stage returned, with its `History` if requested.
     - `iterations`: the total number of iterations of all stages.
-    - `distortion`: `jaxsmw.repair.scores.distortion` of the map, 1 for isometries; None if the preset has no
+    - `distortion`: `jaxsmw.repair.scores.distortion` of the map: 1 for isometries, larger for worse maps.
+      None if the preset has no repair.
+    - `suspicious`: True if limbs still look swapped or the body looks upside down. False if the preset has no
       repair.
-    - `suspicious`: whether limbs look swapped, or the body looks upside down.
-    - `seconds`: the wall time of each step, by its name. The first refinement of meshes of a given size
-      includes compilation.
+    - `seconds`: the wall time of each step in seconds, by the name of the step. The first refinement of
+      meshes of a given size includes compilation.
     """
 
     pair: Pair
@@ -91,26 +94,30 @@ class Correspondence:
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
-        """The last functional map, in the convention of the last refiner.
+        """The functional map of the last iteration, in the convention of the last stage's refiner.
 
-        Its shape is (k_X, k_Y) for a pullback and (k_Y, k_X) for a pushforward.
+        The shape is (k_X, k_Y) for a pullback, from functions on Y to functions on X. The shape is (k_Y, k_X)
+        for a pushforward, from functions on X to functions on Y.
         """
         return np.asarray(self.refinement.functional_map)
 
     def surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of X as a point on a triangle of Y.
 
-        The point is the nearest point on the triangles of Y in the embeddings of the last stage, whereas
-        `pointwise_map` contains the nearest vertex; see `jaxsmw.functional_maps.decode_to_triangles`. An
-        unreferenced vertex of X gets the point of the nearest referenced vertex.
+        The last stage embeds X and Y in a common space. Each vertex of X is mapped to the nearest point on
+        the triangles of Y in this space, whereas `pointwise_map` contains the nearest vertex; see
+        `jaxsmw.functional_maps.decode_to_triangles`. An unreferenced vertex of X gets the point of the
+        nearest referenced vertex.
 
-        **Returns:** m surface points on Y. Their faces are rows of `mesh_y.faces`.
+        **Returns:** `SurfacePoints` on Y, one for each of the m vertices of X: the faces, as rows of
+        `mesh_y.faces` (m,), and barycentric weights (m, 3).
         """
         with self._precision():
             faces, traced_weights = compiled(nearest_point_on_triangles)(
                 *self._embeddings(), jax.device_put(self.mesh_y.faces)
             )
-        weights = np.maximum(np.asarray(traced_weights, np.float64), 0)  # rounding errors can be negative
+        # Rounding errors can make weights negative.
+        weights = np.maximum(np.asarray(traced_weights, np.float64), 0)
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def one_to_one(self) -> Int64[np.ndarray, " m"]:
@@ -120,10 +127,10 @@ class Correspondence:
         `pointwise_map` has much smaller errors. As an exception, an unreferenced vertex of X shares the match
         of the nearest referenced vertex.
 
-        **Returns:** The map X -> Y (m,), 0-based vertices of Y.
+        **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
-        **Raises:** `InputError` if X has more referenced vertices than Y, or both have too many (see
-        `jaxsmw.geometry.one_to_one_map`).
+        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of the numbers of
+        referenced vertices is above 20 000².
         """
         queries, database = (np.asarray(points) for points in self._embeddings())
         used = self.mesh_x.referenced_vertices
@@ -134,21 +141,25 @@ class Correspondence:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
         The soft map transfers functions smoothly from Y to X (`SoftMap.pull_back`), and its pointwise map
-        covers more of Y. On four remeshed FAUST pairs, it covers 76 to 82 % of the vertices instead of 69 to
-        75 %, and its errors are between 4 % smaller and 2 % larger. One iteration takes 0.2 seconds for 5000
-        vertices, and 20 iterations are needed.
+        covers more of Y than `Correspondence.pointwise_map` covers. On four remeshed FAUST pairs, the
+        pointwise map of the soft map covers 76 to 82 % of Y's vertices instead of 69 to 75 %. Its errors are
+        between 4 % smaller and 2 % larger. One iteration takes 0.2 seconds for 5000 vertices, and 20
+        iterations are needed.
 
-        An unreferenced vertex of X is mapped like the nearest referenced vertex. A warning is given if the
-        share of misplaced area is larger than `tolerance` after the last iteration.
+        An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a warning
+        if the share of misplaced area is larger than `tolerance` after the last iteration.
 
         **Arguments:**
 
-        - `temperature`: a positive number, in the unit of `jaxsmw.learning.sinkhorn`. 0.1 gives a sharper map
-          and needs more iterations, 1 gives a softer map.
-        - `iterations`: the largest number of iterations, at least 1.
-        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. With tolerances
-          below a few hundredths, further iterations only move area across the body. This does not improve the
-          map of two different bodies.
+        - `temperature`: a positive number, in units of the area-weighted mean squared distance from the
+          embedded vertices of X to their nearest embedded vertices of Y (see `jaxsmw.learning.sinkhorn`). A
+          temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A temperature of 1 gives
+          a softer map.
+        - `iterations`: the largest number of iterations, an integer of at least 1.
+        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. This is the share
+          of the total area that vertices of Y receive in excess of their own area. With tolerances below a
+          few hundredths, further iterations only move area across the body. This does not improve the map
+          between two different bodies.
 
         **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y.
 
@@ -193,9 +204,9 @@ class Correspondence:
         return extend_to_unreferenced(self.mesh_x, expected)
 
     def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """The embeddings of the last stage, in which nearest neighbours are matches.
+        """Return the embeddings of X and Y in the last stage, in which matches are nearest neighbours.
 
-        An unreferenced vertex of X has the position of the nearest referenced vertex.
+        An unreferenced vertex of X has the same embedding as the nearest referenced vertex.
         """
         with self._precision():
             queries, database = compiled(_embeddings)(*self._last_stage())
@@ -206,7 +217,7 @@ class Correspondence:
         return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
-        """A context in which JAX uses the float type with which the map was computed."""
+        """Return a context manager in which JAX uses the float type with which the map was computed."""
         return jax.enable_x64(self.functional_map.dtype == np.float64)
 
 
@@ -233,33 +244,37 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    A warning is given if the map still looks wrong after repair.
+    The function issues a warning if the map still looks wrong after repair.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
-      may also be a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
+      argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement (see `jaxsmw.PRESETS`). Presets use fewer eigenvectors and samples on
-      small meshes. Stages are used with exactly the given sizes.
-        - `"accurate"`: three stages, with repair.
+    - `preset`: the method of refinement, which is one of the following. Presets use fewer eigenvectors and
+      samples on small meshes. Stages are used with exactly the given sizes.
+        - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
         - `"fast"`: the method of the MWP paper on samples.
         - a `Preset`.
         - a `Stage` or several stages, for example
           `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`.
-    - `init`: the initial map.
-        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: nearest neighbours in this descriptor. Only SHOT
-          distinguishes left from right. With `"shot"`, presets with repair also try alternative initial maps.
-        - `"functional"`: the functional map that preserves SHOT and commutes with the Laplacian (section 3.2
-          of the MWP paper). This initial map is smoother and has much smaller errors.
-        - an array (m,) of vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
-        - an array (l, 2) of landmarks, each row a vertex of X and its match on Y: nearest neighbours in SHOT
-          and in geodesic distances to the landmarks. Give a few landmarks on both sides of the body.
-    - `laplacian`, `eigensolver`: the computation of the eigenbases; see `jaxsmw.compute_spectrum`.
+    - `init`: the initial map, which is one of the following.
+        - `"shot"` (the default), `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
+          the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
+          With `"shot"`, presets with repair also try alternative initial maps.
+        - `"functional"`: the initial map follows from the functional map that preserves SHOT and commutes
+          with the Laplacian (section 3.2 of the MWP paper). It is smoother than the initial map `"shot"` and
+          has smaller errors. The refined map is often worse, though (docs/results.md).
+        - an array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: the given pointwise map is used.
+        - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
+          0-based: vertices are compared by SHOT and by their geodesic distances to the landmarks. Give a few
+          landmarks on both sides of the body.
+    - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
+    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`.
-    - `history`: whether to record the iterations of the last stage; see `jaxsmw.refine`.
+    - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
 
     **Returns:** A `Correspondence`. An unreferenced vertex of X (in no face) gets the match of the nearest
     referenced vertex. Unreferenced vertices of Y are never matched.
@@ -296,19 +311,20 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     """Compile the programs of all stages in the background.
 
     Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
-    compiled for more eigenvectors than vertices either, because such settings cause an error soon.
+    compiled if the preset has at least as many eigenvectors as a mesh has vertices, because `prepare` then
+    raises an error.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []
     sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
-    # The last stages are compiled first, because their compilation takes longest.
+    # The last stages are compiled first, because their compilation takes the longest time.
     return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
 
 
 def _correspondence(
     prepared: PreparedPair, preset: Preset, outcome: Outcome, seconds: dict[str, float]
 ) -> Correspondence:
-    """Make the result of `match`, and give a warning if the map looks wrong.
+    """Make the result of `match`, and issue a warning if the map looks wrong.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -353,8 +369,9 @@ def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
         f"distortion {outcome.distortion:.3f}, reverses the orientation of {mirrored:.0%} of the source's "
-        f"area, and separates {cut_off:.0%} of it by discontinuities. Correct maps have distortions up to "
-        f"{repair.suspicious} (more between non-isometric shapes, with topological noise, or for a mirror "
-        "image). Look at the map (--report, in Python jaxsmw.report.summary.write_report). If the map is "
-        f"wrong, {cure}."
+        f"area, and separates {cut_off:.0%} of the source's area by discontinuities. Correct maps between "
+        f"poses of one body have distortions up to {repair.suspicious}. Correct maps can have larger "
+        "distortions between non-isometric shapes, with topological noise, or if one shape is mirrored. "
+        "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
+        f"the map is wrong, {cure}."
     )

@@ -13,7 +13,7 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
 from jaxsmw.runtime.threads import side_by_side
 
-# The smallest number of vertices for which presets use two eigenvectors. Presets use at most half as many
+# With fewer vertices, presets would use fewer than two eigenvectors, because they use at most half as many
 # eigenvectors as vertices.
 _FEWEST_VERTICES = 4
 # The smallest allowed ratio of the smaller area to the larger area of a partial pair. A thousandth of a
@@ -23,7 +23,7 @@ _SMALLEST_PART = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """The meshes of a source X and a target Y, and the information whether one of them is a partial shape.
+    """Two meshes to be matched, the source X and the target Y, with a flag for partial shapes.
 
     `Pair.make` makes a pair and checks its arguments; the constructor checks nothing.
 
@@ -83,7 +83,7 @@ class Pair:
         return (max(roots),) * 2 if self.partial else roots
 
     def fewest_vertices(self) -> int:
-        """Return the number of referenced vertices of the mesh that has fewer of them.
+        """Return the smaller of the two meshes' numbers of referenced vertices.
 
         **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which are too few for
         matching.
@@ -93,7 +93,7 @@ class Pair:
             if number < _FEWEST_VERTICES:
                 raise InputError(
                     f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a "
-                    f"mesh with at least {_FEWEST_VERTICES} vertices, or with hundreds for a meaningful result."
+                    f"mesh with at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
                 )
         return min(used)
 
@@ -121,18 +121,20 @@ def paired_spectra(
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
     - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh, at least 1 and
       less than the number of referenced vertices.
-    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization, `"robust"`
-      also handles non-manifold and badly shaped meshes. `"auto"` chooses between both for each mesh.
+    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
+      also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
+      degenerate triangles or edges with more than two faces, else `"cotangent"`.
     - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
       `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
 
-    **Returns:** The `Spectrum` of X (m vertices, k_X eigenvectors) and that of Y (n vertices, k_Y
-    eigenvectors), with positions and normals, in `Pair.units_of_length`. For two full shapes, k_X = k_Y = k.
+    **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
+    spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
+    For two full shapes, k_X = k_Y = k.
 
     **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if the area
     of one mesh of a partial pair is less than a thousandth of the other area.
     """
-    if eigensolver == "auto":  # both shapes need the same eigensolver, because their spectra are compared
+    if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
     eigenpairs_x, eigenpairs_y = side_by_side(
         lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
@@ -157,8 +159,8 @@ def paired_spectra(
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
     """Remove the eigenpairs whose eigenvalues are not in the range of both spectra.
 
-    The largest eigenvalue of each spectrum is taken, and eigenpairs above the smaller of these two values are
-    removed. The MWP paper uses this rule for partial shapes.
+    Eigenpairs above the smaller of the two shapes' largest eigenvalues are removed. The MWP paper uses this
+    rule for partial shapes.
 
     **Arguments:**
 

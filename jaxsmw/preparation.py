@@ -1,4 +1,4 @@
-"""The computation of everything that refinement needs, for `match`, benchmarks and studies."""
+"""The computation of the spectra, the initial map, the descriptors and the samples of a pair."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-# Shapes with more vertices are not padded, because the memory for their padding outweighs the saved
-# compilation.
+# Shapes with more vertices are not padded, because the padding costs too much memory compared with the time
+# that it saves in compilation.
 _PADDED_UP_TO = 50_000
 
 
@@ -44,17 +44,18 @@ def program_size(mesh: Mesh) -> int:
 
 @dataclass(frozen=True, eq=False)
 class PreparedPair:
-    """A pair with everything that refinement needs.
+    """The result of `prepare`: a pair with the spectra, the initial map and the samples for refinement.
 
     **Attributes:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, with descriptors if
-      requested.
+    - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, without padding. They
+      contain descriptors if descriptors were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
-    - `initial_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `samples`: samples of X (s,) and of Y (s,) in farthest-point order, or None.
-    - `seconds`: the wall time of each step of the preparation, by its name.
+    - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
+    - `samples`: 0-based samples of X (s,) and of Y (s,) in farthest-point order; None if no samples were
+      requested.
+    - `seconds`: the wall time of each step of the preparation in seconds, by the name of the step.
     """
 
     pair: Pair
@@ -76,7 +77,8 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # All later maps have this type, so one compiled program serves all stages.
+        # Refinement returns int32 maps. Therefore the same compiled program accepts this map and refined
+        # maps.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
@@ -100,15 +102,21 @@ def prepare(
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `number_of_eigenvectors`, `number_of_descriptors`, `number_of_samples`: the largest numbers that any
-      stage uses. 0 descriptors or 0 samples means that none are computed.
-    - `init`: the initial map; see `match`.
-    - `laplacian`, `eigensolver`: the computation of the eigenbases; see `jaxsmw.compute_spectrum`.
-    - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. Otherwise a
-      warning is given, and the spectra have no descriptors.
+    - `pair`: a `Pair` of the source X (m vertices) and the target Y (n vertices).
+    - `number_of_eigenvectors`: the largest number of eigenvectors that a stage uses, at least 1.
+    - `number_of_descriptors`: the largest number of descriptors that a stage uses, from 0 to 352. With 0, no
+      descriptors are computed.
+    - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
+      are computed.
+    - `init`: the initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`; a pointwise map (m,)
+      or m `SurfacePoints` on Y; or landmarks (l, 2). See `match`.
+    - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
+    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
+    - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
+      function issues a warning instead, and the spectra have no descriptors.
 
-    **Returns:** The prepared pair.
+    **Returns:** A `PreparedPair` with the attributes `pair`, `spectrum_x`, `spectrum_y`, `init`,
+    `initial_map` (m,), `samples` and `seconds`.
 
     **Raises:** `InputError` for arguments that cannot be used. `ArithmeticError` if the initial map cannot be
     computed.

@@ -16,15 +16,19 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True)
 class Preset:
-    """Stages of refinement, and the settings of the repair of maps that look wrong.
+    """A method for `jaxsmw.match`: stages of refinement, and settings for the repair of maps that look wrong.
+
+    `jaxsmw.PRESETS` contains three ready presets.
 
     **Attributes:**
 
-    - `stages`: a tuple of at least one stage. The stages run in this order.
-    - `repair`: the settings that determine when and how a map is repaired; None for no repair.
+    - `stages`: a tuple of at least one `Stage`. The stages run in this order, and each stage starts from the
+      map of the previous stage.
+    - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
+      repair.
 
-    **Raises:** `InputError` if there is no stage, an attribute has another type, or the stage that repair
-    repeats does not exist or has no levels.
+    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if the stage that
+    repair repeats (`RepairSettings.stage`) does not exist or has a refiner without levels.
     """
 
     stages: tuple[Stage, ...]
@@ -42,7 +46,7 @@ class Preset:
         if not 0 <= self.repair.stage < len(self.stages):
             raise InputError(
                 f"repair repeats stage {self.repair.stage}, but the stages are 0 to {len(self.stages) - 1}: "
-                "give RepairSettings(stage=...) with one of these."
+                "give RepairSettings(stage=...) with one of these numbers."
             )
         self.stages[self.repair.stage].with_levels(self.repair.fallback_levels)
 
@@ -84,10 +88,12 @@ PRESETS: dict[PresetName, Preset] = {
         RepairSettings(stage=1),
     ),
 }
-"""The presets by name.
+"""The presets of `jaxsmw.match` by name. Each value is a `Preset`.
 
-`"fast"` is the fast variant of the MWP authors, on samples. `"paper"` has the settings of the MWP paper.
-`"accurate"` has three stages and repair; `docs/accuracy.md` measures its accuracy.
+`"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
+iterations. `"fast"` is the fast variant of the MWP authors, which iterates on 500 samples. `"accurate"` has
+three stages and repair: the stage of `"paper"`, `FeatureRegression` with up to 35 eigenvectors, and
+`Registration` with up to 200 eigenvectors. `docs/accuracy.md` measures the accuracy of `"accurate"`.
 """
 
 
@@ -98,7 +104,8 @@ def choose_preset(preset: str | Preset | Stage | Sequence[Stage]) -> Preset:
 
     - `preset`: a key of `PRESETS`, a `Preset` (which is returned unchanged), a stage, or several stages.
 
-    **Raises:** `InputError` if the name is unknown, or the argument contains no stages.
+    **Raises:** `InputError` if the name is unknown, or if the argument is not a preset, a stage or several
+    stages.
     """
     if isinstance(preset, Preset):
         return preset

@@ -1,4 +1,4 @@
-"""A stage of refinement: a refiner and its sizes, which runs as one compiled program."""
+"""A stage of refinement: a refiner and its sizes, which JAX compiles as one program."""
 
 from __future__ import annotations
 
@@ -24,23 +24,28 @@ from jaxsmw.runtime.compilation import compile_ahead, compiled
 
 @dataclass(frozen=True, init=False)
 class Stage:
-    """A refiner and the sizes with which `jaxsmw.refine` runs the refiner.
+    """A stage of refinement for `jaxsmw.match` or a `Preset`: a refiner, and the sizes with which it runs.
+
+    All arguments except `refiner` are keyword arguments. They become attributes of the same names.
 
     **Attributes:**
 
-    - `refiner`: the method, for example `WaveletPreservation(bank=Meyer(8))`.
-    - `number_of_eigenvectors`: the number of eigenvectors of each shape. For a refiner with levels, it is the
-      largest level. For other refiners, the default is 100.
-    - `iterations`: the number of iterations, at least 1. For a refiner with levels, it is the number of
-      levels. For other refiners, the default is 3.
+    - `refiner`: the method, an instance of a subclass of `Refiner`: `WaveletPreservation` (the default),
+      `FeatureRegression`, `Registration` or your own subclass. An example is
+      `WaveletPreservation(bank=Meyer(8))`.
+    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1. For a refiner with
+      levels, this number is the largest level. For other refiners, the default is 100.
+    - `iterations`: the number of iterations, at least 1. For a refiner with levels, this number is the number
+      of levels. For other refiners, the default is 3.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
-      352.
-    - `number_of_samples`: the number of samples of each shape on which the refiner iterates. The last step
-      searches all vertices. None means that all iterations use all vertices.
-    - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; see `jaxsmw.refine`.
+      352; 0 by default.
+    - `number_of_samples`: the number of samples of each shape on which the refiner iterates, at least the
+      number of eigenvectors. The last step then matches all vertices. None, the default, means that all
+      iterations use all vertices.
+    - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
-    **Raises:** `InputError` for a refiner of another type, a size that is not a whole number, is out of range
-    or contradicts the refiner's levels, or fewer samples than eigenvectors.
+    **Raises:** `InputError` if `refiner` is not a `Refiner`; if a size is not a whole number, is out of range
+    or contradicts the refiner's levels; or if there are fewer samples than eigenvectors.
     """
 
     refiner: Refiner
@@ -98,7 +103,7 @@ class Stage:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The keyword arguments of `jaxsmw.refine` that are not arrays."""
+        """The keyword arguments of `jaxsmw.refine` that this stage determines and that are not arrays."""
         return {
             "refiner": self.refiner,
             "iterations": self.iterations,
@@ -111,7 +116,12 @@ class Stage:
         The number of eigenvectors becomes the largest level, and the number of iterations becomes the number
         of levels.
 
-        **Raises:** `InputError` if the refiner has no levels, or there are fewer samples than eigenvectors.
+        **Arguments:**
+
+        - `levels`: the number of eigenvectors in each iteration.
+
+        **Raises:** `InputError` if the refiner has no levels, or if there are fewer samples than
+        eigenvectors.
         """
         if not isinstance(self.refiner, CoarseToFine):
             raise InputError(
@@ -149,14 +159,15 @@ class Stage:
     def view(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
     ) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra with the eigenvectors and descriptors that this stage uses.
+        """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        The spectra of a partial pair are cut to their `common_range`.
+        The spectra of a partial pair are then cut to a common range of eigenvalues
+        (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 
         - `spectrum_x`, `spectrum_y`: the spectra of X and Y.
-        - `partial`: whether the pair is partial.
+        - `partial`: whether one of the shapes is a partial shape.
         """
         spectra, seen = (spectrum_x, spectrum_y), []
         for spectrum in spectra:
@@ -182,13 +193,14 @@ class Stage:
         **Arguments:**
 
         - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
-        - `pointwise_map`: the map from which the stage starts (m,), 0-based vertices of Y.
+        - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y.
         - `samples`: samples of X and of Y in farthest-point order, at least `number_of_samples` of each. None
           if the stage uses no samples.
-        - `partial`: whether the pair is partial.
-        - `history`: whether to record the iterations; see `jaxsmw.refine`.
+        - `partial`: whether one of the shapes is a partial shape.
+        - `history`: whether to record a `History`; see `jaxsmw.refine`.
 
-        **Returns:** The `Refinement`. Its `result` says whether refinement succeeded.
+        **Returns:** The `Refinement`. Its attribute `result` is a status code (`RESULTS`), which tells
+        whether refinement succeeded.
         """
         arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
         settings = {**options, **self.settings, "partial": partial, "history": history}
@@ -200,7 +212,7 @@ class Stage:
         **Arguments:**
 
         - `number_x`, `number_y`: the numbers of vertices of X and of Y, including padding.
-        - `history`: whether the program records the iterations; see `jaxsmw.refine`.
+        - `history`: whether the program records a `History`; see `jaxsmw.refine`.
 
         **Returns:** A future that is done when the program is compiled.
         """
@@ -215,7 +227,7 @@ class Stage:
         return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
 
     def _outline(self, number_of_vertices: int) -> Spectrum:
-        """Return a spectrum with arrays of the right shapes. Its values are not used."""
+        """Return a spectrum of zeros, whose arrays have the shapes for which the program is compiled."""
         n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
         descriptors = jnp.zeros((n, d)) if d else None
         places = {"positions": jnp.zeros((n, 3)), "normals": jnp.zeros((n, 3))}
@@ -230,9 +242,9 @@ class Stage:
         pointwise_map: Int[Array, " m"],
         samples: Samples | None,
     ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Any]]:
-        """Return the positional and keyword arguments of `jaxsmw.refine` that are arrays.
+        """Return the positional and keyword arguments of `jaxsmw.refine` that contain arrays.
 
-        `run` and `compile_ahead` share this method, so they use the same compiled program.
+        `run` and `compile_ahead` both call this method, so both use the same compiled program.
         """
         chosen = None
         if self.number_of_samples is not None and samples is not None:
@@ -241,7 +253,7 @@ class Stage:
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """Return the size that the refiner's levels determine, or else the given size, or else the default."""
+    """Return the size that the refiner's levels require. Without levels, return the given or default size."""
     if derived is None:
         return default if given is None else given
     if given is not None and given != derived:

@@ -26,7 +26,7 @@ NAMESPACES = ("__main__", "banks", "functional_maps", "learning")
 
 
 def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
-    """Return, for each module of the library, the modules that its `from jaxsmw... import` statements import.
+    """Return, for each module of the library, the modules of the library that it imports.
 
     Names are dotted and relative to the library. A package has the name of its folder.
     """
@@ -34,12 +34,14 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
     names = {name.removesuffix(".__init__"): path for name, path in modules.items() if name != "__init__"}
     found: dict[str, set[str]] = {}
     for name, path in names.items():
-        found[name] = set()
+        imported: set[str] = set()
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxsmw"):
-                base = (node.module or "").removeprefix("jaxsmw").removeprefix(".")
-                inner = {f"{base}.{alias.name}".removeprefix(".") for alias in node.names}
-                found[name] |= {module if module in names else base for module in inner} - {""}
+            if isinstance(node, ast.Import):
+                imported |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                inner = {f"{node.module}.{alias.name}" for alias in node.names}
+                imported |= {one if one.removeprefix("jaxsmw.") in names else node.module for one in inner}
+        found[name] = {one.removeprefix("jaxsmw.") for one in imported if one.startswith("jaxsmw.")}
     return found
 
 

@@ -44,7 +44,7 @@ def assert_refused(outcome: Outcome, *, naming: str) -> None:
 
 
 def write_pair(directory: Path) -> Path:
-    """Write a body, a renumbered noisy copy and their ground truth in several formats to a directory."""
+    """Write a body, a renumbered noisy copy, and their ground truth in several formats to a directory."""
     mesh = bumpy_mesh(3)
     order = np.random.default_rng(0).permutation(len(mesh.vertices))
     truth = np.argsort(order)

@@ -10,13 +10,13 @@ import jaxtyping
 import pytest
 from threadpoolctl import threadpool_limits
 
-# The tests spend most of their time compiling small programs that run once. XLA's older loop emitters compile
-# these programs three times as fast. The flag is set only for versions of JAX that have it, because XLA ends
-# the process at an unknown flag.
+# The tests spend most of their time compiling small programs that run once. With XLA's older loop emitters,
+# this compilation takes a third of the time. The flag is set only for versions of JAX that have it, because
+# XLA ends the process at an unknown flag.
 if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
-# Recording the call stack of every operation would take a tenth of the time.
+# Recording the call stack of every operation would take 10 % of the time of the tests.
 jax.config.update("jax_include_full_tracebacks_in_locations", False)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -60,7 +60,7 @@ def one_thread_each() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Give all commands that tests start, in all workers, one common cache of compiled programs."""
+    """Give all commands that the tests start in any worker a common cache of compiled programs."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:
@@ -79,15 +79,15 @@ def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
-    """Release compiled programs after each module: the programs of all tests would take gigabytes."""
+    """Release compiled programs after each test module, because the programs of all tests take gigabytes."""
     yield
     jax.clear_caches()
 
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable the run-time type checks, as for users.
+    """Disable the run-time type checks, which only the tests use.
 
-    The type checks would raise before the library raises its own messages.
+    The type checks would raise errors before the library raises its own errors.
     """
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -27,7 +27,7 @@ def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) 
 
 
 def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a triangulated unit square."""
+    """Return the vertices and faces of a triangulated unit square."""
     y, x = np.mgrid[0 : 1 : rows * 1j, 0 : 1 : columns * 1j]
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -37,7 +37,10 @@ def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """The unit sphere as a subdivided icosahedron: 10 * 4^subdivisions + 2 vertices, and their faces."""
+    """Return the vertices and faces of the unit sphere, as an icosahedron whose faces are subdivided.
+
+    The sphere has 10 * 4^subdivisions + 2 vertices.
+    """
     golden = (1 + np.sqrt(5)) / 2
     vertices = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
     vertices = np.array(

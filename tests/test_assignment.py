@@ -1,4 +1,4 @@
-"""One-to-one maps use no target twice and have the lowest cost, compared with a search by brute force."""
+"""One-to-one maps use no target twice, and have the lowest cost according to a brute-force search."""
 
 from itertools import permutations
 

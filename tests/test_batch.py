@@ -1,4 +1,4 @@
-"""Batched pairs get the results of single pairs: with padding, on several devices, in several processes."""
+"""Pairs in a batch get the results of single pairs, with padding, several devices and several processes."""
 
 import os
 import socket
@@ -44,6 +44,7 @@ def test_at_most_17_padded_sizes_cover_4001_to_16000_vertices():
     assert len({padded_size(n) for n in range(4001, 16001)}) <= 17
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch_size", [None, 3])
 @pytest.mark.parametrize(
     ("refiner", "pairs"),
@@ -161,7 +162,7 @@ def test_the_estimated_memory_of_a_pair_agrees_with_the_compiler(m, n, k):
 
 
 def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
-    # Type checks are disabled, as for users, because they would raise before the library raises its messages.
+    # Run-time type checks are disabled, because they would raise errors before the library raises its own.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     spectra, starts = make_problem()
     with pytest.raises(ValueError, match="shape 0 is a str, but a Spectrum is needed"):
@@ -172,7 +173,7 @@ def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
         refine_pairs(spectra[:1], PAIRS, starts)
     with pytest.raises(ValueError, match="pair 0 is"):
         refine_pairs(spectra, [(0, 1, 1)], starts[:1])
-    with pytest.raises(ValueError, match="pair 0 is of float"):
+    with pytest.raises(ValueError, match="pair 0 has type float"):
         refine_pairs(spectra, PAIRS, [np.asarray(start, float) for start in starts])
     with pytest.raises(ValueError, match="initial map of pair 1"):
         refine_pairs(spectra, PAIRS, [starts[0]] * 7)
@@ -209,7 +210,7 @@ np.savez(
 
 
 def run_processes(output, count: int) -> None:
-    """Run the program in several processes that together have four devices."""
+    """Run `_PROGRAM` in several processes that together have four devices."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""BCICP: each step agrees with a plain NumPy implementation, and the method recovers known maps."""
+"""Each step of BCICP agrees with a plain NumPy implementation, and the method recovers known maps."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def permuted(mesh: Mesh, seed: int = 0) -> tuple[Mesh, Spectrum, np.ndarray]:
 
 
 def scrambled(truth: np.ndarray, mesh: Mesh, seed: int = 1) -> np.ndarray:
-    """An initial map with a tenth of random matches, and a connected cap matched to the opposite side."""
+    """An initial map with 10 % random matches, in which a connected cap is matched to the opposite side."""
     generator = np.random.default_rng(seed)
     initial_map = np.where(generator.random(len(truth)) < 0.1, generator.permutation(truth), truth)
     cap = mesh.vertices @ [0.6, 0.0, 0.8] > 0.8
@@ -68,7 +68,7 @@ def dense_adjacency(mesh: Mesh) -> np.ndarray:
 
 
 def with_wrong_disc(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The true map with a small disc matched to the opposite side, and a mask of this disc."""
+    """The true map, except that a small disc is matched to the opposite side, and a mask of this disc."""
     disc = np.linalg.norm(x.positions - x.positions[7], axis=1) < 0.12
     assert 3 < disc.sum() < 30
     t = truth.copy()
@@ -261,7 +261,7 @@ def test_impossible_arguments_are_refused(body, copy):
 
 
 def test_the_error_is_close_to_the_error_of_the_published_map(shared):
-    """The pair is a gorilla and a man, with published initial maps and a published result."""
+    """The pair consists of a gorilla and a man. Its initial maps and the result of BCICP are published."""
     directory = shared / "data" / "tosca_nonisometric"
     data_set = open_data_set(directory)
     (pair,) = [p for p in data_set.pairs if (p.source, p.target) == ("8_gorilla_02", "8_man_02")]

@@ -1,4 +1,4 @@
-"""The benchmark command: its results, its behaviour when killed, and the input it refuses."""
+"""The benchmark command returns correct results, continues after a kill, and refuses bad input."""
 
 import csv
 import json
@@ -77,7 +77,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
 
     second = subprocess.run(call, check=True, capture_output=True, text=True)
     lines = results.read_text().splitlines()
-    assert lines[: len(kept)] == kept  # a second measurement would have different times
+    assert lines[: len(kept)] == kept  # repeated measurements would have different times
     assert len(lines) == len(set(lines)) == 1 + 6 * 2
     assert second.stdout.startswith("| method | mean error |")
     assert run_command(call[3:]) == 0
@@ -296,7 +296,7 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
 
 @pytest.mark.slow
 def test_a_mirrored_map_is_compared_with_the_mirrored_truth_only_on_request(measure, tmp_path):
-    """The ground truth is the identity. The mirrored ground truth and the map are a reflection."""
+    """The ground truth is the identity. The mirrored ground truth and the map are the same reflection."""
     vertices, faces = sphere_mesh(3)
     reflected = KDTree(vertices).query(vertices * [-1, 1, 1])[1]
     data = tmp_path / "data"
@@ -398,6 +398,7 @@ def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_
     assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["results.csv", "shapes.csv"])
 @pytest.mark.parametrize("kept", [None, 0, 10])
 def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
@@ -427,7 +428,7 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
 
 @pytest.mark.slow
 def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
-    """The environment, the listeners and the compiled programs are kept. Only workers release programs."""
+    """Environment, listeners and compiled programs do not change, because only workers release programs."""
     monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
     double = jax.jit(lambda x: 2 * x)
     double(1.0)

@@ -1,4 +1,4 @@
-"""The scripts that measure speed run, on small shapes, and print complete tables."""
+"""The scripts that measure speed print complete tables for small shapes."""
 
 import sys
 from argparse import Namespace
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.study
 
 @pytest.fixture(autouse=True)
 def single_precision():
-    """The scripts measure in float32, as users run the library."""
+    """Use float32, because the scripts measure the library with its default precision."""
     with jax.enable_x64(False):
         yield
 

@@ -1,4 +1,4 @@
-"""The disk cache: equal inputs, damaged entries, unwritable directories, the size limit, many processes."""
+"""The disk cache handles bad entries, unwritable directories, a size limit and many processes."""
 
 import concurrent.futures
 import errno
@@ -166,7 +166,7 @@ def test_a_full_disk_leaves_no_unfinished_file(directory, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)
-    with pytest.warns(RuntimeWarning, match="make room there"):
+    with pytest.warns(RuntimeWarning, match="free disk space"):
         assert_same(cached("test", [INPUT], Computation()))
     assert not list(directory.iterdir())
 
@@ -198,7 +198,7 @@ def test_the_limit_removes_the_least_recently_used_entries_but_no_foreign_files(
         for file in directory.glob("test-*"):
             if file.stat().st_mtime > now + 1000:
                 os.utime(file, (now + number, now + number))
-    assert entry(0) == 0  # entry 0 was used, so now entry 1 is the oldest
+    assert entry(0) == 0  # this use of entry 0 makes entry 1 the least recently used entry
     assert entry(3) == 1
     assert not (directory / f".{'0' * 32}.npz").exists() and (directory / "thesis.npz").exists()
     assert [entry(number) for number in (0, 2, 3, 1)] == [0, 0, 0, 1]
@@ -231,7 +231,7 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
 
 @pytest.mark.slow
 def test_commands_cache_compiled_programs(tmp_path):
-    """The next process loads the programs from a directory for its processor.
+    """A second command loads the programs that the first command compiled.
 
     A disabled cache stays empty.
     """

@@ -1,4 +1,4 @@
-"""The script `calibrate_scores`: its tables are correct for known measurements."""
+"""The tables of the script `calibrate_scores` are correct for known measurements."""
 
 import sys
 from pathlib import Path
@@ -29,7 +29,8 @@ def test_tables_summarise_the_measurements():
     assert shares[2] == ["a", "1", "100.0", "100.0", "1.00", "50.00%", "20%"]
     assert shares[3] == ["b", "2", "100.0", "100.0", "-1.00", "50.00%", "0%"]
     assert len(tenths) == 12 and tenths[-1][0] == "180.0 to 200.0"
-    # The last tenth has the ten largest errors of the first pair and the ten smallest of both other pairs.
+    # The group with the largest expected errors contains the ten largest true errors of the first pair, and
+    # the ten smallest true errors of each other pair.
     assert float(tenths[-1][1]) == round(1e3 * (true[-10:].mean() + 2 * true[:10].mean()) / 3, 1)
     assert scores[2:] == [["a", "1 of 1"], ["b", "0 of 2"]]
 
@@ -43,7 +44,7 @@ def test_a_mirrored_map_has_a_worse_distortion():
     found = match(pair.source, pair.target, preset="fast")
     scores = scores_of(found)
     assert np.isfinite(list(scores.values())).all()
-    # The same map with left and right exchanged.
+    # This map equals the found map after an exchange of left and right.
     other = pair.target.vertices * (-1, 1, 1)
     mirrored = cKDTree(pair.target.vertices).query(other[found.pointwise_map])[1]
     wrong = scores_of(match(pair.source, pair.target, init=mirrored, preset="fast"))

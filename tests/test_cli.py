@@ -1,4 +1,4 @@
-"""The commands of `jaxsmw`: help texts, results, output files and notes."""
+"""The commands of `jaxsmw` print help texts, results and notes, and write their output files."""
 
 import base64
 import inspect
@@ -73,7 +73,7 @@ def test_every_command_has_a_help_text(run, command):
 
 
 def test_the_help_states_the_defaults_of_the_library(run):
-    """Names and sizes come from `jaxsmw.choices`, and the defaults there are those of the functions."""
+    """Names and sizes come from `jaxsmw.choices`, whose defaults equal the defaults of the functions."""
     words = {command: " ".join(run(command, "--help").output.split()) for command in COMMANDS}
     defaults = {name: entry.default for name, entry in inspect.signature(match).parameters.items()}
     assert f"(default: {defaults['preset']}, or paper if" in words["match"]
@@ -246,8 +246,9 @@ def test_the_report_has_all_files_settings_and_maps(run, pair, tmp_path):
     assert refined["functional"] != initial["functional"] and refined["map"] != initial["map"]
 
 
+@pytest.mark.slow
 def test_the_default_preset_is_accurate_and_options_select_paper(run, pair, tmp_path):
-    """The default preset is accurate. Options that change the paper's method need the preset paper."""
+    """The default preset is `accurate`. Options that change the paper's method need the preset `paper`."""
     maps = {}
     for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100"),
                     ("--preset", "fast"), ("--samples", "500")):  # fmt: skip
@@ -353,7 +354,7 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
         assert outcome.code == 0 and "is read with indices from 1, as usual in MATLAB" in outcome.errors
     found = scipy.io.loadmat(written)["T12"]
     np.testing.assert_array_equal(found[:, 0] - 1, np.loadtxt(tmp_path / "map.txt"))
-    # The map and the truth are both read with indices from 1, and a note says so for each.
+    # The map and the ground truth are both read with indices from 1. A note reports this for each file.
     call = ("evaluate", *meshes, tmp_path / "truth.mat", "--ground-truth", tmp_path / "truth.mat", "--quiet")
     outcome = run(*call)
     assert outcome.code == 0 and mean_error(outcome.output) == 0
@@ -482,7 +483,7 @@ def test_a_failed_computation_exits_with_1(run, pair, tmp_path, failing_match):
 
 @pytest.fixture
 def failing_match(monkeypatch) -> str:
-    """Make every match fail at once, and return the message of the failure."""
+    """Make every match fail immediately, and return the message of the failure."""
     message = "x to y: the functional map became NaN."
 
     def fail(*_, **__):
@@ -570,7 +571,7 @@ def test_the_times_account_for_the_whole_run(run, pair, tmp_path):
     assert 0.9 * wall < total <= wall + 0.01
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize(
     "arguments", [["--help"], ["match", "--help"], ["--version"], ["spectrum", "{pair}/x.off"]], ids=" ".join
 )

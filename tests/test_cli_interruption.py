@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: the process prints one line, is killed by the signal, and leaves no unfinished file."""
+"""After Ctrl-C, a process prints one line, is killed by the signal, and leaves no unfinished file."""
 
 import os
 import shlex
@@ -73,7 +73,7 @@ def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
     assert_interrupted(started(program, *call), tmp_path)
 
 
-# Python discards exceptions in functions that run at a garbage collection. JAX registers such a function.
+# Python discards exceptions in callbacks of the garbage collector. JAX registers such a callback.
 IN_GARBAGE_COLLECTION = """
     import gc
     def interrupt_late(phase, _):
@@ -114,7 +114,7 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
     call += ("--expected-error", tmp_path / "e") if program == IN_A_WRITE else ()
     process = started(program, *call)
-    if program == IN_A_WRITE:  # the interruption follows after the map is complete
+    if program == IN_A_WRITE:  # in this case the interruption comes after the map is complete
         process.wait(timeout=60)
         (tmp_path / "m").unlink()
     assert_interrupted(process, tmp_path)
@@ -135,7 +135,7 @@ def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_benchmark_prints_one_line(tmp_path):
-    """A terminal sends the signal to the workers as well, but only the main process prints a line."""
+    """A terminal also sends the signal to the workers, but only the main process prints a line."""
     data, output = tmp_path / "data", tmp_path / "output"
     data.mkdir()
     for number in range(3):
@@ -170,7 +170,7 @@ def test_an_ignored_signal_stays_ignored(pair):
 
 
 def test_a_shell_ends_its_loop_at_an_interruption(pair, tmp_path):
-    """A shell continues its loop if an interrupted command exits instead of being killed by the signal."""
+    """A shell ends its loop only if the signal kills the command, and not if the command exits by itself."""
     call = (
         sys.executable,
         "-m",

@@ -314,7 +314,7 @@ def test_clashing_paths_of_other_commands_are_refused(run, pair, tmp_path, argum
     assert_refused(run(*words, "--quiet"), naming=fault.format(t=tmp_path))
 
 
-# One call for each option that takes a path. `{path}` is the path under test.
+# Each command line tests one option that takes a path. `{path}` is the path under test.
 PATHS = {
     "SOURCE": "match {path} {y} --output {t}/m",
     "TARGET": "match {x} {path} --output {t}/m",
@@ -391,7 +391,7 @@ def test_the_largest_accepted_numbers_get_a_message_of_the_library(run, pair, tm
 
 
 def test_functions_refuse_names_that_are_too_long(tmp_path):
-    """The functions of the library, called without the command line, give the same kind of message."""
+    """Functions of the library raise the same kind of message as the command line."""
     path = tmp_path / ("n" * 300)
     for check in (check_writable, check_directory, make_directory):
         with pytest.raises(InputError, match=r"cannot be .*File name too long"):
@@ -410,5 +410,5 @@ def test_too_little_memory_is_reported_in_one_sentence(run, pair, tmp_path, monk
     assert outcome.code == 1
     assert outcome.errors == (
         "jaxsmw: this machine has too little memory (Unable to allocate 75.0 GiB): give smaller meshes, or "
-        "request fewer eigenvectors or samples.\n"
+        "smaller numbers of vertices, eigenvectors or samples.\n"
     )

@@ -14,7 +14,7 @@ from jaxsmw.report.standing import stand
 
 
 def test_oklab_matches_published_values() -> None:
-    # CSS Color Module Level 4: sRGB white, red and blue in OKLab.
+    # CSS Color Module Level 4 publishes these OKLab values for white, red and blue in sRGB.
     lab = np.array([[1, 0, 0], [0.627955, 0.224863, 0.125846], [0.452014, -0.032457, -0.311528]])
     assert np.allclose(colors._oklab_to_srgb(lab), [[1, 1, 1], [1, 0, 0], [0, 0, 1]], atol=2e-3)
 
@@ -30,7 +30,8 @@ def test_position_colors_vary_smoothly_and_differ_between_opposite_ends() -> Non
     assert color.min() >= 0 and color.max() <= 1
     edges = mesh.edges
     assert np.abs(color[edges[:, 0]] - color[edges[:, 1]]).max() < 0.2
-    # The two ends of each axis have different colours. The difference is larger on the first two axes.
+    # The two ends of the body along each axis have different colours. The colours along the first two axes
+    # differ more than along the third axis.
     ends = [(mesh.vertices[:, axis].argmin(), mesh.vertices[:, axis].argmax()) for axis in range(3)]
     difference = [np.abs(color[low] - color[high]).max() for low, high in ends]
     assert min(difference) > 0.15 and min(difference[:2]) > 0.4
@@ -75,6 +76,6 @@ def test_signed_colors_are_blue_below_zero_and_red_above() -> None:
         assert np.ptp(color[3]) < 0.03 and np.all(color[:3, 2] > color[:3, 0] + 0.2)
         assert np.all(color[4:, 0] > color[4:, 2] + 0.2)
         luminance = colors.srgb_to_linear(color) @ [0.2126, 0.7152, 0.0722]
-        # Zero has the colour of the background. Values far from zero stand out on either side.
+        # Zero has the colour of the background. Positive and negative values far from zero stand out.
         assert np.all(np.diff(luminance[3:6]) * (1 if on_dark else -1) > 0.05)
         assert np.all(np.diff(luminance[1:4]) * (-1 if on_dark else 1) > 0.05)

@@ -1,4 +1,4 @@
-"""The script `compare_frames`: stored results, refusals, measurements, summaries and figures."""
+"""The script `compare_frames` stores results, refuses bad input, measures, summarises and draws figures."""
 
 import csv
 import os
@@ -161,11 +161,11 @@ def test_only_missing_measurements_run_after_a_kill(tmp_path):
     first.send_signal(signal.SIGKILL)
     first.wait()
     begun = [line.split() for line in log.read_text().splitlines()]
-    # The workers must end, too.
+    # The worker processes must also end.
     while any(is_alive(int(pid)) for pid, *_ in begun):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    # One row is missing, and the row before is incomplete.
+    # This file lacks its last row, and the row before that row is incomplete.
     lines = results.read_bytes().splitlines(keepends=True)
     kept = [*lines[:-2], lines[-2][:-4]]
     results.write_bytes(b"".join(kept))
@@ -376,7 +376,7 @@ def test_interval_is_a_confidence_interval_of_the_mean():
 
 def test_comparison_is_paired_and_counts_failures():
     generator = np.random.default_rng(0)
-    reference = generator.uniform(10, 1000, 40)  # pairs differ far more than variants
+    reference = generator.uniform(10, 1000, 40)  # errors differ far more between pairs than between variants
     errors = reference - 1 + generator.normal(0, 0.1, 40)
     errors[:4] = reference[:4] + 2
     errors[-6:] = np.nan
@@ -394,8 +394,8 @@ def test_comparison_is_paired_and_counts_failures():
 def made_up() -> summary.Study:
     """A study with invented numbers.
 
-    On every second pair, every variant has ten times the error of the default. Low-pass variants without
-    filtering always fail.
+    On every second pair, every other variant has ten times the error of the default. Low-pass variants fail
+    on all pairs unless their update is filtering.
     """
     settings = replace(compare_frames.QUICK, pairs=4, iterations=3)
     every = variants.variants(settings.frames)
@@ -430,7 +430,7 @@ def test_study_summarises_known_numbers(made_up):
     found = made_up.comparisons[spline, "both"]
     assert found.mean == pytest.approx(55) and found.difference.mean == pytest.approx(45)
     assert found.better == 0 and found.failures == 0
-    # The map settles in iteration 1 on pairs 0, 2, …, and in iteration 2 on pairs 1, 3, ….
+    # The map settles in iteration 1 on even pairs, and in iteration 2 on odd pairs.
     assert made_up.median_settling(spline, "both") == 1.5
     assert made_up.relative_energy(spline, "faust_r") == pytest.approx(0.2)
     twin = Variant("Meyer", "least squares (area)", "pushforward")

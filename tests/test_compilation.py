@@ -28,7 +28,7 @@ def test_the_options_disable_the_library_for_matrix_products(points):
     )
     assert "__ynn_fusion" not in ours or not compiler_options()
     if jax.default_backend() == "cpu" and jax.__version_info__[:2] == (0, 10):
-        # The effect of the option is known for this version of JAX.
+        # In this version of JAX, XLA is known to use the library without these options.
         assert "__ynn_fusion" in plain and compiler_options()
 
 

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.study
 
 
 def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
-    """The method of Myronenko and Song (figure 4) with dense matrices."""
+    """Run the algorithm in Fig. 4 of the paper by Myronenko and Song, with dense matrices."""
     (m, d), n = x.shape, len(y)
     mean, (x, y) = x.mean(0), (p - p.mean(0) for p in (x, y))
     scale, (x, y) = np.sqrt((x**2).sum() / m), (p / np.sqrt((p**2).sum() / len(p)) for p in (x, y))
@@ -39,15 +39,15 @@ def dense_drift(x, y, iterations, width=2.0, stiffness=3.0, outliers=0.1):
     return mean + scale * moved, variance
 
 
-# The tests share these sizes and ranks, because every other size, rank or dtype needs another compilation.
+# The tests share these sizes and ranks, because JAX compiles the program anew for each size, rank or dtype.
 M, N, RANK, LOW_RANK = 140, 150, 150, 40
 ORDER = np.random.default_rng(1).permutation(N)[:M]
 
 
 def deformed(d=3, noise=0.0, seed=0):
-    """Return data (M, d) and centroids (N, d). The data are M of the centroids after a smooth deformation.
+    """Return data (M, d) and centroids (N, d).
 
-    Data and centroids are in different coordinate frames and units.
+    The data are a subset of M centroids after a smooth deformation, in another coordinate frame and unit.
     """
     generator = np.random.default_rng(seed)
     y = generator.uniform(-1, 1, size=(N, d))
@@ -80,7 +80,7 @@ def test_low_rank_is_close_to_the_dense_method():
 
 
 def test_float32_in_many_dimensions_does_not_underflow():
-    """Likelihoods near exp(-d/2) underflow in float32, and the noise term underflows even in float64."""
+    """For large d, likelihoods near exp(-d/2) underflow in float32, and the noise term even in float64."""
     x, y = deformed(d=300, noise=0.5)
     exact, variance = dense_drift(x, y, 4, stiffness=1e3)
     scale = np.sqrt(((x - x.mean(0)) ** 2).sum() / M)
@@ -105,7 +105,7 @@ def test_kernel_factor_of_full_rank_is_exact():
 
 
 def test_a_known_displacement_is_recovered():
-    """The deformation is too large for a nearest-neighbour search."""
+    """The deformation is so large that a nearest-neighbour search would fail."""
     x, y = deformed()
     drift = coherent_point_drift(jnp.asarray(x), jnp.asarray(y), rank=RANK)
     assert drift.iterations < 150
@@ -133,7 +133,7 @@ def test_numbers_out_of_range_raise(wrong):
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[jax.Array, Spectrum, Spectrum]:
-    """Spectra that no functional map C aligns, because the embedding of X is a deformed embedding of Y."""
+    """Two spectra that no functional map aligns, because the embedding of X is a deformed embedding of Y."""
     x, y = (
         Spectrum(jnp.arange(3.0), jnp.asarray(points), jnp.full(n, 1 / n), jnp.ones(n, bool))
         for points, n in zip(deformed(), (M, N), strict=True)
@@ -201,7 +201,7 @@ def test_refiner_recovers_by_drift(pair):
 
 
 def test_the_drift_stores_no_dense_matrix():
-    """A dense float32 matrix of 50 000 x 50 000 takes 10 GB. The program needs less than 1/20 of that."""
+    """A dense 50 000 x 50 000 matrix in float32 takes 10 GB. The program needs less than 5 % of that."""
     points = jax.ShapeDtypeStruct((50_000, 30), jnp.float32)
     compiled = jax.jit(lambda x, y: coherent_point_drift(x, y, rank=100)).lower(points, points).compile()
     assert compiled.memory_analysis().temp_size_in_bytes < 500e6

@@ -18,7 +18,7 @@ from jaxsmw.geometry.creature import (
     creature_pair,
 )
 
-# Generating a dragon takes longest.
+# The dragon takes the longest time to generate, so its tests are marked slow.
 KINDS = [pytest.param(kind, marks=pytest.mark.slow) if kind == "dragon" else kind for kind in CREATURES]
 
 
@@ -34,7 +34,7 @@ def pair(kind):
 
 @pytest.fixture(scope="module")
 def rest(kind):
-    """The source of `pair` in the rest pose."""
+    """The source body of `pair`, in the rest pose."""
     return creature(kind, vertices=1200, seed=4)
 
 
@@ -158,7 +158,7 @@ def test_a_vertex_is_the_same_point_in_every_pose(kind, pair, rest):
 
 
 def test_the_ground_truth_follows_the_deformation(kind, pair):
-    """The source vertices in the pose of the target lie at the points of the ground truth."""
+    """In the pose of the target, the source vertices coincide with the ground-truth points."""
     m, size = len(pair.source.vertices), np.sqrt(pair.target.area)
     assert pair.truth.faces.shape == (m,) and pair.truth.weights.shape == (m, 3)
     assert pair.truth.faces.min() >= 0 and pair.truth.faces.max() < len(pair.target.faces)
@@ -168,7 +168,7 @@ def test_the_ground_truth_follows_the_deformation(kind, pair):
     moved = creature(kind, vertices=1200, pose=pose_of(pair.target), seed=4).vertices
     error = np.linalg.norm(pair.truth.positions(pair.target) - moved, axis=1) / size
     assert error.mean() < 0.004 and error.max() < 0.03
-    # Neighbors stay neighbors: no vertex is projected onto another limb, or through a thin limb.
+    # Neighbouring vertices stay close, so no vertex is projected onto another limb or through a thin limb.
     edges = igl.edges(pair.source.faces)
     ends = pair.truth.positions(pair.target)[edges]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 0.2 * size

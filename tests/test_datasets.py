@@ -131,7 +131,7 @@ def test_lists_of_pairs_replace_the_pairs_of_the_layout(tmp_path):
     put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
     data_set = open_data_set(tmp_path)
     assert names(data_set) == [("dog0", "cat1"), ("cat2", "dog0")]
-    # Further pairs within a class have ground truth, too.
+    # The unlisted pairs within a class also have ground truth.
     others = {pair.names for pair in data_set.others}
     assert len(others) == 6 and ("cat10", "cat2") in others and len(data_set.shapes) == 4
     shrec19(tmp_path / "other")

@@ -1,6 +1,6 @@
-"""README and docs: code blocks run from top to bottom, and commands and their options exist.
+"""Code blocks in README and docs run from top to bottom, and the commands and options in them exist.
 
-Notebooks run when the site is built (`.ci/run`). That build also checks names and links within the site.
+Notebooks run when the site is built (`.ci/run`). The build also checks names and links within the site.
 """
 
 import argparse
@@ -28,7 +28,7 @@ PAGES = sorted(
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
 )
-# The smallest number of refinements that the code of a page computes.
+# The code of each of these pages must compute at least this number of refinements.
 REFINEMENTS = {
     "README.md": 1,
     "docs/frames.md": 3,
@@ -52,7 +52,7 @@ def code_blocks(page: str, language: str = "python") -> list[str]:
 
 
 def commands(page: str) -> list[str]:
-    """The lines of code blocks that begin with `jaxsmw` or `python`."""
+    """The lines in the code blocks of a page that begin with `jaxsmw` or `python`."""
     lines = "\n".join(code_blocks(page, "")) + "\n"
     lines += "\n".join(re.findall(r"^    (.+)$", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE))
     return [
@@ -190,7 +190,7 @@ def test_the_research_log_has_the_tables_that_code_names():
 
 
 def test_annotations_can_be_resolved():
-    """Every name in an annotation can be looked up, except types that only type checkers import."""
+    """Every name in an annotation can be looked up, except types imported only for type checkers."""
     resolved = 0
     for module in pkgutil.walk_packages(jaxsmw.__path__, "jaxsmw."):
         if module.name.startswith(("jaxsmw.report", "jaxsmw.cli", "jaxsmw.__main__")):

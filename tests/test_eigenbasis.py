@@ -1,4 +1,4 @@
-"""Eigenbases: known eigenvalues, results of an independent program, bad meshes, the approximate solver."""
+"""Eigenbases agree with known eigenvalues and an independent program, for good and bad meshes."""
 
 import warnings
 
@@ -84,7 +84,7 @@ def test_results_are_reproducible_with_canonical_signs():
 
 
 def test_components_keep_all_multiplicities():
-    """With two spheres and a triangle, eigenvalues of the sphere occur twice, and zero occurs three times."""
+    """A mesh of two spheres and a triangle has each sphere eigenvalue twice, and zero three times."""
     sphere = make_mesh(*sphere_mesh(3))
     triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
     mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
@@ -144,7 +144,7 @@ def test_impossible_numbers_of_eigenvectors_are_refused(k):
 
 
 def test_two_threads_give_the_results_of_one():
-    """This holds even if one thread finishes before the other starts."""
+    """The results are equal even if one thread finishes before the other thread starts."""
     meshes = make_mesh(*sphere_mesh(3)), body_with_arms()
     for mesh, (values, vectors, _) in zip(
         meshes, side_by_side(lambda mesh: eigenpairs(mesh, 40), *meshes), strict=True
@@ -170,7 +170,7 @@ def test_nonmanifold_meshes_use_the_robust_laplacian():
 
 def test_zero_area_faces_need_the_robust_laplacian():
     vertices, faces = grid_mesh(12, 12)
-    # A triangle without area along a boundary edge, with its third corner on that edge.
+    # This triangle along a boundary edge has no area, because its third corner is on the edge.
     sliver = make_mesh(
         np.concatenate([vertices, [(vertices[0] + vertices[1]) / 2]]), np.concatenate([faces, [[0, 1, 144]]])
     )
@@ -241,6 +241,7 @@ def test_eigenvalues_are_exact_on_shapes_far_from_weyls_law(length, monkeypatch)
     np.testing.assert_allclose(eigenvalues, np.maximum(exact[:40], 0), rtol=1e-8, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
     stiffness, areas = assemble_laplacian(bumpy_mesh(4))
@@ -276,7 +277,7 @@ def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
 
 @pytest.mark.parametrize("subdivisions", [4, 5])
 def test_the_approximation_error_does_not_grow_with_the_mesh(subdivisions):
-    """Errors do not grow with four times as many vertices in a subspace of the same dimension."""
+    """With a subspace of the same dimension, four times as many vertices do not increase the errors."""
     mesh = bumpy_mesh(subdivisions)
     exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
     np.testing.assert_allclose(approximate, exact, rtol=0.006)
@@ -324,7 +325,7 @@ def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
 
 
 def falls_back(mesh, k):
-    """Return whether the exact solver takes over. If not, check that the approximation is accurate."""
+    """Return whether the exact solver takes over. If it does not, check that the approximation is accurate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
         approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
@@ -333,7 +334,8 @@ def falls_back(mesh, k):
     return bool(caught)
 
 
-# The radius of the cells is one edge in the first case, and three edges in the second case.
+# The cells of the subspace have a radius of one edge in the first case, and of three edges in the second
+# case.
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])
@@ -403,7 +405,7 @@ def test_the_eigensolver_depends_on_the_option_and_the_size_of_the_mesh(monkeypa
     assert used == ["_lanczos", "_lanczos", "_lanczos"]
     eigenpairs(mesh, 20)
     assert used[3:] == ["_approximate", "_lanczos"]
-    # In tests, the type checker raises before the library does.
+    # In tests, the type checker raises an error before the library does.
     with pytest.raises(Exception, match="fast"):
         eigenpairs(mesh, 20, eigensolver="fast")
 

@@ -59,7 +59,7 @@ class TestReading:
         assert read_ground_truth([path], X, Y).targets.tolist() == [8, 1, 1, 2]
 
     def test_unreferenced_vertices_are_left_out(self, write):
-        """A partial shape may keep the vertices of the full shape."""
+        """The mesh of a partial shape may still contain all vertices of the full shape."""
         part = make_mesh(X.vertices, X.faces[:1], name="part")
         path = write("truth.txt", "8\n1\n2\n3\n")
         with pytest.warns(UserWarning, match=r"truth.txt: 1 of 4 points are vertices that no face of part"):
@@ -452,8 +452,8 @@ class TestStatistics:
 
 @pytest.mark.slow
 def test_errors_agree_with_published_errors_of_the_same_maps(shared):
-    # The published means are over 1000 selected vertices, with exact distances. Here the means are over other
-    # rows of the same ground truth, so the difference is mainly a sampling error.
+    # The published means use exact distances at 1000 selected vertices. This test uses other rows of the same
+    # ground truth, so the difference is mainly a sampling error.
     published = {
         ("002", "007"): {
             "T0": 362,

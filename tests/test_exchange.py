@@ -30,7 +30,7 @@ K = 12
 
 @pytest.fixture(scope="module")
 def bodies() -> tuple[Mesh, Mesh]:
-    """Two surfaces of different areas and numbers of vertices."""
+    """Two surfaces with different areas and different numbers of vertices."""
     x, (vertices, faces) = bumpy_mesh(3), sphere_mesh(2)
     return make_mesh(3 * x.vertices, x.faces, name="x"), make_mesh(vertices * [5, 7, 6], faces, name="y")
 
@@ -165,7 +165,7 @@ def test_an_eigenbasis_in_any_unit_is_scaled_to_area_1(spectra, unit, form):
 def test_vertices_without_area_are_masked(spectra):
     padded = spectra[0].pad(spectra[0].mask.shape[0] + 3)
     vectors = np.asarray(padded.eigenvectors).copy()
-    vectors[-1] = 7  # an eigensolver may leave any value there
+    vectors[-1] = 7  # an eigensolver may return any value for such a vertex
     found = make_spectrum(padded.eigenvalues, vectors, padded.vertex_areas)
     same_spectrum(found, padded, tolerance=1e-12)
 
@@ -268,7 +268,7 @@ def test_bad_spectra_end_in_one_sentence(arrays, fault):
 
 
 def test_maps_of_pyfm_equal_ours(spectra, pointwise_map):
-    """Shape 1 of pyFM is our Y, and shape 2 is our X: `FM_12` is C, `p2p_21` is T."""
+    """Shape 1 of pyFM is our Y, and shape 2 is our X, so `FM_12` is C and `p2p_21` is T."""
     convert = pytest.importorskip("pyFM.spectral", reason="pip install pyfmaps")
     x, y = spectra
     basis_1, basis_2 = np.asarray(y.eigenvectors), np.asarray(x.eigenvectors)
@@ -421,7 +421,7 @@ def test_a_shape_for_matlab_has_consistent_fields(bodies, spectra, tmp_path):
     surface = shape["surface"][0, 0]
     assert surface["X"].shape == (n, 1) and surface["TRIV"].dtype == np.float64
     np.testing.assert_array_equal(surface["TRIV"], body.faces + 1)
-    # All fields describe the surface that was scaled to area 1, like the spectrum.
+    # Like the spectrum, all fields describe the surface after scaling to area 1.
     mesh = jaxsmw.read_mesh(tmp_path / "x.mat")
     np.testing.assert_allclose(mesh.area, shape["area"].item(), rtol=1e-12)
     np.testing.assert_allclose(mesh.vertex_areas, shape["A"].diagonal(), rtol=1e-9)
@@ -451,7 +451,7 @@ def test_shapes_of_other_matlab_code_are_read(spectra, tmp_path, form, nested):
 
 
 def test_matlab_code_can_use_our_files(bodies, spectra, pointwise_map, tmp_path):
-    """C21 = S1.evecs' * S1.A * S2.evecs(T12, :), and T12 = knnsearch(S2.evecs * C21', S1.evecs)."""
+    """The code is C21 = S1.evecs' * S1.A * S2.evecs(T12, :) and T12 = knnsearch(S2.evecs * C21', S1.evecs)."""
     x, y = spectra
     ours = encode(jnp.asarray(pointwise_map), x, y)
     jaxsmw.io.write_spectrum(tmp_path / "1.mat", x, bodies[0])

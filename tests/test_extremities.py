@@ -26,7 +26,7 @@ def test_the_tips_of_arms_are_extremities():
 
 @pytest.mark.slow
 def test_distances_run_along_the_surface(creature):
-    """Distances are slightly too long, because they run along edges. Their unit is the mean remoteness."""
+    """Distances follow edges, so they are slightly too long. Their unit is the mean of `remoteness`."""
     pair, ends, _ = creature
     assert 3 <= len(ends.vertices) <= 6
     exact = geodesic_distances(pair.source, ends.vertices)[:, ends.vertices]

@@ -21,7 +21,8 @@ M, K, D = 250, 12, 5
 def pair():
     """Two spectra with descriptors, an initial map and the true map.
 
-    Y is X in another vertex order, with mixed and disturbed features. Two fifths of the initial map are random.
+    Y is X in another vertex order, with mixed features and noise. In the initial map, 40 % of the matches are
+    random.
     """
     generator = np.random.default_rng(0)
     x = random_spectrum(M, K).with_descriptors(jnp.asarray(generator.normal(size=(M, D))))
@@ -44,7 +45,7 @@ def features(spectrum):
 
 
 def predicted(moments_xx, moments_xy, moments_yy):
-    """The matrix that predicts the features of X from those of Y, and the precision of the residual."""
+    """Return the matrix that predicts the features of X from Y, and the precision matrix of the residual."""
 
     def least_squares(cross, gram):
         return cross @ np.linalg.inv(gram + 1e-3 * np.eye(len(gram)))
@@ -69,7 +70,7 @@ def test_refinement_agrees_with_the_definition(pair, partial):
             forward_squared = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t] ** 2
             distances = cdist(b, a @ reverse_matrix.T, "mahalanobis", VI=reverse_precision)
             backward_squared = distances[np.arange(M), reverse_map] ** 2
-            # The reverse map fits worse, so only the weights of Y change.
+            # The reverse map has larger residuals than the forward map, so only the weights of Y change.
             assert w_x @ forward_squared < w_y @ backward_squared
             w_y = w_y / (1 + (backward_squared / (w_x @ forward_squared)) ** 2)
             w_y /= w_y.sum()
@@ -148,7 +149,7 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
 
 @pytest.mark.slow
 def test_search_in_patches_ignores_descriptors(pair):
-    """The first map is the same as for spectra without descriptors."""
+    """The first iteration gives the same map as for spectra without descriptors."""
     x, y, initial_map, truth = pair
     maps = [
         refine(x, y, initial_map, refiner=FeatureRegression(search=search), iterations=1).pointwise_map

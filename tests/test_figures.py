@@ -1,4 +1,4 @@
-"""Figures: their contents, their files, and the inputs that they refuse."""
+"""Figures have the right contents, are saved to files, and refuse bad input."""
 
 import subprocess
 import sys
@@ -39,7 +39,7 @@ def pixels(figure: Any) -> np.ndarray:
 
 
 def panels(figure: Any) -> dict[str, np.ndarray]:
-    """The images of the bodies in a figure, by the labels of their axes."""
+    """Return the images of the bodies in a figure by the labels of their axes."""
     return {axes.get_label(): np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images}
 
 
@@ -123,7 +123,7 @@ def test_the_color_of_unknown_errors_is_explained() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_view_options_change_the_picture() -> None:
-    # Every view of this pointed body is different.
+    # This body has a pointed end, so all views of it differ.
     vertices = TALL.vertices * (1 + 0.5 * np.clip(TALL.vertices @ [[0.3], [1], [0.6]], 0, None))
     body = replace(TALL, vertices=vertices)
     images = [pixels(draw_mesh(body, up=up, azimuth=azimuth)) for up, azimuth in

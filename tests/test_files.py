@@ -1,4 +1,4 @@
-"""Reading and writing files: errors are one sentence, and no file is left half-written."""
+"""Errors while reading or writing files are one sentence, and no file is left incomplete."""
 
 import errno
 import os
@@ -49,7 +49,7 @@ def test_unwritable_paths_are_refused_and_leave_no_files(tmp_path, name):
 def test_write_protection_is_respected(tmp_path, monkeypatch):
     path = tmp_path / "kept.txt"
     path.write_text("old")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser can write in spite of permissions
+    monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser can write despite missing permissions
     with pytest.raises(InputError, match="write-protected"), atomic_write(path) as temporary:
         temporary.write_text("new")
     assert path.read_text() == "old"
@@ -136,7 +136,7 @@ def test_impossible_names_are_refused_in_one_sentence(tmp_path, name, call):
 
 
 def test_names_with_a_too_long_temporary_name_are_refused(tmp_path):
-    """The temporary name repeats the long suffix, so it exceeds the limit although the name does not."""
+    """The temporary name repeats the long suffix, so it exceeds the limit although the final name does not."""
     path = tmp_path / ("a." + "x" * 250)
     for write in (check_writable, lambda path: atomic_write(path).__enter__()):
         with pytest.raises(InputError, match="File name too long"):

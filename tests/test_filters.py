@@ -38,7 +38,8 @@ WARPS = {
     "power": Power(),
     "distribution": SpectralDistribution(),
 }
-# The banks of this table and the next are Parseval frames. The banks of this table take 5 or more filters.
+# The banks in this table and in the next table are Parseval frames. The banks in this table allow any number
+# of at least 5 filters.
 PARSEVAL_OF_ANY_SIZE = {
     "meyer": Meyer,
     "simple tight": SimpleTight,
@@ -217,7 +218,7 @@ def test_a_softmax_frame_resembles_another_bank_at_its_knots():
     for bank in (Meyer(5), Itersine(4)):
         similar = SoftmaxFrame.like(bank, 33, floor=1e-6)
         np.testing.assert_allclose(sample(similar, knots, knots), sample(bank, knots, knots), atol=1e-5)
-    # For a bank that is not tight, the proportions between the filters agree.
+    # For a bank that is not tight, only the ratios between the filters agree.
     squares = sample(Heat([1.0, 10.0]), knots, knots) ** 2
     similar = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
     np.testing.assert_allclose(similar[0], squares[0] / squares.sum(axis=0), atol=1e-3)
@@ -277,7 +278,7 @@ def test_some_banks_follow_closed_forms():
     centres = np.asarray([0, 1 / 3, 2 / 3, 1])
     gaussians = np.exp(-((relative - centres[:, None]) ** 2) / (2 * (0.4 / 3) ** 2))
     np.testing.assert_allclose(respond(Gabor(4, 0.4)), gaussians)
-    # The transition of two Meyer filters begins at one half.
+    # The transition between the filters of a Meyer frame with two filters begins at lambda_max / 2.
     np.testing.assert_allclose(respond(LowPass(0.5)), respond(Meyer(2))[:1], atol=1e-15)
     window = respond(ExponentialWindow(0.8, 2.0))[0]
     assert window[16] == pytest.approx(0.5) and (window[32:] == 0).all()
@@ -377,14 +378,14 @@ def test_banks_accept_traced_parameters():
     assert jnp.isfinite(eqx.filter_jit(lambda e: Warped(Gabor(), Power())(e, e))(eigenvalues)).all()
 
 
-# Comparison with an independent toolbox. The tables state every difference in convention.
+# The next tests compare banks with an independent toolbox. Their tables state every difference in convention.
 
 PARSEVAL_FACTOR = np.sqrt(9 / 8)  # the squared half cosines of the toolbox sum to 9/8
 
 
 def as_in_the_toolbox(lambda_max):
-    """Returns our banks by toolbox name, with factors that turn our responses into those of the toolbox."""
-    # The toolbox normalises by the scale in units of 1 / lambda.
+    """Returns our banks by their toolbox names, with factors that convert our responses to the toolbox's."""
+    # The toolbox normalises filters by a scale in units of 1 / lambda.
     scale_units = np.r_[1, np.full(5, 1 / np.sqrt(lambda_max))]
     logarithm = Logarithm(10 * lambda_max)
     half_cosines = {
@@ -432,8 +433,8 @@ def test_the_logarithm_and_regular_equal_the_independent_toolbox(shared, lambda_
     grid = jnp.asarray(reference["x"])
     warped = Logarithm(10 * lambda_max)(grid, grid)
     np.testing.assert_allclose(warped, reference["warped_log_wf"], atol=1e-10)
-    # The toolbox returns the high-pass first. Its low-pass is sqrt(1 - high²), which has half the digits
-    # near zero.
+    # The toolbox returns the high-pass filter first. It computes the low-pass filter as sqrt(1 - high²),
+    # which has only half of the correct digits near zero.
     low, high = Regular()(grid, grid)
     np.testing.assert_allclose(high, reference["regular"][:, 0], atol=1e-10)
     np.testing.assert_allclose(low**2, reference["regular"][:, 1] ** 2, atol=1e-10)
@@ -463,7 +464,8 @@ def test_values_equal_pygsp(lambda_max, filters):
         (Itersine(filters), 1, pygsp_filters.Itersine(graph, filters)),
         (HalfCosine(filters), PARSEVAL_FACTOR, pygsp_filters.HalfCosine(graph, filters)),
         (Heat(np.arange(1.0, filters)), 1, pygsp_filters.Heat(graph, np.arange(1, filters))),
-        # PyGSP scales the spectrum to [0, 2]. Its exponential window is as wide as the whole interval.
+        # PyGSP scales the spectrum to [0, 2], so its edges are twice as large. The width of its exponential
+        # window is the whole interval.
         (Held(edge), 1, pygsp_filters.Held(graph, 2 * edge)),
         (Simoncelli(edge), 1, pygsp_filters.Simoncelli(graph, 2 * edge)),
         (Papadakis(edge), 1, pygsp_filters.Papadakis(graph, 2 * edge)),

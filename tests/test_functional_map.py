@@ -68,7 +68,7 @@ def test_kernel_is_the_sum_over_scales(pair):
 
 
 def stacked(pair, pointwise_map, convention, norm):
-    """Returns the input, output and weight of every vertex of X, straight from the definition."""
+    """Returns the input, output and weight of every vertex of X, as the definition of the energy states."""
     x, y = pair
     p = permutation_matrix(pointwise_map)
     areas_x = np.asarray(x.vertex_areas)
@@ -205,21 +205,24 @@ def test_energies_add_and_scale():
 
 
 def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair, pointwise_map):
-    """Remark 4.1 holds for any T in the pushforward convention: Phi_X is orthonormal and the frame is Parseval."""
+    """Remark 4.1 of the MWP paper holds for any T in the pushforward convention with a Parseval frame.
+
+    The reason is that Phi_X is orthonormal.
+    """
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)
     energy = WaveletProblem(x, y, g_x, g_y, "pushforward").energy(pointwise_map)
     np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
     np.testing.assert_allclose(energy.condition_number(), 1, atol=1e-12)
-    # In the pullback convention the remark holds for a permuted copy of one shape.
+    # In the pullback convention, Remark 4.1 holds for a shape and a copy with permuted vertices.
     order = jnp.asarray(np.random.default_rng(5).permutation(M))
     copy = Spectrum(x.eigenvalues, x.eigenvectors[order], x.vertex_areas[order], x.mask)
     inverse = jnp.argsort(order)
     update = encode(inverse, x, copy) * multiscale_kernel(g_x, g_x)
     energy = WaveletProblem(x, copy, g_x, g_x).energy(inverse)
     np.testing.assert_allclose(energy.minimizer(), update, atol=1e-12)
-    # The identity has zero energy for this copy, because all wavelets are preserved exactly.
+    # The identity has zero energy for this copy, because it preserves all wavelets exactly.
     np.testing.assert_allclose(energy(jnp.eye(K_X)), 0, atol=1e-12)
 
 

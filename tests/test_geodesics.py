@@ -34,7 +34,7 @@ def shaken_square(side: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flat_sheet(side: int = 17, seed: int = 0) -> Mesh:
-    """A square sheet, tilted in space, whose geodesics are straight."""
+    """A flat square sheet, tilted in space. Its geodesics are straight lines."""
     square, faces = shaken_square(side, seed)
     return make_mesh(np.pad(square, ((0, 0), (0, 1))) @ Rotation.random(random_state=seed).as_matrix(), faces)
 
@@ -49,7 +49,10 @@ def blob(subdivisions: int = 3, seed: int = 0) -> Mesh:
 
 
 def book(pages: int, n: int = 7) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """Flat pages that meet in one spine, and the page and position (x from the spine, y) of each vertex."""
+    """Return a mesh of flat pages that meet in one spine, and the page and position of each vertex.
+
+    A position consists of the distance x from the spine and the coordinate y along the spine.
+    """
     square, faces = shaken_square(n, 1)
     on_spine = np.flatnonzero(square[:, 0] == 0)
     vertices, triangles, page_of, place = [], [], [], []
@@ -142,7 +145,7 @@ def test_distances_on_a_cube_are_exact():
     distances = geodesic_distances(CUBE, np.arange(8))
     np.testing.assert_allclose(distances[0], np.sqrt([0, 1, 2, 1, 1, 2, 5, 2]), rtol=1e-14)
     assert sorted(np.round(distances.ravel() ** 2).astype(int)) == [0] * 8 + [1] * 24 + [2] * 24 + [5] * 8
-    # The centres of the bottom, top and front sides of the cube, which are on diagonals.
+    # These points are the centres of the bottom, top and front sides of the cube. They are on diagonal edges.
     centres = SurfacePoints(np.array([0, 2, 4]), np.array([[0.5, 0.5, 0], [0.5, 0, 0.5], [0.5, 0, 0.5]]))
     np.testing.assert_allclose(centres.positions(CUBE), [[0.5, 0.5, 0], [0.5, 0.5, 1], [0.5, 0, 0.5]])
     first, second = np.array([0, 0, 1, 0]), np.array([1, 2, 2, 0])
@@ -362,7 +365,7 @@ def test_points_at_corners_act_as_vertices():
 def test_distances_between_points_on_a_flat_sheet_are_euclidean():
     mesh = flat_sheet()
     points, others = random_points(mesh, 1500), random_points(mesh, 1500, seed=1)
-    # Some points are on vertices, on edges, or on the same face, and some pairs are equal.
+    # Some points are on vertices or edges. Some pairs of points are on the same face, and some coincide.
     points.weights[:100], others.weights[:50] = [0, 1, 0], [0, 0, 1]
     points.weights[100:300], others.weights[200:400] = [0.3, 0, 0.7], [0.8, 0.2, 0]
     others.faces[300:600] = points.faces[300:600]
@@ -373,7 +376,7 @@ def test_distances_between_points_on_a_flat_sheet_are_euclidean():
     expected = np.linalg.norm(points.positions(mesh) - others.positions(mesh), axis=1)
     distances = geodesic_distances_between(mesh, points, others)
     assert (distances - expected).min() > -1e-12
-    assert (distances - expected)[300:900].max() < 1e-12  # on same or touching faces: straight paths
+    assert (distances - expected)[300:900].max() < 1e-12  # straight paths on equal or touching faces
     assert (distances / np.maximum(expected, 0.05) - 1).max() < 0.02
     np.testing.assert_allclose(geodesic_distances_between(mesh, others, points), distances, atol=1e-12)
     to_vertices = np.linalg.norm(points.positions(mesh)[:, None] - mesh.vertices, axis=2)
@@ -452,7 +455,7 @@ def test_graphs_are_read_from_the_cache(tmp_path, monkeypatch):
     assert geodesic_graph(mesh, depth=2).nnz < geodesic_graph(mesh).nnz
     assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 2
     geodesic_graph.cache_clear()
-    monkeypatch.setattr(geodesics, "_unfold", None)  # so another computation would fail
+    monkeypatch.setattr(geodesics, "_unfold", None)  # makes a new computation fail
     np.testing.assert_array_equal(geodesic_distances(mesh, [0, 1]), first)
 
 

@@ -62,7 +62,7 @@ def spectra(creatures):
 
 @pytest.fixture(scope="module")
 def pair(creatures, spectra):
-    """A creature in two poses, in the form that training takes."""
+    """A creature in two poses, as a `TrainingPair`."""
     meshes = creatures.source, creatures.target
     chosen = [farthest_point_samples(mesh, SAMPLES) for mesh in meshes]
     positions = [
@@ -124,7 +124,8 @@ def test_descriptors_do_not_depend_on_numbering_units_or_padding(network, creatu
     expected = np.asarray(network(spectra[0]))[:n]
     order = np.random.default_rng(0).permutation(n)
     renumbered = make_mesh(7 * mesh.vertices[order], np.argsort(order)[mesh.faces])
-    # Rounding errors are large: the eigensolver has another initial vector, and SHOT adds in another order.
+    # Rounding errors are large, because the eigensolver has another initial vector and SHOT sums in another
+    # order.
     np.testing.assert_allclose(np.asarray(network(described(renumbered)))[:n], expected[order], atol=1e-5)
     np.testing.assert_allclose(np.asarray(network(spectra[0].pad(2000)))[:n], expected, atol=1e-12)
 
@@ -156,15 +157,15 @@ def test_resumed_training_gives_the_same_result(network, pair, tmp_path, monkeyp
         (tmp_path / name).mkdir()
     whole = learn(network, pair, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        # One watched pair and three steps.
+        # The four prepared pairs serve one watched pair and three steps.
         learn(network, pair, tmp_path / "parts", prepare=InterruptedPreparation(pair, 4))
     assert [file.name for file in (tmp_path / "parts").iterdir()] == ["training_labels.eqx"]
-    again = InterruptedPreparation(pair, 5)  # four steps and one watched pair
+    again = InterruptedPreparation(pair, 5)  # for four steps and one watched pair
     resumed = learn(network, pair, tmp_path / "parts", prepare=again)
     assert again.left == 0
     for found, expected in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(found, expected)
-    # A third run has nothing left to do.
+    # A third run prepares no pair, because training is complete.
     learn(network, pair, tmp_path / "parts", prepare=InterruptedPreparation(pair, 0))
 
 

@@ -25,7 +25,7 @@ N, K = 60, 12
 
 
 def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
-    """The names of a pair, and a random spectrum with a disturbed copy as samples for training."""
+    """Return the names of a pair, and samples for training from a random spectrum and a disturbed copy."""
     generator = np.random.default_rng(seed)
     x = random_spectrum(N, K, seed=seed)
     y = Spectrum(x.eigenvalues, x.eigenvectors + 0.3 * generator.normal(size=(N, K)), x.vertex_areas, x.mask)
@@ -39,7 +39,7 @@ def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
 
 @pytest.fixture
 def pairs(monkeypatch):
-    # The vertices of random spectra are far from each other, which needs a high temperature.
+    # The vertices of random spectra are far from each other, so the soft maps need a high temperature.
     monkeypatch.setattr(learn_frame, "TEMPERATURE", 1.0)
     made = [fake_pair(seed) for seed in range(3)]
     with jax.numpy_dtype_promotion("standard"):  # optax needs standard promotion

@@ -21,12 +21,12 @@ NUMERIC, CELL, STRUCT = 6, 1, 2
 
 
 def element(kind: int, data: bytes, size: int | None = None) -> bytes:
-    """An element with a declared size, by default its true size."""
+    """Return an element with the declared size `size`, which is the true size by default."""
     return struct.pack("<II", kind, len(data) if size is None else size) + data + bytes(-len(data) % 8)
 
 
 def array(kind: int, shape: tuple[int, ...], contents: bytes = b"", size: int | None = None) -> bytes:
-    """An array named x, of the class `kind`."""
+    """Return an array named x of the MATLAB class `kind`."""
     flags, name = element(6, struct.pack("<II", kind, 0)), element(1, b"x")
     return element(14, flags + element(5, struct.pack(f"<{len(shape)}i", *shape)) + name + contents, size)
 
@@ -88,7 +88,7 @@ CONTENTS = {
 @pytest.mark.parametrize("compression", [False, True])
 @pytest.mark.parametrize("contents", CONTENTS.values(), ids=CONTENTS)
 def test_the_limit_holds_for_all_contents_together(monkeypatch, contents, compression):
-    """Numbers count as float64: 40 000 of them take 320 000 bytes."""
+    """The limit counts all numbers as float64, so 40 000 numbers take 320 000 bytes."""
     file = io.BytesIO()
     scipy.io.savemat(file, contents, do_compression=compression)
     monkeypatch.setattr(mat_format, "largest_contents", lambda size: 300_000)

@@ -157,7 +157,7 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
 
 @pytest.mark.slow
 def test_the_reverse_map_of_registration_compares_all_columns():
-    """Above 15 000 vertices the search uses patches, even if columns outnumber eigenvectors."""
+    """Above 15 000 vertices the search uses patches, even if an embedding has more columns than eigenvectors."""
     creature = creature_pair(vertices=15_600)
     truth = creature.truth.nearest_corners(creature.target)
     stage = Stage(Registration((20, 30)), number_of_samples=400)
@@ -169,7 +169,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
     expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
     agree = reverse == expected
-    # Two vertices can be equally near, to the precision of float32.
+    # In float32, two vertices can have the same distance.
     apart = np.linalg.norm(queries[reverse] - database, axis=1) - np.linalg.norm(
         queries[expected] - database, axis=1
     )
@@ -198,7 +198,7 @@ def test_pairs_of_similar_size_share_compiled_programs(caplog):
     match(pairs[0].source, pairs[0].target, preset=STAGE)
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         found = match(pairs[1].source, pairs[1].target, preset=STAGE, history=False)
-    assert "jit(pad)" in caplog.text  # padding is compiled for each size
+    assert "jit(pad)" in caplog.text  # JAX compiles the padding anew for each size
     assert "jit(refine)" not in caplog.text and "jit(nearest_neighbor)" not in caplog.text
     m = len(pairs[1].source.vertices)
     assert found.refinement.pointwise_map.shape == found.spectrum_x.mask.shape == (m,)
@@ -214,6 +214,7 @@ def test_scale_and_rotation_do_not_matter(pair):
     assert np.mean(plain.pointwise_map == other.pointwise_map) > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("init", ["shot", "wks", "hks", "wavelet", "landmarks", "map"])
 def test_every_initial_map_is_better_than_chance_and_differs_from_shot(pair, init):
     mesh_x, mesh_y, truth = pair
@@ -309,7 +310,7 @@ def test_unreferenced_vertices_do_not_change_other_matches(pair):
 
 
 def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
-    """OpenBLAS threads that wait for work slow down everything except linear algebra."""
+    """Waiting OpenBLAS threads slow down all other computations, so refinement runs with one BLAS thread."""
 
     def threads() -> list[int]:
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
@@ -320,7 +321,7 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
     meanwhile: list[list[int]] = []
     monkeypatch.setattr(matching, "refine_in_stages", watched)
-    threads_module._libraries.cache_clear()  # other tests load libraries with a BLAS of their own
+    threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()
         match(*pair[:2], **OPTIONS)
@@ -407,7 +408,8 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
         monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *spectra))
     assert len(starts) == 3
-    # Spectra with descriptors add maps from pairings of extremities. This body adds only one map.
+    # For spectra with descriptors, pairings of extremities give further initial maps. This body gives only
+    # one.
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
     without = RepairSettings(alternatives=())
@@ -481,7 +483,8 @@ def test_presets_match_a_copy_accurately(pair):
 
 def test_presets_fit_small_meshes(monkeypatch):
     """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
-    # Beartype, which only tests use, captures warnings. In a compilation thread it would capture ours, too.
+    # Beartype, which only tests use, captures warnings. In a compilation thread, it would also capture our
+    # warnings.
     monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):
@@ -585,6 +588,7 @@ def test_a_partial_shape_is_matched_to_the_full_shape(part):
     assert mean_error(mesh_y, as_wholes.pointwise_map, truth) > 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("init", ["functional", np.array([[0, 0], [900, 900]])], ids=str)
 def test_other_initial_maps_work_for_partial_shapes(part, init):
     mesh_x, mesh_y, truth = part
@@ -626,7 +630,7 @@ def test_unreferenced_vertices_share_matches_one_to_one(pair):
     found = result.one_to_one()
     assert found.dtype == np.int64 and found[-1] == found[0]
     np.testing.assert_array_equal(np.sort(found[:-1]), np.arange(len(truth)))
-    # Both meshes have one triangulation, so one-to-one matches need not be worse.
+    # Both meshes have the same triangulation, so one-to-one matches need not be worse.
     assert mean_error(mesh_y, found[:-1], truth) <= mean_error(mesh_y, result.pointwise_map[:-1], truth)
     with pytest.raises(InputError, match=r"2562 vertices of the source .* 642 .* swap"):
         match(mesh_x, bumpy_mesh(3), **OPTIONS).one_to_one()

@@ -1,4 +1,4 @@
-"""Meshes: checks and cleaning, properties, every file format in both directions, and hostile files."""
+"""Meshes are checked and cleaned, have correct properties, survive all file formats, and refuse bad files."""
 
 import dataclasses
 import errno
@@ -156,7 +156,7 @@ def test_distant_vertices_are_accepted_within_the_limits(scale):
 def test_cleaning_drops_faces_and_keeps_vertices():
     faces = [[0, 1, 2], [2, 1, 0], [1, 1, 3], [0, 2, 3], [3, 0, 2], [0, 1, 2]]
     mesh = make_mesh([*SQUARE, [9, 9, 9]], faces, notes=["From afar."])
-    assert mesh.faces.tolist() == SQUARE_FACES, "the first of equal faces stays, in place"
+    assert mesh.faces.tolist() == SQUARE_FACES, "the first of several equal faces must keep its place"
     assert len(mesh.vertices) == 5 and mesh.referenced_vertices.tolist() == [True] * 4 + [False]
     assert mesh.notes == (
         "From afar.",
@@ -181,7 +181,7 @@ def test_welding_closes_a_seam_without_renumbering():
     assert np.array_equal(welded.vertices[welded.faces], seam.vertices[seam.faces])
     found = diagnose(welded)
     assert (found.components, found.boundary_edges, found.unreferenced_vertices) == (1, 0, 18)
-    # Faces use the lowest-numbered of the vertices at the same position.
+    # Among vertices at the same position, faces use the vertex with the lowest number.
     for i in np.flatnonzero(welded.referenced_vertices):
         assert i == (seam.vertices == seam.vertices[i]).all(axis=1).argmax()
     assert any("Welding changed" in note for note in welded.notes)
@@ -241,12 +241,12 @@ def test_properties_of_an_octahedron_follow_closed_forms():
 
 
 def test_normals_are_zero_where_they_cancel():
-    # The front is one triangle and the back is two triangles, so rounding leaves a residue.
+    # The front consists of one triangle and the back of two triangles, so rounding leaves a residue.
     corners = np.array(
         [[0.1, 0.2, 0.3], [1, 0, 0.5], [0, 1, 0.7], [1, 0, 0.5], [0, 1, 0.7], [0.3, 0.7, 0.64]]
     )
     mesh = make_mesh(corners, [[0, 1, 2], [0, 5, 3], [0, 4, 5]])
-    assert mesh._area_vectors.sum(axis=0).any(), "otherwise the test is trivial"
+    assert mesh._area_vectors.sum(axis=0).any(), "without rounding errors the test is trivial"
     assert (mesh.vertex_normals[0] == 0).all()
     assert np.allclose(np.linalg.norm(mesh.vertex_normals[1:], axis=1), 1)
 
@@ -360,7 +360,7 @@ PLY_CODES = {
 
 
 def ply(encoding: str, elements, newline: str = "\n") -> bytes:
-    """A PLY file from (name, [(property, type, length type or None)], rows) with rows as lists of values."""
+    """Return a PLY file. An element is (name, [(property, type, length type or None)], rows of values)."""
     order = ">" if "big" in encoding else "<"
     header, body = ["ply", f"format {encoding} 1.0", "comment made by hand"], b""
     for name, properties, rows in elements:
@@ -521,7 +521,7 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
 
 
 def test_welding_reports_that_it_changed_nothing(saved):
-    """One case is an STL file, because the reader already merges its corners."""
+    """One case is an STL file, whose corners the reader already merges."""
     path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
     plain, welded = read_mesh(path), read_mesh(path, weld=True)
     assert same_mesh(plain, welded) and diagnose(plain).components == 1
@@ -538,7 +538,7 @@ def test_files_written_by_trimesh_are_read(tmp_path, suffix):
     mesh = bumpy_grid(9)
     path = tmp_path / f"m.{suffix}"
     exporter = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert len(exporter.vertex_normals) == len(mesh.vertices)  # trimesh exports normals after computing them
+    assert len(exporter.vertex_normals) == len(mesh.vertices)  # trimesh exports only computed normals
     exporter.export(path)
     again = read_mesh(path)
     if suffix == "stl":
@@ -811,7 +811,7 @@ def scratch(tmp_path_factory) -> Path:
 
 
 def read_or_refuse(path: Path) -> None:
-    """Read a file; the result must be a sound mesh or an error of one sentence."""
+    """Read a file. The result must be a valid mesh or an error message of one sentence."""
     try:
         mesh = read_mesh(path)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Opponents agree with plain NumPy programs of their papers, and solve cases with a known result."""
+"""Opponents agree with plain NumPy implementations of their papers, and solve cases with a known result."""
 
 from dataclasses import replace
 
@@ -78,7 +78,7 @@ def test_spectral_icp_takes_the_nearest_rotation(pair):
 
 
 def test_all_methods_repair_a_noisy_initial_map():
-    """X is Y with its vertices in another order, and a tenth of the initial map is wrong."""
+    """X is Y with its vertices in another order, and 10 % of the initial matches are wrong."""
     generator = np.random.default_rng(0)
     mesh_y = bumpy_mesh(3)
     y = compute_spectrum(mesh_y, 120)
@@ -94,9 +94,10 @@ def test_all_methods_repair_a_noisy_initial_map():
     pair = MethodInput.of(prepared, ("X", "Y"))
     for name, method in METHODS.items():
         if method.both_directions or method.partial_only:
-            continue  # because the method needs meshes: tests/test_bcicp.py, tests/test_partial_functional_maps.py
+            continue  # tests/test_bcicp.py and tests/test_partial_functional_maps.py test these methods
         if isinstance(method, ZoomOut):
-            method = replace(method, step=50)  # because every size is compiled
+            # JAX compiles the program anew for each size, so large steps save time.
+            method = replace(method, step=50)
         found, result = method(pair)
         assert result == RESULTS.successful
         wrong = np.mean(np.asarray(found)[:n] != order)
@@ -105,7 +106,7 @@ def test_all_methods_repair_a_noisy_initial_map():
 
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
-    """The other libraries see neither padding nor unreferenced vertices, and their maps use our vertex numbers."""
+    """Other libraries get no padding and no unreferenced vertices, and their maps use our vertex numbers."""
     peers = installed_peers()
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")
@@ -116,7 +117,7 @@ def test_other_libraries_run_the_same_zoomout():
     initial_map = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
     samples = (jnp.arange(200), jnp.arange(200))
     expected, _ = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
-    # An unreferenced vertex at the beginning, and padding at the end.
+    # These spectra have an unreferenced vertex at the beginning, and padding at the end.
     x, y = (
         Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
         for s in (x.pad(320), y.pad(310))

@@ -1,4 +1,4 @@
-"""The page as a file: its data, its size and the inputs that it refuses."""
+"""The file of a page contains the right data, is small, and is not written for bad input."""
 
 import hashlib
 import json
@@ -78,7 +78,7 @@ def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     assert '<p data-for="error-0">How far &amp; wide. ' in page
     assert '<p data-for="error-1">Expected &lt;error&gt; of every match. ' in page
     assert "{{" not in page.split("<script>")[0]
-    # The only address is the name of a namespace, which browsers do not fetch.
+    # The only address in the page is the name of an XML namespace, which browsers do not fetch.
     assert set(re.findall(r"https?://[^\s\"'`<]+", page)) == {"http://www.w3.org/1999/xhtml"}
     assert not re.search(r"<(link|iframe|object)|@import|\burl\(", page.split("<script>")[0])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
@@ -146,7 +146,7 @@ def test_viewer_bundle_is_current_licensed_and_safe_to_embed() -> None:
     assert license.strip() in viewer and "MIT" in license
     # The script must neither end its element early nor open a comment that hides the end tag.
     assert "</script" not in viewer.lower() and "<!--" not in viewer
-    # The page shows the current source of the viewer.
+    # The bundle was built from the current viewer.js.
     source = (ROOT / "scripts" / "build_viewer" / "viewer.js").read_bytes()
     assert f"Built from viewer.js with SHA-256 {hashlib.sha256(source).hexdigest()}." in viewer
     lock = json.loads((ROOT / "scripts" / "build_viewer" / "package-lock.json").read_text("utf-8"))

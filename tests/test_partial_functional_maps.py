@@ -1,4 +1,4 @@
-"""Partial functional maps: the energies equal plain NumPy programs, and the method matches a cut shape."""
+"""The energies of partial functional maps equal plain NumPy programs, and the method matches a cut shape."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +35,7 @@ K, D = 40, 8
 
 
 class Case:
-    """A full shape Y, its part above a plane as X in another vertex order, and a noisy initial map."""
+    """A full shape Y, the part X of Y above a plane in another vertex order, and a noisy initial map."""
 
     def __init__(self) -> None:
         generator = np.random.default_rng(0)
@@ -100,7 +100,7 @@ def test_weights_are_distances_from_a_slanted_diagonal():
 
 
 def flat() -> tuple[Mesh, Spectrum]:
-    """Returns a square of side 3, and its spectrum for side 1 with two padded vertices."""
+    """Returns a square of side 3, and the spectrum of a square of side 1 with two padded vertices."""
     vertices, faces = grid_mesh(9, 9)
     mesh = make_mesh(3 * vertices, faces)
     return mesh, jaxsmw.compute_spectrum(mesh, 5).pad(len(vertices) + 2)

@@ -1,4 +1,4 @@
-"""The refinement loop: its invariances, the failures that it reports, and how often it compiles."""
+"""The refinement loop has the expected invariances, reports failures, and compiles once for each size."""
 
 import subprocess
 import sys
@@ -104,7 +104,7 @@ def test_every_option_changes_the_result(name):
 
 
 def products(jaxpr):
-    """All matrix products of a program and of its nested programs."""
+    """Return all matrix products of a program and of its nested programs."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             yield equation
@@ -116,7 +116,7 @@ def products(jaxpr):
 
 @pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
 def test_products_use_the_highest_precision(pair, refiner):
-    """The default precision of GPUs is lower, but small differences can change matches."""
+    """GPUs use a lower precision by default, and small differences can change matches."""
     x, y, initial_map, _ = pair
     arrays, rest = eqx.partition((x, y, initial_map, refiner), eqx.is_array)
 
@@ -278,9 +278,9 @@ def test_vmap_over_pairs_equals_a_loop():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux for the peak memory")
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux reports peak memory in /proc")
 def test_memory_stays_far_below_all_distances():
-    """30 000 x 30 000 distances would take 3.6 GB; the whole process must use less than a fifth of that."""
+    """All 30 000 x 30 000 distances would take 3.6 GB. The process must use less than 20 % of this memory."""
     program = """
 import re
 import jax.numpy as jnp
@@ -293,7 +293,7 @@ def spectrum():
     return Spectrum(jnp.arange(k, dtype=jnp.float32), vectors, jnp.full(n, 1 / n, jnp.float32), jnp.ones(n, bool))
 t = refine(spectrum(), spectrum(), jnp.zeros(n, jnp.int32), iterations=1).pointwise_map
 assert len(np.unique(t)) > 1
-# The peak of getrusage would include the memory of the parent process before this process began.
+# getrusage is not used, because its peak would include the memory of the parent process.
 print(re.search(r"VmHWM:\\s*(\\d+) kB", open("/proc/self/status").read())[1])
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -425,7 +425,9 @@ def test_initial_maps_of_other_types_than_integers_are_refused(pair, kind):
 def test_spectra_of_different_float_types_are_refused(pair):
     x, y, initial_map, _ = pair
     single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, x)
-    with pytest.raises(ValueError, match="X is float32 and that of Y float64"):
+    with pytest.raises(
+        ValueError, match="spectrum of X has type float32, but the spectrum of Y has type float64"
+    ):
         refine(single, y, initial_map, stop_when_unchanged=True)
 
 

@@ -25,7 +25,7 @@ K = 60
 
 
 def changed(mesh, order, motion):
-    """The mesh with its vertices in another order and moved by `motion`."""
+    """Return the mesh with its vertices in another order and moved by `motion`."""
     place = np.argsort(order)
     return make_mesh(motion(mesh.vertices[order]), place[mesh.faces])
 
@@ -54,7 +54,7 @@ def pair():
 
 
 def by_definition(x: Spectrum, y: Spectrum, t, levels):
-    """The map and the embeddings of X and of Y after one iteration for each level.
+    """Return the map and the embeddings of X and of Y after one iteration for each level.
 
     The rotations are computed vertex by vertex with singular value decompositions.
     """
@@ -122,7 +122,7 @@ def test_refinement_agrees_with_the_definition(pair, number_of_descriptors):
 
 
 def test_nearest_rotations_agree_with_singular_value_decompositions():
-    """The matrices include rotations by 180 degrees, and some whose best orthogonal matrix is a reflection."""
+    """The test includes rotations by 180 degrees, and matrices whose nearest orthogonal matrix is a reflection."""
     generator = np.random.default_rng(0)
     turns = Rotation.random(40, rng=generator).as_matrix()
     covariances = np.concatenate(
@@ -151,7 +151,7 @@ def test_a_moved_copy_is_matched_exactly(pair):
     found = refine(x, y, initial_map, refiner=Registration((20, 40)), iterations=4)
     assert found.result == RESULTS.successful
     np.testing.assert_array_equal(found.pointwise_map, truth)
-    # Matched rows of both embeddings coincide.
+    # In both embeddings, the rows of matched vertices coincide.
     queries, database = Registration().embeddings(Registration().prepare(Problem(x, y)), found.state)
     np.testing.assert_allclose(queries, np.asarray(database)[truth], atol=1e-6)
 
@@ -194,6 +194,7 @@ def test_is_more_accurate_than_refiners_that_use_only_eigenfunctions():
         assert best < 0.9 * error(other)
 
 
+@pytest.mark.slow
 def test_signs_padding_and_vmap_do_not_change_the_map(pair):
     x, y, initial_map, *_ = pair
     refiner = Registration((20, 40))
@@ -277,7 +278,7 @@ def test_does_not_stop_before_the_last_level(pair):
 
 
 def test_a_single_constant_eigenvector_is_no_failure(pair):
-    """Such spectra occur if a mesh has as many connected components as requested eigenvectors."""
+    """A mesh has such a spectrum if it has as many connected components as requested eigenvectors."""
     x, y, initial_map, *_ = pair
     found = refine(x.truncate(1), y.truncate(1), initial_map, refiner=Registration())
     assert found.result == RESULTS.successful and (np.asarray(found.pointwise_map) >= 0).all()

@@ -1,4 +1,4 @@
-"""Pictures of meshes: camera, visibility and light."""
+"""Pictures of meshes have the right camera, visibility and light."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
 from jaxsmw.report.standing import stand
 
 SPHERE = stand(ellipsoid(1, 1, 1, subdivisions=4), "y")
-RADIUS = 0.5 / np.sqrt(np.pi)  # of a sphere with area 1
+RADIUS = 0.5 / np.sqrt(np.pi)  # the radius of a sphere with area 1
 
 
 def test_people_are_seen_from_the_front_and_animals_from_the_side() -> None:

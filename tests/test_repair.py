@@ -1,4 +1,4 @@
-"""Runs of stages, and the repair of maps that look wrong."""
+"""Stages run one after the other, and maps that look wrong are repaired."""
 
 from dataclasses import fields, replace
 
@@ -55,7 +55,7 @@ def identity(body):
 
 
 def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), **options):
-    """The share of the area with a wrong match, and the outcome."""
+    """Return the share of the area that has wrong matches, and the outcome of the stages."""
     mesh, spectrum = body
     prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, initial_map, initial_map)
     found = refine_in_stages(prepared, stages, repair, **options)
@@ -103,12 +103,13 @@ def test_a_map_that_looks_right_precedes_a_map_with_a_better_score(body, mirrore
 def test_the_map_on_which_three_initial_maps_agree_is_taken_if_none_looks_right(body, mirrored, identity):
     alternatives = [mirrored, identity, mirrored]
     wrong, found = outcome(body, mirrored, alternatives=alternatives)
-    assert wrong < 0.02 and not found.suspicious  # the identity looks right, so agreement does not count
+    # The identity looks right, so the agreement of initial maps is not considered.
+    assert wrong < 0.02 and not found.suspicious
     strict = replace(REPAIR, suspicious=0.5, doubtful=0.5)
     wrong, found = outcome(body, mirrored, strict, alternatives=alternatives)
     assert wrong > 0.5 and found.suspicious
     wrong, found = outcome(body, mirrored, strict, alternatives=alternatives[:2])
-    assert wrong < 0.02 and found.suspicious  # two initial maps are not enough
+    assert wrong < 0.02 and found.suspicious  # the agreement of two initial maps is not enough
     wrong, found = outcome(body, mirrored, replace(strict, agreeing=2), alternatives=alternatives[:2])
     assert wrong > 0.5 and found.suspicious
 

@@ -1,4 +1,4 @@
-"""The report of a match: its files, its texts and its times."""
+"""The report of a match has the right files, texts and times."""
 
 import json
 import re
@@ -36,11 +36,12 @@ def errors(found: Correspondence) -> dict[str, GeodesicError]:
 
 
 def read(directory: Path) -> tuple[dict[str, Any], str]:
-    """The summary and the page of a report."""
+    """Return the summary and the page of a report."""
     summary = json.loads((directory / "summary.json").read_text("utf-8"))
     return summary, (directory / "report.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_the_report_states_the_time_of_every_step_and_the_total(
     found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
 ) -> None:
@@ -64,7 +65,7 @@ def test_the_report_states_the_times_of_match_by_default(found: Correspondence, 
     summary, page = read(tmp_path)
     assert list(summary["seconds"]) == [*found.seconds, "expected error", "pictures", "total"]
     assert set(REPORT_FILES) - {path.name for path in tmp_path.iterdir()} == {"quality.png"}
-    # Without ground truth there is only the expected error, which is explained as an estimate.
+    # Without ground truth, the page shows only the expected error, and explains it as an estimate.
     assert embedded(page)["error_names"] == ["Expected error"]
     assert re.search(r'<p data-for="error-0">An estimate of the distance .* not use the true points', page)
 

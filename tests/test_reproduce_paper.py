@@ -1,4 +1,4 @@
-"""The comparisons of the paper as one command: derived data sets, results, and reports of failures."""
+"""One command repeats the comparisons of the paper, derives data sets, and reports failures."""
 
 import re
 import shutil
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.study
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    """Three deformed bumpy spheres in the layout of a remeshed set, and a directory that is no data set."""
+    """Three deformed bumpy spheres in the layout of a remeshed set, next to a directory without a data set."""
     directory = tmp_path_factory.mktemp("data")
     (directory / "papers").mkdir()
     (directory / "bumps" / "off").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Samples: far apart, evenly spread, independent of the numbering, and on the surface."""
+"""Samples are far apart, evenly spread, on the surface, and independent of the vertex numbers."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_all_referenced_vertices_can_be_samples_but_no_others():
 
 @pytest.mark.parametrize("number", [100, 400])
 def test_poisson_disk_samples_leave_neither_gaps_nor_clusters(number):
-    """One end of this mesh is much finer than the other."""
+    """One end of this mesh is much finer than the other end."""
     vertices, faces = sphere_mesh(5)
     vertices = vertices + np.array([0, 0, 0.5])
     mesh = make_mesh(vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces)
@@ -65,7 +65,7 @@ def test_poisson_disk_samples_leave_neither_gaps_nor_clusters(number):
     away = cdist(mesh.vertices, chosen)
     rows = np.arange(len(away))
     np.testing.assert_allclose(away[rows, samples.nearest], away.min(axis=1), rtol=1e-12)
-    # Every vertex has a sample nearby, up to the diagonal of a box of the grid.
+    # The distance from a vertex to its nearest sample is at most `distance` plus the diagonal of a grid box.
     assert away.min(axis=1).max() < 1.6 * distance
 
 
@@ -85,7 +85,7 @@ def test_unreferenced_vertices_are_never_samples():
 
 @pytest.mark.parametrize("radius", [1, 3])
 def test_a_maximal_independent_set_is_independent_and_maximal(radius):
-    """In graph distance, chosen vertices are farther apart than the radius, and no vertex could be added."""
+    """Chosen vertices are farther apart than the radius in graph distance, and no vertex can be added."""
     from scipy.sparse.csgraph import shortest_path
 
     mesh = bumpy()

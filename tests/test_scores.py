@@ -25,7 +25,7 @@ from jaxsmw.repair.settings import ScoreSettings
 
 @pytest.fixture(scope="module")
 def mesh():
-    """A sphere with an arm to the left and one to the right."""
+    """A sphere with an arm on the left and an arm on the right."""
     return body_with_arms()
 
 
@@ -78,7 +78,7 @@ def test_swapped_limbs_have_discontinuities_and_orientation_reversal(mesh, spect
 
 
 def test_a_right_map_between_coarse_meshes_is_not_distorted():
-    """With 200 vertices, a match is often one edge away from the truth, which is no distortion."""
+    """With 200 vertices, right matches are often one edge from the truth, which is no distortion."""
     fine, noise = body_with_arms(), np.random.default_rng(0).normal(size=(2562, 3))
     x, y = (
         make_mesh(*igl.decimate(fine.vertices + amount * noise, fine.faces, 400)[:2]) for amount in (0, 0.03)
@@ -104,14 +104,14 @@ def test_a_map_that_collapses_is_distorted(spectrum, mesh):
     shrunk = part[KDTree(mesh.vertices[part]).query(mesh.vertices)[1]]
     assert dirichlet_energy_ratio(Pair(mesh, mesh), shrunk, spectrum) < 0.8
     assert distortion(Pair(mesh, mesh), shrunk, spectrum) > 1.25
-    # For a partial pair shrinking does not count, because large parts of the full shape have no match.
+    # For a partial pair, shrinking is no distortion, because large parts of the full shape have no match.
     assert distortion(Pair(mesh, mesh, True), shrunk, spectrum) < distortion(
         Pair(mesh, mesh), shrunk, spectrum
     )
 
 
 def test_scattered_matches_are_no_distortion(spectrum, mesh):
-    """Independent errors of about one edge do not count, but a map that takes an arm to one vertex does."""
+    """Independent errors of about one edge are no distortion, but a map of an arm to one vertex is."""
     edge = np.sqrt(mesh.area / len(mesh.vertices))
     moved = mesh.vertices + edge * np.random.default_rng(0).normal(size=mesh.vertices.shape)
     _, rough = KDTree(mesh.vertices).query(moved)
@@ -124,7 +124,7 @@ def test_scattered_matches_are_no_distortion(spectrum, mesh):
 
 
 def test_swapped_arms_are_discontinuous_on_dense_meshes(mesh, monkeypatch):
-    """On dense meshes, edges between evenly spread vertices replace the edges of the mesh."""
+    """On dense meshes, discontinuities are detected on edges between evenly spread vertices."""
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, np.arange(len(mesh.vertices)))
@@ -142,7 +142,7 @@ def test_the_expected_error_of_a_perfect_map_is_zero(mesh, spectrum):
 
 
 def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
-    """The errors come from swapped limbs and from scattered matches."""
+    """The wrong maps have swapped limbs or scattered matches."""
     identity = np.arange(len(mesh.vertices))
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
@@ -164,7 +164,7 @@ def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
 
 
 def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
-    """The spectra are in float32, which would lose the digits of vertices far from the origin."""
+    """The spectra are in float32, which would lose digits of positions far from the origin."""
     near = bumpy_mesh(3)
     far = make_mesh(near.vertices + 1e5, near.faces)
     identity = np.arange(len(near.vertices))
@@ -175,7 +175,7 @@ def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
         assert dirichlet_energy_ratio(Pair(x, y), identity, spectrum) == pytest.approx(1, abs=1e-4)
 
 
-def test_same_map_ignores_details(mesh):
+def test_same_map_ignores_a_few_different_matches(mesh):
     identity = np.arange(len(mesh.vertices))
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     assert same_map(Pair(mesh, mesh), identity, identity) and not same_map(
@@ -183,7 +183,7 @@ def test_same_map_ignores_details(mesh):
     )
     few = np.arange(len(mesh.vertices)) < 5
     assert same_map(Pair(mesh, mesh), identity, np.where(few, mirrored, identity))
-    # For a partial pair, distances on the small piece are measured in the unit of the full shape.
+    # For a partial pair, distances on the small piece are small, because their unit is that of the full shape.
     piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
     moved = np.empty_like(identity)
     moved[shift] = np.roll(shift, 40)

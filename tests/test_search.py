@@ -82,7 +82,7 @@ def test_padding_changes_nothing():
 
 
 def test_float32_finds_the_same_far_from_the_origin():
-    """Scores lose digits if norms are large, so true distances decide between the two best candidates."""
+    """Search scores lose digits if norms are large, so distances decide between the two best candidates."""
     generator = np.random.default_rng(0)
     database = generator.normal(size=(1000, 10)) + 20
     queries = database[generator.permutation(1000)] + 1e-3 * generator.normal(size=(1000, 10))
@@ -102,7 +102,7 @@ def test_vmap_equals_a_loop():
 
 
 def test_search_never_stores_all_distances():
-    """All 50 000 x 50 000 distances would take 10 GB in float32. The program uses less than 1/50 of that."""
+    """All 50 000 x 50 000 distances would take 10 GB in float32. The program uses less than 2 % of that."""
     points = jax.ShapeDtypeStruct((50_000, 100), jnp.float32)
     memory = jax.jit(nearest_neighbor).lower(points, points).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 200e6
@@ -121,7 +121,7 @@ def in_patches(queries, database, *, size=20, rank=3, query_mask=None, database_
     ("m", "n", "d"), [(1, 1, 1), (3, 50, 2), (50, 3, 30), (130, 210, 5), (300, 300, 1), (257, 500, 20)]
 )
 def test_search_in_patches_equals_brute_force_for_random_points(m, n, d):
-    """No patch can be skipped for points that are spread evenly in all dimensions."""
+    """If points are spread evenly in all dimensions, the search cannot skip any patch."""
     check_against_brute_force(in_patches, m, n, d, draws=5)
 
 
@@ -134,7 +134,7 @@ def embedding():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
 def test_search_in_patches_equals_exhaustive_search_on_surfaces(embedding, dtype, noise):
-    """The noise gives a perfect map, a poor map and a random map."""
+    """The noise levels give a perfect map, a poor map and a random map."""
     generator = np.random.default_rng(0)
     turned, _ = np.linalg.qr(np.eye(30) + noise * generator.normal(size=(30, 30)) / np.sqrt(30))
     database = jnp.asarray(embedding @ (turned * generator.uniform(0.1, 1, 30)), dtype)

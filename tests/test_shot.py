@@ -24,7 +24,7 @@ def descriptors(bumpy):
 
 
 def agree(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether descriptors are equal, except at rare vertices where rounding decides a tied majority."""
+    """Return whether descriptors are equal, except at rare vertices where rounding decides a tied majority."""
     return np.mean(np.abs(a - b).max(axis=1) < 1e-6) > 0.99
 
 

@@ -1,4 +1,4 @@
-"""Sinkhorn iterations: agreement with dense iterations, and invariances."""
+"""Sinkhorn iterations agree with dense iterations, and have the expected invariances."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ compiled = jax.jit(sinkhorn, static_argnames="iterations")
 
 
 def points(m=150, n=170, d=4, seed=0, dtype=np.float64):
-    """Returns two point sets and their areas; m is more than one block of queries."""
+    """Returns two point sets and their areas. The m queries fill more than one block of queries."""
     generator = np.random.default_rng(seed)
     queries, database = generator.normal(size=(m, d)), generator.normal(size=(n, d))
     areas = {
@@ -74,7 +74,7 @@ def test_the_cost_is_close_to_the_cost_of_the_best_assignment():
     distances = cdist(queries, database, "sqeuclidean")
     least = distances[linear_sum_assignment(distances)].mean()
     more = np.sum(plan(soft) * distances) - least
-    # No plan with these marginals costs less. The entropy, which competes with the cost, is at most log 40.
+    # No plan with these marginals has a lower cost. The entropy in the objective is at most log 40.
     assert -1e-4 * distances.max() < more < float(soft.temperature) * np.log(40) < 0.4 * least
 
 
@@ -121,7 +121,7 @@ def test_vmap_equals_a_loop():
 
     together = jax.jit(jax.vmap(run))(stacked, areas)
     alone = [jax.jit(run)(*pair) for pair in pairs]
-    # The pairs need different numbers of iterations.
+    # The pairs in the batch need different numbers of iterations.
     assert len({int(soft.iterations) for soft, _, _ in alone}) > 1
     for found, expected in zip(
         jax.tree.leaves(together), zip(*map(jax.tree.leaves, alone), strict=True), strict=True
@@ -187,7 +187,7 @@ def test_iterations_converge_for_degenerate_points():
 
 
 def test_distant_rows_get_their_share():
-    """The share of a distant row underflows to zero in the first iterations in float32."""
+    """In float32, the share of a distant row underflows to zero in the first iterations."""
     (queries, database), _ = points(60, 60, 2, dtype=np.float32)
     database, ones = database.at[0].set(10.0), jnp.ones(60, jnp.float32)
     soft = compiled(

@@ -1,4 +1,4 @@
-"""Soft recoveries and differentiable refinement: limits, derivatives, memory and reported failures."""
+"""Soft recoveries and differentiable refinement have the right limits, derivatives, memory and failures."""
 
 import equinox as eqx
 import jax
@@ -65,7 +65,7 @@ def test_softmax_follows_its_definition():
     np.testing.assert_array_equal(found.pointwise_map(), distances.argmin(axis=1))
     np.testing.assert_allclose(
         dense(NearestFew(1000, 0.7), queries, database, a, b), expected, atol=1e-12
-    )  # more than there are rows
+    )  # more rows than the database has
 
 
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
@@ -111,7 +111,7 @@ def test_a_soft_map_of_one_row_each_is_a_pointwise_map(pair, convention):
 
 
 def leaves_and_directions(pair):
-    """Returns the variables of the derivatives, and one direction in each variable."""
+    """Returns the variables for which derivatives are tested, and one direction for each variable."""
     x, y, _ = pair
     leaves = {
         "eigenvalues of X": x.eigenvalues,
@@ -192,6 +192,7 @@ def test_derivatives_agree_with_finite_differences(pair, case):
         )
 
 
+@pytest.mark.slow
 def test_all_kinds_of_differentiation_agree_at_a_fixed_point(pair):
     leaves, _ = leaves_and_directions(pair)
 
@@ -310,7 +311,7 @@ def test_models_of_any_library_can_use_the_layer(pair):
     assert beside == pytest.approx(float(inside))
     np.testing.assert_allclose(slope["params"]["kernel"], slopes["params"]["kernel"])
     assert 0 < float(jnp.abs(slope["params"]["kernel"]).max()) < float("inf")
-    # A layer that is a parameter has a derivative, too.
+    # The loss also has a derivative with respect to the layer.
     assert 0 < abs(float(slopes["layer"].recovery.temperature)) < float("inf")
 
 
@@ -411,7 +412,7 @@ def test_failures_are_reported(pair):
 def test_a_common_shift_changes_nothing_in_single_precision(recovery):
     queries, database, a, b = (value.astype(jnp.float32) for value in points())
     far = jnp.asarray([[1000.0, -300.0, 500.0, 0.0]], jnp.float32)
-    queries, database = (jnp.round(p * 64) / 64 for p in (queries, database))  # so that shifts are exact
+    queries, database = (jnp.round(p * 64) / 64 for p in (queries, database))  # makes shifts exact
     expected = recovery(queries, database, a, b).pull_back(database)
     found = recovery(queries + far, database + far, a, b).pull_back(database)
     np.testing.assert_allclose(found, expected, atol=1e-4)
@@ -434,7 +435,7 @@ def test_invalid_arguments_are_refused(pair):
     with pytest.raises(ValueError, match=r"initial map has shape \(117,\)"):
         refine_softly(x, y, initial_map[:-3])
     short = Softmax()(x.eigenvectors[3:], y.eigenvectors, x.vertex_areas[3:], y.vertex_areas)
-    with pytest.raises(ValueError, match="from 117 to 120 points, but the shapes have 120 and 120"):
+    with pytest.raises(ValueError, match="from 117 to 120 points, but X has 120 vertices and Y has 120"):
         refine_softly(x, y, short)
     with pytest.raises(ValueError, match="Sinkhorn needs at least 1 iteration"):
         Sinkhorn(iterations=0)
@@ -482,7 +483,7 @@ def test_derivatives_exist_at_the_lowest_temperatures(pair, kind, dtype):
 
     differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
     one = jnp.asarray(1, dtype)
-    # At these temperatures all maps are nearest neighbours, so only the factor changes the result.
+    # At these temperatures, all soft maps equal nearest neighbours, so only the factor changes the result.
     value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
     for temperature in (1e-12, 1e-30, 1e-37):
         found, (in_temperature, in_factor) = differentiate(jnp.asarray(temperature), one)

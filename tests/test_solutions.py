@@ -1,4 +1,4 @@
-"""Solutions: the energies that they minimise, their invariances, and their failures."""
+"""Solutions minimise their energies, have the expected invariances, and report failures."""
 
 import equinox as eqx
 import jax
@@ -140,6 +140,7 @@ def test_wavelets_alone_give_the_closed_form(pair, pointwise_map, norm, conventi
     np.testing.assert_allclose(iterative, exact, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 def test_orthogonality_is_minimised_to_first_order(pair, pointwise_map, descriptors, convention):
     weights = dict.fromkeys(TERMS, 0.5)
@@ -238,6 +239,7 @@ def test_the_solver_begins_with_the_previous_functional_map(pair, pointwise_map)
     np.testing.assert_allclose(again, c, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 def test_signs_of_eigenvectors_do_not_matter(pair, pointwise_map, convention):
     generator = np.random.default_rng(0)
@@ -254,7 +256,7 @@ def test_signs_of_eigenvectors_do_not_matter(pair, pointwise_map, convention):
 
 
 class Gap(FilterBank):
-    """A bank that passes nothing in the middle of the spectrum."""
+    """A bank whose filters are zero in the middle of the spectrum."""
 
     def __call__(self, points, eigenvalues):
         return jnp.where(jnp.abs(points / eigenvalues[-1] - 0.5) < 0.2, 0.0, Meyer(3)(points, eigenvalues))
@@ -277,8 +279,9 @@ def test_a_vanishing_frame_function_is_reported(pair, pointwise_map, solution, c
     assert refine(*pair, pointwise_map, refiner=filtering).result == RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_map_to_too_few_vertices_is_reported(pair):
-    """With one target for all vertices and one filter, the gram matrix has rank one."""
+    """If all vertices have the same match and the bank has one filter, the Gram matrix has rank 1."""
 
     class Flat(FilterBank):
         def __call__(self, points, eigenvalues):
@@ -386,7 +389,7 @@ def test_descriptors_that_do_not_fit_are_refused(pair, pointwise_map):
         DescriptorPair.project(f, g[:, :2], x, y)
     swapped = DescriptorPair.project(g, f, y, x)
     solution = RegularizedLeastSquares(descriptors=swapped, descriptor_preservation=1.0)
-    with pytest.raises(ValueError, match=f"bases of {K_Y} and {K_X} eigenvectors"):
+    with pytest.raises(ValueError, match=f"expressed in {K_Y} and {K_X} eigenvectors"):
         refine(x, y, pointwise_map, refiner=WaveletPreservation(solution=solution))
 
 
@@ -463,7 +466,7 @@ def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
 
 
 def test_minimize_accepts_another_energy(pair):
-    """`minimize` accepts any sum of squares; the minimum of this energy is known."""
+    """`minimize` accepts any sum of squares. The minimum of the energy in this test is known."""
     generator = np.random.default_rng(0)
     a, target = generator.normal(size=(K_Y, 20)), generator.normal(size=(K_X, K_Y))
     b = target @ a

@@ -1,4 +1,4 @@
-"""Bodies stand upright in pictures, whatever the convention of the file."""
+"""Bodies stand upright in pictures for every direction of the up axis in the file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ def test_stand_turns_the_named_axis_up(up: Any) -> None:
     assert np.allclose(used.min(axis=0), -used.max(axis=0))
 
 
-# Rotations from y-up coordinates (x across the body, y up, z forward) to each convention.
+# The rotations convert y-up coordinates (x across the body, y up, z forward) to each convention.
 FROM_Y_UP = {
     "y": np.eye(3),
     "z": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
@@ -38,10 +38,11 @@ FROM_Y_UP = {
 
 
 def in_convention(mesh: Mesh, up: str) -> Mesh:
-    """The body of a y-up file, turned as in files of another convention."""
+    """Return a body in y-up coordinates in the coordinates of another convention."""
     return replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[up].T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["biped", "quadruped"])
 def test_up_is_guessed_in_every_convention(kind: str) -> None:
     pair = creature_pair(kind, vertices=1500)
@@ -66,7 +67,7 @@ def test_up_is_guessed_for_bodies_without_limbs() -> None:
     assert guess_up(Mesh(vertices, faces)) == "y"
     assert guess_up(Mesh(vertices[:, [0, 2, 1]], faces)) == "z"
     assert guess_up(Mesh(np.eye(3), np.array([[0, 1, 2]]))) == "z"
-    # A body that is slender along y is a person in a y-up file. Otherwise z is up.
+    # A body without limbs counts as a person with y up if it is slender along y. Otherwise z is up.
     person, animal = np.array([0.4, 1, 0.3]), np.array([0.3, 0.6, 1])
     assert guess_up(ellipsoid(*person)) == "y" and guess_up(ellipsoid(*person[[0, 2, 1]])) == "z"
     assert guess_up(ellipsoid(*animal[[0, 2, 1]])) == "z"
@@ -75,7 +76,7 @@ def test_up_is_guessed_for_bodies_without_limbs() -> None:
 @pytest.mark.parametrize(
     ("name", "up"),
     [
-        *((f"faust_r/off/tr_reg_{number}.off", "y") for number in ("002", "057", "069")),  # 057: on one leg
+        *((f"faust_r/off/tr_reg_{number}.off", "y") for number in ("002", "057", "069")),  # 057 is on one leg
         *((f"tosca_r/off/{name}.off", "z") for name in ("cat0", "cat6", "dog2", "centaur3", "michael8", "horse5")),
         *((f"smal_r/off/{name}.off", "-y") for name in ("cow_alph", "fox-05", "hippo5", "lion6", "cougar")),
         ("shrec19_r/off/10.off", "y"),
@@ -122,6 +123,7 @@ def test_a_partial_shape_keeps_its_size_next_to_the_full_shape() -> None:
     assert shown_whole.area == pytest.approx(1) and shown_part.area == pytest.approx(part.area / TALL.area)
     assert np.array_equal(shown_whole.vertices, whole.vertices)
     assert stand_pair(TALL, part)[0].area == pytest.approx(TALL.area / part.area)
-    # In another unit the full shape looks the same. A partial shape in millimetres counts as a full shape.
+    # A copy that is 1.2 times as large counts as a full shape. A copy that is 1000 times as large counts as a
+    # full shape in another unit. Both copies are scaled to area 1.
     for other in (1.2, 1000.0):
         assert stand_pair(replace(TALL, vertices=other * TALL.vertices), TALL)[0].area == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""The nearest point on triangles, compared with libigl and brute force, and its invariances."""
+"""The nearest points on triangles agree with libigl and brute force, and have the expected invariances."""
 
 import igl
 import jax
@@ -26,7 +26,7 @@ def found(queries, points, faces, **options):
 
 
 def by_brute_force(queries, points, faces):
-    """Returns distances by non-negative least squares. A heavy row makes the weights sum to one."""
+    """Returns distances by non-negative least squares, with a heavy row that makes the weights sum to 1."""
     heavy = 1e4
     distances = []
     for query in queries:
@@ -75,7 +75,7 @@ def test_points_of_the_surface_are_their_own_nearest_points(generator):
 
 @pytest.mark.parametrize("corners", [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [0, 1, 3]])
 def test_distances_to_triangles_without_area_are_exact(corners):
-    """The triangles degenerate to a point, to a segment, and to three points in a row."""
+    """The degenerate triangles are a point, a segment, and three collinear points."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 5, 0], [2, 0, 0]])
     queries = np.array([[0.4, 1, 0], [-1, 0, 0], [3, 0, 0]])
     _, weights, distance = found(queries, points, np.array([corners]))

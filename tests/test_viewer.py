@@ -1,4 +1,4 @@
-"""The page in a browser, used with mouse, keyboard and touch."""
+"""The page works in a browser with mouse, keyboard and touch."""
 
 import io
 import os
@@ -68,7 +68,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 class OpenPage:
-    """One page in the browser, with the actions of a user."""
+    """A page in the browser, with a method for each action of a user."""
 
     def __init__(self, browser: Any, path: Path, *, width: int = 840, height: int = 600) -> None:
         self.browser, self.path = browser, path
@@ -135,17 +135,17 @@ class OpenPage:
 
 
 def differ(a: np.ndarray, b: np.ndarray) -> float:
-    """The share of pixels that differ visibly."""
+    """Return the share of pixels that differ visibly."""
     return float(np.mean(np.abs(a - b).max(axis=2) > 8)) if a.shape == b.shape else 1.0
 
 
-# A lumpy shape, whose views and vertices differ clearly.
+# This shape is lumpy, so its views and vertices differ clearly.
 SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.vertices[:, [1]])), name="X.off")
 TARGET, NUMBER = renumbered(replace(TALL, name="Y.off"), seed=1)
 
 
 def visible_vertices() -> np.ndarray:
-    """The vertices of the source that face the first camera, the most central vertex first."""
+    """Return the source vertices that face the initial camera, the most central vertex first."""
     standing, other = stand_pair(SOURCE, TARGET)
     axes = camera_axes(choose_azimuth([standing, other]))
     facing = standing.vertex_normals @ axes[2]
@@ -253,7 +253,7 @@ def test_modes_change_the_colors(page: OpenPage) -> None:
     assert page.find(".errors").text.split("\n") == ["0", "0.1 and above (fraction of √area)", "unknown"]
     assert page.find("#unknown").size["height"] < 2 * page.find(".errors span").size["height"]
     assert page.state["mode"] == "error-0" and page.find(".scale").is_displayed()
-    # The page interpolates on another grid: colours differ by one step of the scale at most.
+    # The page interpolates colours on another grid, so they differ by at most one step of the colour scale.
     values = np.linspace(0, 0.2, len(NUMBER))
     values[visible_vertices()[1]] = np.nan
     shown = np.reshape(page.run("return jaxsmw.colors('x')"), (-1, 3))
@@ -282,7 +282,7 @@ def test_cameras_turn_together_or_alone(page: OpenPage) -> None:
     page.look_away()
     assert differ(turned["x"], page.view("x")) == 0
     assert differ(turned["y"], page.view("y")) > 0.05
-    # Dragging turns the body and marks nothing.
+    # Dragging turns the body and does not mark a vertex.
     assert not page.state["pinned"]
     page.find("#reset").click()
     assert all(differ(page.view(side), start[side]) == 0 for side in "xy")
@@ -299,7 +299,7 @@ def test_keys_move_the_camera_and_select_vertices(page: OpenPage) -> None:
         seen.append(page.view("x"))
         assert differ(seen[-2], seen[-1]) > 0.01
     canvas.send_keys("0")
-    # Equal except for the frame that shows the focus.
+    # The pictures are equal except for the frame that shows the keyboard focus.
     assert differ(start[20:-20, 20:-20], page.view("x")[20:-20, 20:-20]) == 0
     field = page.find("#vertex")
     field.send_keys("17", Keys.ENTER)
@@ -412,13 +412,16 @@ def comparison(browser: Any, comparison_file: Path) -> Iterator[OpenPage]:
 
 
 def rounding(values: np.ndarray) -> np.ndarray:
-    """A bound (n, k) on the rounding errors of eigenvectors on the page: half a level, which varies."""
+    """Return a bound (n, k) on the rounding errors of the page's eigenvectors.
+
+    An error is at most half of the distance between adjacent levels, which grows with the value.
+    """
     largest, half = np.abs(values).max(axis=0), 0.5 / 127
     return largest * (2 * half * np.sqrt(np.abs(values) / largest) + half**2) + 1e-6 * largest
 
 
 def wavelets(spectrum: Spectrum, vertex: int) -> tuple[np.ndarray, np.ndarray]:
-    """The wavelets around a vertex at all scales (filters, n), and a bound on their error on the page."""
+    """Return the wavelets of all scales around a vertex (filters, n), and bounds on their page errors."""
     responses = np.asarray(Meyer(FILTERS)(spectrum.eigenvalues, spectrum.eigenvalues))
     values = np.asarray(spectrum.eigenvectors)
     off = rounding(values)
@@ -453,7 +456,8 @@ def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[
             exact, bound = (array[scale] for array in expected[side])
             error = np.abs(np.array(shown[side]) - exact)
             assert np.all(error <= bound)
-            # Invisible errors are below a twentieth of the scale everywhere and a hundredth in the mean square.
+            # Errors are invisible if they are everywhere below 5 % of the colour scale, and their root mean
+            # square is below 1 % of the scale.
             assert error.max() < 0.05 * limit and np.sqrt(np.mean(error**2)) < 0.01 * limit
             color = np.reshape(comparison.run("return jaxsmw.colors(arguments[0])", side), (-1, 3))
             expected_color = 255 * colors.signed_colors(np.array(shown[side]), limit)
@@ -473,7 +477,7 @@ def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[
     assert comparison.state["filter"] == FILTERS - 1
     assert comparison.find("#filter-name").text == f"wavelet {FILTERS - 1} of {FILTERS - 1} (narrowest)"
     assert all(differ(a, b) > 0.02 for a, b in pairwise(views))
-    # If a target vertex is picked, the wavelet on the source is around the vertex with this match.
+    # If a target vertex is picked, the source shows the wavelet around a vertex whose match is the picked one.
     target = int(NUMBER[first])
     comparison.point_at(*comparison.place("y", target), click=True)
     exact, bound = wavelets(spectra[0], first)
@@ -481,7 +485,7 @@ def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[
 
 
 def test_real_wavelets_look_the_same_on_the_page(shared: Path) -> None:
-    """Rounding affects most the eigenvectors that are large on a limb and small elsewhere."""
+    """Rounding has the largest effect on eigenvectors that are large on a limb and small elsewhere."""
     spectrum = compute_spectrum(read_mesh(shared / "data/faust_r/off/tr_reg_062.off"), 100)
     values = np.asarray(spectrum.eigenvectors)
     shown = encode_rounded(values.T)
@@ -559,7 +563,7 @@ def test_entries_of_the_functional_map_show_their_eigenfunctions(
 
 
 def check_mode(page: OpenPage, mode: str) -> None:
-    """Checks that buttons, explanation and legend belong to what the bodies show."""
+    """Checks that buttons, explanation and legend belong to the colours of the bodies."""
     checked = "return [...document.querySelectorAll('input[name=mode]:checked')].map(e => e.value)"
     explained = (
         "return [...document.querySelectorAll('[data-for]')].filter(e => "
@@ -586,13 +590,13 @@ def test_buttons_explanation_and_legend_follow_the_mode(comparison: OpenPage, mo
     check_mode(comparison, "eigenfunctions")
     comparison.look_away()
     check_mode(comparison, mode)
-    # Nothing moves under the pointer when the mode changes.
+    # The matrix under the pointer does not move when the mode changes.
     assert comparison.run("return arguments[0].getBoundingClientRect().top", matrix) == height
     matrix.send_keys(Keys.ARROW_DOWN)
     check_mode(comparison, "eigenfunctions")
     matrix.send_keys(Keys.ESCAPE)
     check_mode(comparison, mode)
-    # The button selects the entry that was chosen last.
+    # The button selects the most recently chosen entry.
     comparison.choose("eigenfunctions")
     check_mode(comparison, "eigenfunctions")
     assert comparison.state["entry"] == [0, 0]
@@ -644,13 +648,13 @@ def test_switching_between_maps_changes_everything_that_depends_on_the_map(compa
     check("bad", 9)
     assert np.abs(matrix_colors(comparison) - good).max() > 50
     assert differ(picture, comparison.view("x")) > 0.1
-    # An error that is unknown for a map cannot be chosen, and does not stay chosen.
+    # If an error is unknown for a map, this error cannot be chosen, and an earlier choice of it is undone.
     assert [comparison.find(f"input[value=error-{i}]").is_enabled() for i in (0, 1)] == [False, True]
     comparison.choose("error-1")
     comparison.find("input[name=map][value='0']").click()
     assert comparison.state["mode"] == "transfer" and comparison.find("input[value=transfer]").is_selected()
     check("good", 1)
-    # The wavelets change with the map, too.
+    # The wavelets also change with the map.
     comparison.choose("wavelets")
     similarities = []
     for position in (0, 1):
@@ -746,14 +750,14 @@ def test_page_works_on_a_phone_of_360_pixels(browser: Any, comparison_file: Path
             assert box["x"] >= 0 and box["x"] + box["width"] <= 360, element.get_attribute("outerHTML")
     for element in browser.find_elements("css selector", ".choice label, .view label, .view button"):
         assert element.rect["height"] >= 32
-    # Both bodies are visible at once, and their vertices can be touched.
+    # Both bodies are visible together, and their vertices can be picked.
     boxes = [page.find(f"#canvas-{side}").rect for side in "xy"]
     assert max(box["y"] + box["height"] for box in boxes) - min(box["y"] for box in boxes) < 740
     page.run("document.querySelector('.bodies').scrollIntoView()")
     vertex = int(visible_vertices()[0])
     page.point_at(*page.place("x", vertex), click=True)
     assert page.state["source"] == [vertex] and page.state["target"] == [int(NUMBER[vertex])]
-    # Nothing is animated.
+    # The browser prefers reduced motion, so the page has no animations.
     assert page.run("return document.getAnimations().length") == 0
     assert browser.get_log("browser") == []
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

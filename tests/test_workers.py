@@ -1,4 +1,4 @@
-"""Workers use one core each, and the calling process does not change."""
+"""Each worker uses one core, and the calling process does not change."""
 
 import ast
 import multiprocessing
@@ -42,6 +42,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="only Linux lists the threads of a process")
 def test_workers_have_one_thread_and_the_environment_does_not_change(tmp_path):
     program = tmp_path / "program.py"

@@ -45,21 +45,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--surface-points",
         metavar="FILE.baryc_gt",
         type=path,
-        help="write a point on the target surface for each source vertex to this file: a face, counted from "
-        "1, and the barycentric weights of the face's corners",
+        help="write to this file, for each source vertex, a point on the target surface: a face, counted "
+        "from 1, and the barycentric weights of the face's corners",
     )
     parser.add_argument(
         "--expected-error",
         metavar="FILE",
         type=path,
-        help="write the expected error of each match to this file, one per line: an estimate of the geodesic "
+        help="write to this file the expected error of each match, one per line: an estimate of the geodesic "
         "error without ground truth, divided by the square root of the target's area",
     )
     parser.add_argument(
         "--one-to-one",
         metavar="FILE",
         type=path,
-        help="write a map in which no two source vertices share a target vertex to this file, in the formats "
+        help="write to this file a map in which no two source vertices share a target vertex, in the formats "
         "of --output; use this map only for meshes with the same triangulation, because it is much less "
         "accurate for other meshes",
     )
@@ -77,7 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write pictures, an interactive 3D page and a summary to this directory",
     )
     add_up(parser)
-    add_ground_truth(parser, required=False, purpose="true map, with which errors before and after refinement are measured")
+    add_ground_truth(
+        parser, required=False, purpose="true map, for errors of the map before and after refinement"
+    )
     add_partial(parser)
     add_method(parser)
     add_weld(parser)

@@ -35,8 +35,8 @@ def run_command(arguments: Sequence[str]) -> int:
     except MemoryError as error:
         detail = f" ({error})" if str(error) else ""
         say(
-            f"jaxsmw: this machine has too little memory{detail}: give smaller meshes, or request fewer "
-            "eigenvectors or samples."
+            f"jaxsmw: this machine has too little memory{detail}: give smaller meshes, or smaller "
+            "numbers of vertices, eigenvectors or samples."
         )
         return 1
     except BrokenPipeError:  # the reader of standard output, for example `head`, has closed the pipe

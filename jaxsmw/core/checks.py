@@ -59,7 +59,7 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Checks a numerical parameter of a module.
+    """Checks that a numerical parameter of a module is within its limits.
 
     If the parameter is traced, only its number of dimensions is checked.
 

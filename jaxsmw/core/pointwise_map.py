@@ -27,8 +27,8 @@ def spectral_embeddings(
     convention.
 
     The convention matters because a filtered C shrinks the vectors that it maps. In the pushforward
-    convention it shrinks the *queries*. The nearest points of most queries are then the few database points
-    of small norm, which become hubs. In the pullback convention it shrinks the *database*, which hardly
+    convention C shrinks the *queries*. The nearest points of most queries are then the few database points
+    of small norm, which become hubs. In the pullback convention C shrinks the *database*, which hardly
     changes the order of the distances from a query. On real pairs pullback maps are good, and pushforward
     maps fail.
 
@@ -41,7 +41,7 @@ def spectral_embeddings(
       `"pushforward"` if C maps functions on X to functions on Y.
 
     **Returns:** The queries (m, d), one row per vertex of X, and the database (n, d), one row per vertex of
-    Y. d is the number of rows of C. Both are in the unit of the eigenvectors.
+    Y. d is the number of rows of C. The points are in the unit of the eigenvectors.
     """
     rows_out, rows_in = out_and_in(convention, spectrum_x.eigenvectors, spectrum_y.eigenvectors)
     return out_and_in(convention, rows_out, product(rows_in, functional_map.T))
@@ -58,9 +58,10 @@ def decode(
     """Returns the pointwise map T: X -> Y of a functional map C, by a nearest-neighbour search.
 
     This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
-    of Y that is nearest in spectral space. In the pullback convention, the query of a vertex of X is its row
-    of `Phi_X`, and the targets are the rows of `Phi_Y C^T`. In the pushforward convention, they are the rows
-    of `Phi_X C^T` and of `Phi_Y`.
+    of Y that is nearest in spectral space. Phi_X and Phi_Y contain the eigenvectors as columns. In the
+    pullback convention, the queries are the rows of `Phi_X` and the targets are the rows of `Phi_Y C^T`. In
+    the pushforward convention, the queries are the rows of `Phi_X C^T` and the targets are the rows of
+    `Phi_Y`.
 
     **Arguments:**
 
@@ -86,17 +87,19 @@ def decode_to_triangles(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Returns the map of a functional map C from the vertices of X to points on the triangles of Y.
+    """Returns the map from the vertices of X to points on the triangles of Y that a functional map C implies.
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
-    vertices of both shapes become points in spectral space: the rows of `Phi_X` and `Phi_Y C^T` in the
-    pullback convention, or the rows of `Phi_X C^T` and `Phi_Y` in the pushforward convention. The triangles
-    of Y span a surface in this space. The map sends each vertex of X to the nearest point of this surface.
+    vertices of both shapes become points in spectral space. With the eigenvectors Phi_X and Phi_Y as columns,
+    these points are the rows of `Phi_X` and `Phi_Y C^T` in the pullback convention. In the pushforward
+    convention, they are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span a surface in this space.
+    Each vertex of X is mapped to the nearest point of this surface.
 
-    If X is finer than Y, `decode` sends neighbouring vertices of X to the same vertex of Y. This map sends
-    them to different points, so textures and other functions stay smooth when the map transfers them. The
-    function takes about ten times as long as `decode` without patches, which is one second for shapes of 5000
-    vertices. The time grows with the product of the numbers of vertices.
+    If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
+    `decode_to_triangles` can map these vertices to different points, so textures and other functions stay
+    smooth when the map transfers them. `decode_to_triangles` takes about ten times as long as `decode`
+    without patches: one second for shapes of 5000 vertices. The time grows with the product of the numbers
+    of vertices.
 
     **Arguments:**
 

@@ -106,8 +106,8 @@ def refine(
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
     The loop is Algorithm 1 of the MWP paper, and it accepts any refiner. The function is pure and
-    jit-compiled. It is compiled again only when sizes or static settings change. For many pairs of equal
-    size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
+    jit-compiled. JAX compiles the function again only when sizes or static settings change. For many pairs of
+    equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
     `jaxsmw.refine_pairs`.
 
     If samples are given, the first functional map is computed from all vertices. The iterations then match

@@ -230,8 +230,8 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
     def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The power iteration starts from coordinates 1, 2 and so on of the points. Coordinate 0 comes last, because
-    # the first eigenvector of a surface is constant and does not distinguish points.
+    # The power iteration starts from coordinates 1, 2 and so on of the points. Coordinate 0 comes last,
+    # because the first eigenvector of a surface is constant and does not distinguish points.
     _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
     return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)

@@ -81,7 +81,7 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
     """
     smallest, largest = _positive_range(spectrum)
     peaks = jnp.geomspace(smallest, largest / 2, dimensions)
-    # The second of three Meyer filters on [0, 2 peak] passes this band.
+    # The second of three Meyer filters on [0, 2 peak] passes the band from peak / 2 to 2 peak.
     wavelets = jax.vmap(lambda peak: Meyer(3)(spectrum.eigenvalues, 2 * peak[None])[1])(peaks)
     return _signature(spectrum, wavelets**2)
 

@@ -32,8 +32,8 @@ class SoftMap(eqx.Module):
     The plan P (m, n) contains the part of each query's area that is sent to each database row. For query i
     and database row j, `P_ij = a_i w_ij / sum_k w_ik` with `w_ij = b_j exp(g_j - |q_i - y_j|² /
     temperature)`. The share of row j in query i is `w_ij / sum_k w_ik`. The matrix P is never stored as a
-    whole. Its rows sum to the areas of the queries exactly. Its columns sum to the areas of the database rows
-    up to the `residual`.
+    whole. The rows of P sum to the areas of the queries exactly. The columns of P sum to the areas of the
+    database rows up to the `residual`.
 
     `refine_softly`, `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps. For maps between shapes, the
     queries are the vertices of X, and the database rows are the vertices of Y.

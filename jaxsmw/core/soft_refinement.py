@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""The function of one iteration: it takes a functional map and returns the next one and a member of `RESULTS`."""
+"""One iteration: a function from a functional map to the next functional map and a member of `RESULTS`."""
 
 
 class SoftRefinement(eqx.Module):
@@ -37,7 +37,7 @@ class SoftRefinement(eqx.Module):
       words.
     - `iterations`: the number of functional maps that were computed after the first functional map.
     - `change`: the Frobenius norm of the change of C in the last iteration, divided by the Frobenius norm of
-      C. It is 0 at a fixed point.
+      C. The change is 0 at a fixed point.
     """
 
     functional_map: Float[Array, "k_out k_in"]
@@ -88,7 +88,7 @@ def refine_softly(
           derivatives of one iteration. The memory does not grow with the number of iterations. The outcome
           has no derivative with respect to the initial map.
     - `tolerance`: a positive number, which only `"implicit"` uses. It is the tolerance of the fixed point,
-      relative to the largest entry of C, and also the tolerance of GMRES.
+      relative to the largest entry of the first C, and also the tolerance of GMRES.
 
     **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in) and `soft_map`.
     Numerical failures raise no error, so compare its attribute `result` with `RESULTS.successful`. If
@@ -152,8 +152,8 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
     check_kind("initial map", matches, np.ndarray, jax.Array)
     if matches.shape[0] != m or matches.ndim != 1 + sparse:
         raise ValueError(
-            f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each vertex "
-            "of X"
+            f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each "
+            "vertex of X"
         )
     return matches
 
@@ -214,8 +214,8 @@ class WaveletPreservationLayer(eqx.Module):
         found = [features_x.shape, features_y.shape]
         if found != needed:
             raise ValueError(
-                "the features have shapes {} and {}, but {} and {} are needed: give one row for each vertex, and "
-                "the same number of features on X and Y".format(*found, *needed)
+                "the features have shapes {} and {}, but {} and {} are needed: give one row for each vertex, "
+                "and the same number of features on X and Y".format(*found, *needed)
             )
         return refine_softly(
             spectrum_x,
@@ -234,7 +234,7 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
 
 
 class _Loop(NamedTuple):
-    """The last functional map, its change in the last iteration, the result, and the number of iterations."""
+    """The final functional map, its change in the last iteration, the result, and the iteration count."""
 
     functional_map: Float[Array, "k_out k_in"]
     last_change: Float[Array, "k_out k_in"]
@@ -245,7 +245,7 @@ class _Loop(NamedTuple):
 def _through_iterations(
     step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
 ) -> _Loop:
-    """Runs a fixed number of iterations, through which derivatives are computed."""
+    """Runs a fixed number of iterations. Derivatives are computed through all iterations."""
 
     def follow(state: _State, _: None) -> tuple[_State, None]:
         following, how = step(state.functional_map)
@@ -258,7 +258,7 @@ def _through_iterations(
 
 
 class _State(NamedTuple):
-    """The previous functional map, the last functional map, and the first failure so far."""
+    """The previous and the current functional map, and the first failure so far."""
 
     previous: Float[Array, "k_out k_in"]
     functional_map: Float[Array, "k_out k_in"]
@@ -268,9 +268,10 @@ class _State(NamedTuple):
 def _to_the_fixed_point(
     step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
 ) -> _Loop:
-    """Iterates up to the fixed point, at which derivatives are implicit."""
+    """Iterates up to the fixed point. Derivatives follow from the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # The solver reports neither the result of an update nor the last change. One more iteration gives both.
+    # The solver of the fixed point reports neither the result of an update nor the last change of the
+    # functional map. One more iteration gives this result and this change.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
@@ -283,11 +284,13 @@ def _fixed_point(
     tolerance: float,
 ) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
     """Returns the fixed point of a step, the number of iterations, and whether the iterations converged."""
-    import lineax as lx  # imported here because the import takes as long as computing an eigenbasis
+    # These imports are local because they take as long as the computation of an eigenbasis.
+    import lineax as lx
     import optimistix as optx
 
-    # The unit is the largest entry, because the tolerance is relative to C as a whole. The solver works in
-    # the default float type, because optimistix does not accept float32 while jax_enable_x64 is set.
+    # The unit is the largest entry of the first functional map, because the tolerance is relative to C as a
+    # whole. The solver works in the default float type, because optimistix does not accept float32 while
+    # jax_enable_x64 is set.
     unit = lax.stop_gradient(jnp.max(jnp.abs(first)))
 
     def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
@@ -310,7 +313,7 @@ def _fixed_point(
 def _differentiable_if(
     converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map. Its derivative is NaN if the iterations have not converged.
+    """Returns the functional map, with NaN derivatives if the iterations have not converged.
 
     The formula for implicit derivatives holds only at fixed points.
     """

@@ -15,8 +15,8 @@ class Spectrum(eqx.Module):
 
     `compute_spectrum` computes the spectrum of a mesh. The eigenpairs solve `W phi = lambda A phi`. W is the
     positive semi-definite stiffness matrix of cotangent weights (the Laplace–Beltrami operator), and the
-    diagonal matrix A contains the vertex areas.
-    The eigenvectors are orthonormal with respect to A: `Phi^T A Phi = I`.
+    diagonal matrix A contains the vertex areas. The eigenvectors are orthonormal with respect to A: `Phi^T A
+    Phi = I`.
 
     A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks several shapes, which gives every
     array a leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero
@@ -29,11 +29,11 @@ class Spectrum(eqx.Module):
     - `vertex_areas`: (n,), in units of length², zero for masked vertices.
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
     - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
-      or None. Only some refiners use descriptors.
-    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Only some
-      refiners use positions.
-    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Only some refiners use
-      normals.
+      or None. Of the refiners of this package, only `FeatureRegression` and `Registration` use descriptors.
+    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Of the
+      refiners of this package, only `Registration` uses positions.
+    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Of the refiners of
+      this package, only `Registration` uses normals.
     """
 
     eigenvalues: Float[Array, " k"]

@@ -44,7 +44,7 @@ def nearest_point_on_triangles(
     lengths = product(edges, jnp.swapaxes(edges, 1, 2))
     grams = (lengths[:, 0, 0], lengths[:, 0, 1], lengths[:, 1, 1])
     starts = jnp.einsum("fed,fd->ef", edges, corners[:, 0], precision="highest")
-    # |q - a|² = |q|² + |a|² - 2 q·a. The first term is the same for all triangles and is left out.
+    # |q - a|² = |q|² + |a|² - 2 q·a. The term |q|² is the same for all triangles and is left out.
     norms = jnp.sum(corners[:, 0] ** 2, axis=1)
     masked = jnp.zeros(len(faces), bool) if face_mask is None else ~face_mask
     columns = [value[:, None] for value in (*grams, *starts, norms)]

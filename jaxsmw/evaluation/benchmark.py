@@ -128,8 +128,9 @@ def run_benchmark(
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
-    The number is the same for most choices of methods. Stored results include the time of the precomputation,
-    which depends on this number. With the same number, a later run can add methods to existing results.
+    This number is the same for most choices of methods. Stored results include the time of the
+    precomputation, which depends on this number. With the same number, a later run can add methods to
+    existing results.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 
@@ -185,7 +186,7 @@ class _Store:
         return tasks
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
-        """Returns the results of all pairs on which all methods are measured."""
+        """Returns the results of all pairs that all methods have finished."""
         # Pairs without results of some method are left out, so that all methods are compared on the same
         # pairs.
         known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]

@@ -195,7 +195,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
 
 def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
-    """Returns the first layout that fits a directory, and its pairs; None if no layout fits."""
+    """Returns the name of the first layout that fits a directory, and its pairs; None if no layout fits."""
     for layout, open_layout in _LAYOUTS.items():
         if (pairs := open_layout(directory)) is not None:
             return layout, pairs
@@ -306,10 +306,10 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     - `data_set`: the data set.
     - `wanted`: the choice, in one of three forms. A number, as text, draws this many pairs at random without
       replacement, or all pairs if the data set has fewer. A path chooses the pairs that a text file lists
-      (see `read_pairs`); repeated pairs are used once. None chooses all pairs of the data set.
+      (see `read_pairs`); repeated pairs are used once. If None, all pairs of the data set are chosen.
     - `seed`: the seed of the random draw.
 
-    **Returns:** The pairs, in the order of the data set or of the list.
+    **Returns:** The chosen pairs, in the order of the data set or, if a path is given, of the text file.
 
     **Raises:** `InputError` if the number is not positive, if the list cannot be read, or if a listed pair
     has no ground truth.

@@ -203,7 +203,8 @@ def claimed_directory(
         lock.acquire()
     except Timeout:
         raise InputError(
-            f"{directory}: another run is adding results: wait until it ends, or give another --output."
+            f"{directory}: another process is adding results: wait until this process ends, or give another "
+            "--output."
         ) from None
     except OSError as error:
         raise InputError(

@@ -183,7 +183,7 @@ def geodesic_error(
 
 
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
-    """Returns the coverage of a map: the share of the target's area that belongs to matched vertices.
+    """Returns the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
     Each matched vertex of Y contributes its vertex area, a third of the area of the triangles around it. The
     coverage is in [0, 1]. Its computation needs no ground truth.

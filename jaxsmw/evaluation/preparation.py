@@ -36,7 +36,7 @@ def prepare_pair(
     **Arguments:**
 
     - `data`: the pair in its data set. Only its `names` and its flag `partial` are used.
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
+    - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
     - `init`: the name of an initial map (see `jaxsmw.match`), or a directory with initial maps in files
       `X_Y.map`.
     - `number_of_eigenvectors`: the number k of eigenvectors of both spectra.

@@ -51,7 +51,7 @@ class Workers(ProcessPoolExecutor):
         super().__init__(count, self._context, initializer=_start_worker)
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submits a call, like `concurrent.futures.Executor.submit`."""
+        """Submits a call to a worker, like `concurrent.futures.Executor.submit`."""
         return super().submit(_call_in_worker, function, *arguments, **options)
 
     def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
@@ -144,7 +144,7 @@ class _DaskWorkers(Executor):
         self._executor = executor
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submits a call, like `concurrent.futures.Executor.submit`."""
+        """Submits a call to a worker, like `concurrent.futures.Executor.submit`."""
         return self._executor.submit(_call_in_worker, function, *arguments, **options)
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.errors import InputError
 
-# The largest number of distances that are stored, which take 3 GiB. A problem of this size takes 15 minutes.
+# The largest allowed number of distances, which take 3 GiB. A problem of this size takes 15 minutes.
 _LARGEST = 20_000**2
 
 
@@ -20,11 +20,10 @@ def one_to_one_map(
 ) -> Int64[np.ndarray, " m"]:
     """Compute the one-to-one map X -> Y with the least sum of squared distances between matched points.
 
-    Each vertex of X gets a different vertex of Y. The optimum is exact and is found by shortest augmenting
-    paths, with SciPy's implementation of Crouse, "On implementing 2D rectangular assignment algorithms",
-    2016. All distances between points of X and of Y are stored in float64. For two real bodies of 5000
-    vertices, the computation takes 15 seconds and 0.7 GiB. The time grows with the third power of the number
-    of vertices.
+    Each vertex of X gets a different vertex of Y. SciPy computes the exact optimum by shortest augmenting
+    paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). All distances between points
+    of X and of Y are stored in float64. For two real bodies of 5000 vertices, the computation takes 15
+    seconds and 0.7 GiB. The time grows with the third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
     triangulation. On other shapes, the areas of corresponding vertices differ, and a vertex whose best match
@@ -67,7 +66,7 @@ def one_to_one_map(
     # The squared distance is |x - y|² = |x|² + |y|² - 2 x·y. The term |x|² has no effect on the optimum.
     costs = x @ (-2 * y.T)
     costs += np.sum(y**2, axis=1)
-    from scipy.optimize import linear_sum_assignment  # slow to import and rarely needed
+    from scipy.optimize import linear_sum_assignment  # this import is slow and rarely needed
 
     matched, found = linear_sum_assignment(costs)
     pointwise_map = np.full(len(embedding_x), -1)
@@ -83,8 +82,8 @@ def check_one_to_one(vertices_x: int, vertices_y: int) -> None:
     """
     if vertices_x > vertices_y:
         raise InputError(
-            f"the {vertices_x} vertices of the source cannot be matched one to one to the {vertices_y} "
-            "vertices of the target, because these are fewer: swap the meshes."
+            f"the {vertices_x} vertices of the source cannot be matched one to one to the {vertices_y} of "
+            "the target: swap the meshes."
         )
     if vertices_x * vertices_y > _LARGEST:
         raise InputError(

@@ -28,8 +28,8 @@ class Coarsening(NamedTuple):
     - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter keeps the
       frequencies that the subspace can represent, and slightly higher frequencies.
 
-    Prolongation and smoothing use single precision. Their rounding errors are far smaller than the errors
-    that the projection onto the subspace causes.
+    Prolongation and smoothing use single precision. The rounding errors of single precision are far smaller
+    than the errors that the projection onto the subspace causes.
     """
 
     prolongation: sp.csr_matrix
@@ -46,14 +46,14 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     fourth order elliptic problems", Computing 1996.
 
     In contrast to that method, a single coarsening step suffices for cells of any size. The indicator
-    functions are smoothed by a Chebyshev polynomial. Its degree is 1.5 times the radius of the cells,
-    measured in edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of
-    the eigenvalues are ten times as large.)
+    functions are smoothed by a Chebyshev polynomial, whose degree is 1.5 times the radius of the cells in
+    edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of the
+    eigenvalues are ten times as large.)
 
     **Arguments:**
 
-    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. Its entries off the
-      diagonal correspond to the edges of the mesh.
+    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. The entries of W off
+      the diagonal correspond to the edges of the mesh.
     - `mass`: the mass matrix A (n, n).
     - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 

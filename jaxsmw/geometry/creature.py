@@ -53,8 +53,8 @@ class CreaturePair:
     def true_map(self) -> Int64[np.ndarray, " m"]:
         """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
 
-        The match of a source vertex is a corner of the triangle that contains the true point. Of the three
-        corners, the corner nearest to the true point is chosen.
+        The match of a source vertex is a corner of the triangle that contains the true point. The corner
+        nearest to the true point is chosen.
         """
         return self.truth.nearest_corners(self.target)
 
@@ -64,9 +64,9 @@ class CreaturePair:
 
 @dataclass(frozen=True)
 class _Tube:
-    """A chain of tapered capsules. A capsule is the convex hull of two balls.
+    """A chain of tapered capsules. A tapered capsule is the convex hull of two balls.
 
-    If `normal` is given, the chain is a plate: the thickness of its capsules is limited.
+    If `normal` is given, the chain is a plate, and the thickness of the capsules is limited.
     """
 
     centers: np.ndarray  # (p, 3)
@@ -87,7 +87,7 @@ class _Tube:
                 run = axis - (axis @ self.normal) * self.normal
             length = np.linalg.norm(run)
             taper = self.radii[i] - self.radii[i + 1]
-            sine = np.clip(taper / length, -0.95, 0.95)  # at 1, one ball contains the other
+            sine = np.clip(taper / length, -0.95, 0.95)  # at 1 or -1, one ball contains the other ball
             along = planar @ (run / length)
             across = np.sqrt(np.maximum(np.einsum("ij,ij->i", planar, planar) - along**2, 0))
             position = np.clip((along - across * sine / np.sqrt(1 - sine**2)) / length, 0, 1)
@@ -111,8 +111,9 @@ class _Body:
     """The body of one individual in the rest pose, as an implicit surface around a skeleton.
 
     The x axis points to the body's left, the y axis up and the z axis forward. Parts away from the plane
-    x = 0 are added on both sides, and their joints are called left_… and right_…. A random function warps all
-    proportions. The function is smooth, so eyes stay in the head and toes stay on the feet.
+    x = 0 are added on both sides, and their joints are called left_… and right_…. A smooth random function of
+    position warps all proportions. Because the function is smooth, eyes stay in the head and toes stay on the
+    feet.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
@@ -150,8 +151,8 @@ class _Body:
     ) -> None:
         """Add a tube or a plate through the balls to the body, or carve it out of the body.
 
-        `joint` is the name of the joint that moves the tube. The name is only needed for a tube that projects
-        far from the body.
+        `joint` is the name of the joint that moves the tube. The name of the joint is needed only for a tube
+        that projects far from the body.
         """
         chain = self._individual(balls)
         if joint:
@@ -166,7 +167,7 @@ class _Body:
         self._tubes.append(_Tube(chain[:, :3], chain[:, 3], blend, carved, unit, thickness))
 
     def limb(self, joints: str, parent: str, balls: str, *, blend: float) -> None:
-        """Add a tube with a joint in each ball except the last."""
+        """Add a tube with a joint in each ball except the last ball."""
         for prefix, side in self._sides(self._individual(balls)):
             above = self.joints.get(prefix + parent, self.joints.get(parent, -1))
             for name, hull in zip(joints.split(), _hulls(side), strict=True):
@@ -225,10 +226,10 @@ class _Body:
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
         """Return the rotation vectors (j, 3) of the joints in radians, with small random changes.
 
-        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. On
-        the head, for example, a positive first angle turns the nose down. A positive second angle turns the
-        nose to the left, and a positive third angle raises the left side. A name without `left_` or `right_`
-        applies to the joints on both sides, with mirrored rotations.
+        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. For
+        the joint of the head, positive angles turn the nose down, turn the nose to the left, and raise the
+        left side. If the name of a joint lacks `left_` or `right_`, the rotation applies to the joints on
+        both sides and is mirrored on the right side.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -340,8 +341,8 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     """
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per square of the grid's spacing. With this spacing, they give four
-    # times the wanted number of vertices.
+    # Marching cubes give 1.5 vertices per square of the grid's spacing. With the following spacing, marching
+    # cubes give four times the wanted number of vertices.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
@@ -592,7 +593,7 @@ CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_,
 def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest", seed: int = 0) -> Mesh:
     """Make the mesh of a creature.
 
-    The mesh is closed and has no handles. Its triangles are well shaped and oriented outward. The same kind,
+    The mesh is closed and has no handles. The triangles are well shaped and oriented outward. The same kind,
     number of vertices and seed give the same triangles in every pose, so vertex i is always the same point of
     the body. In the rest pose the body is mirror symmetric in x, but its triangulation is not symmetric.
 
@@ -601,14 +602,14 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
     - `kind`: `"quadruped"`, `"biped"` or `"dragon"`.
     - `vertices`: the number of vertices, at least 500.
     - `pose`: `"rest"` or another pose of this kind. `CREATURES` lists the poses of each kind.
-    - `seed`: a random seed, an integer of at least 0. It determines the proportions, the triangulation, and
-      the small random changes of the pose.
+    - `seed`: a random seed, an integer of at least 0. The seed determines the proportions, the triangulation,
+      and the small random changes of the pose.
 
     **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. The x axis points to the
     creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
-    whose body intersects itself. The last error is rare and occurs for none of the seeds below 250.
+    whose body intersects itself. Such seeds are rare, and none of the seeds below 250 is such a seed.
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
@@ -624,13 +625,14 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     The two shapes are nearly isometric and are triangulated independently. The source is in the pose
     `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
     vertices. For the ground truth, both meshes are taken in the same rest pose, and the source vertices are
-    projected onto the triangles of the target. The ground truth is therefore exact up to discretization.
+    projected onto the triangles of the target. Therefore the ground truth is exact except for the errors of
+    this projection between two triangulations.
 
     **Arguments:**
 
     - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin) or `"dragon"`.
     - `vertices`: the number m of source vertices, at least 500.
-    - `seed`: a random seed, an integer of at least 0. It determines the individual, the poses and the
+    - `seed`: a random seed, an integer of at least 0. The seed determines the individual, the poses and the
       triangulations.
 
     **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` (m

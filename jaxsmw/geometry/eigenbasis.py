@@ -24,7 +24,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
 
-# The shift for ARPACK on a surface of area 1. There, the first non-zero eigenvalue of a body is from 1 to 30.
+# The shift for ARPACK, for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is between
+# 1 and 30.
 _SHIFT = -1e-2
 # In an accurate eigenbasis, the residuals relative to the largest eigenvalue and the entries of
 # |Phi^T A Phi - I| do not exceed these tolerances.
@@ -48,14 +49,14 @@ def compute_spectrum(
     chosen so that its entry of largest absolute value is positive. The eigenpairs of each connected component
     are computed separately and then merged.
 
-    The exact solver is a shift-invert Lanczos method. It counts the eigenvalues, and its residuals and
-    orthonormality are checked. If the method fails, the eigenpairs are computed by ARPACK.
+    The exact solver is a shift-invert Lanczos method. The number of eigenvalues, the residuals and the
+    orthonormality are checked. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
     (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal up to rounding. The time
-    is nearly proportional to the number of vertices. The method requires triangles of similar size and shape.
-    If the triangles are too different, the function warns and uses the exact solver. Results are cached on
-    disk (`jaxsmw.runtime.cache`).
+    is nearly proportional to the number of vertices. The approximate solver requires triangles of similar
+    size and shape. If the triangles are too different, the function warns and uses the exact solver. Results
+    are cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -74,7 +75,7 @@ def compute_spectrum(
         - `"auto"`: approximate if the mesh has at least 50 000 referenced vertices, else exact.
 
     **Returns:** A `Spectrum` with eigenvalues (k,), eigenvectors (n, k), vertex areas (n,), positions (n, 3)
-    and normals (n, 3), in units in which the area of the surface is 1. The spectrum has no descriptors. Its
+    and normals (n, 3), in units in which the area of the surface is 1. The spectrum has no descriptors. The
     float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are masked.
 
     **Raises:** `InputError` if k is not an integer or does not fit the mesh, the Laplacian or the eigensolver
@@ -101,8 +102,8 @@ def as_spectrum(
     - `eigenvalues`, `eigenvectors`, `vertex_areas`: the result of `eigenpairs`.
     """
     referenced = mesh.referenced_vertices
-    # Positions are relative to the centroid, because they are stored in single precision. Otherwise the
-    # positions of a mesh far from the origin would be inaccurate.
+    # Positions are relative to the centroid. In single precision, absolute positions of a mesh far from the
+    # origin would be inaccurate.
     centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
@@ -267,7 +268,7 @@ def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> 
 def _number_below(factors: SuperLU) -> int:
     """Return the number of eigenvalues below the shift.
 
-    By Sylvester's law of inertia, it equals the number of negative pivots.
+    By Sylvester's law of inertia, this number equals the number of negative pivots.
     """
     return int((factors.U.diagonal() < 0).sum())
 
@@ -306,8 +307,8 @@ def _lanczos(
     """Return the k smallest eigenpairs by the block Lanczos method for (W - shift A)^-1 A, without restarts.
 
     The shift is in the middle of the wanted eigenvalues, so the wanted eigenpairs are at both ends of the
-    spectrum of the inverse. Then two products with the inverse per eigenpair suffice. Keeping every vector
-    A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
+    spectrum of the inverse. Therefore two products with the inverse per eigenpair suffice. Keeping every
+    vector A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
 
     Blocks of b vectors find at most b copies of a multiple eigenvalue. Therefore the eigenvalues are counted.
     If some eigenvalues are missing, the method is repeated with larger blocks. An eigenpair has converged
@@ -364,8 +365,8 @@ def _converged(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # The large overlaps with the last blocks are removed first. Otherwise their rounding errors would
-        # hide the small overlaps with earlier blocks.
+        # The large overlaps with the last two blocks are removed first. Otherwise the rounding errors of the
+        # large overlaps would hide the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
         overlaps[:, before:] += large
@@ -455,7 +456,8 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
     # If all triangles are badly shaped, the last eigenvectors are the least accurate. If only one region has
-    # badly shaped triangles, any eigenvectors can be the least accurate. Therefore both kinds are checked.
+    # badly shaped triangles, any eigenvectors can be the least accurate. Therefore the last eigenvectors and
+    # every third eigenvector are checked.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
@@ -480,10 +482,10 @@ def _slices(number: int) -> Iterator[slice]:
 def _check(
     stiffness: sp.csc_matrix, areas: np.ndarray, eigenvalues: np.ndarray, eigenvectors: np.ndarray
 ) -> tuple[float, float]:
-    """Return two error measures of eigenpairs.
+    """Return the largest relative residual of eigenpairs, and the largest deviation from orthonormality.
 
-    The first is the largest relative residual, max |A^-1 W phi - lambda phi|_A / lambda_max. The second is
-    the largest deviation from orthonormality, max |Phi^T A Phi - I|.
+    The relative residual is |A^-1 W phi - lambda phi|_A / lambda_max. The deviation from orthonormality is an
+    entry of |Phi^T A Phi - I|.
     """
     deviation, highest = 0.0, 0.0
     for columns in _slices(len(eigenvalues)):

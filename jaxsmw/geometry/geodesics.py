@@ -47,10 +47,11 @@ _EXACT_HEIGHT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """p points on the faces of a mesh.
+    """Points on the faces of a mesh, given by barycentric weights.
 
-    `len(points)` is p. `points[rows]` contains only the points that an integer array selects. The functions
-    that receive surface points check them; the class itself checks nothing.
+    For an array `rows` of integers, `points[rows]` contains only the points with these numbers, and
+    `len(points)` is the number p of points. The class itself checks nothing. Functions that receive surface
+    points check the points.
 
     **Attributes:**
 
@@ -84,8 +85,8 @@ class _Sides(NamedTuple):
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
     images: the faces 0 … f - 1 with reversed order of corners. When a line crosses from one face into
-    another, it leaves by one side and enters by another side with the opposite direction. This rule holds for
-    any orientation of the faces, and for any number of faces at an edge.
+    another face, the side by which the line leaves has the opposite direction of the side by which it enters.
+    This rule holds for any orientation of the faces, and for any number of faces at an edge.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -245,9 +246,9 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
     - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, the shortest paths
-        in a graph of depth 6 are too long by 0.1 to 0.2 % on average. In a graph of depth 10, they are too
-        long by 0.03 to 0.07 %. A search in a graph of depth 10 takes 1.4 times as long as in a graph of
-        depth 6.
+        in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths in a graph of depth
+        10 are too long by 0.03 to 0.07 % on average. A search in a graph of depth 10 takes 1.4 times as long
+        as a search in a graph of depth 6.
 
     **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
     mesh. A stored zero is the length of a line between two vertices at the same position. All callers share
@@ -292,9 +293,10 @@ def geodesic_distances(
         times n numbers, so divide very many sources into several calls. For distances between given pairs of
         points, use `geodesic_distances_between`.
     - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
-        lines across faces. Its distances are too long by 0.03 to 0.07 % on average on bodies. `"exact"`
-        propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl). `"exact"` works
-        only between vertices of manifold meshes, and takes about 100 times as long as `"strips"`.
+        lines across faces. On bodies, distances by `"strips"` are too long by 0.03 to 0.07 % on average.
+        `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl).
+        `"exact"` works only between vertices of manifold meshes, and takes about 100 times as long as
+        `"strips"`.
     - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
         `"strips"`, a limit saves time.
 
@@ -327,8 +329,8 @@ def geodesic_distances_between(
     """Compute the geodesic distance between each point and its partner.
 
     The search starts from `points` or from `partners`, whichever has fewer distinct points. The radius of the
-    search grows in steps. If each point is close to its partner, as good matches are to true points, the
-    search is much faster than a computation of all distances. It never stores p times n numbers.
+    search grows in steps. If each point is close to its partner, as a good match is close to the true point,
+    the search takes a fraction of the time of all distances. The search never stores p times n numbers.
 
     **Arguments:**
 
@@ -451,8 +453,8 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
     """Return a function that computes exact distances from a source vertex to target vertices.
 
     **Raises:** `InputError` for meshes that libigl cannot handle. libigl crashes at edges with three faces,
-    and stops early at vertices that join several fans of faces. On slivers, libigl does not terminate. (It
-    also does not terminate on a mesh with very small coordinates, so the mesh is scaled to area 1 first.)
+    and stops early at vertices that join several fans of faces. On slivers, libigl does not terminate.
+    (libigl also does not terminate on meshes in very small units, so the mesh is scaled to area 1 first.)
     """
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -481,8 +483,8 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
 def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarray, " p"]:
     if isinstance(points, SurfacePoints):
         raise InputError(
-            "exact geodesic distances can be computed only between vertices, but points on faces were given: "
-            "use method='strips'."
+            "exact geodesic distances are computed between vertices, not to points on faces: use "
+            "method='strips'."
         )
     return points
 
@@ -544,9 +546,7 @@ def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray,
     outside = (indices < 0) | (indices >= count)
     if outside.any():
         at = int(outside.argmax())
-        cure = "correct the index"
-        if indices.max() == count:
-            cure = "subtract 1, because they seem to count from 1"
+        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
         raise InputError(
             f"{name} indices must lie between 0 and {count - 1}, but number {at} is {indices[at]}: {cure}."
         )

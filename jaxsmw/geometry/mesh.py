@@ -52,8 +52,8 @@ class Mesh:
     - `faces`: vertex indices (f, 3), int64, 0-based.
     - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
     - `notes`: sentences that report the changes by cleaning and the peculiarities of the mesh.
-    - `dropped_faces`: the numbers (d,) of the faces that cleaning dropped, ascending. The numbers are 0-based
-      and count all faces of the file. Other files that refer to faces by number use the same numbers.
+    - `dropped_faces`: the 0-based numbers (d,), ascending, of the faces in the file that cleaning dropped.
+      Other files that refer to faces by number count the dropped faces too.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -107,7 +107,7 @@ class Mesh:
 
     @cached_property
     def is_inside_out(self) -> bool:
-        """Whether the normals point inward. Then the faces enclose a negative volume with the centroid."""
+        """Whether the normals point inward, so the faces enclose a negative volume with the centroid."""
         corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
@@ -157,9 +157,10 @@ class Mesh:
 
     @cached_property
     def _edge_table(self) -> _EdgeTable:
-        """The edges, with the number of faces at each edge and a balance of their directions.
+        """The edges, the number of faces at each edge, and the balance of each edge.
 
-        A face counts as 1 or -1 in the balance, depending on the direction in which it traverses the edge.
+        The balance is the sum of 1 or -1 for each face, depending on the direction in which the face
+        traverses the edge.
         """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
@@ -180,9 +181,10 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The numbers of all unusual elements of a mesh, such as boundary edges. None of them is an error.
+    """The numbers of all unusual elements of a mesh, such as boundary edges.
 
-    `str` of a `Diagnosis` explains the numbers in sentences, one per line.
+    An unusual element is not an error. `str` of a `Diagnosis` explains the numbers in sentences, one per
+    line.
 
     **Attributes:**
 
@@ -193,8 +195,8 @@ class Diagnosis:
     - `boundary_loops`: the number of connected chains that the boundary edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
     - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
-    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. This number
-      is 0 in a consistently oriented mesh.
+    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. A consistently
+      oriented mesh has no such edges.
     - `degenerate_faces`: the number of triangles without area.
     """
 
@@ -261,9 +263,10 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     **Returns:**
 
-    A `Diagnosis`. Its attributes are the integers `vertices`, `faces`, `components`, `unreferenced_vertices`,
-    `boundary_edges`, `boundary_loops`, `nonmanifold_edges`, `nonmanifold_vertices`, `misoriented_edges` and
-    `degenerate_faces`. `str` of the diagnosis explains these numbers in sentences, one per line.
+    A `Diagnosis` with the numbers of elements as the attributes `vertices`, `faces`, `components` (connected
+    components), `unreferenced_vertices`, `boundary_edges`, `boundary_loops`, `nonmanifold_edges`,
+    `nonmanifold_vertices`, `misoriented_edges` and `degenerate_faces`. `str` of the `Diagnosis` explains the
+    numbers in sentences, one per line.
     """
     unreferenced = int((~mesh.referenced_vertices).sum())
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
@@ -332,7 +335,7 @@ def make_mesh(
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
     The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
-    It never drops or renumbers vertices. `read_mesh` also calls this function.
+    Vertices are never dropped or renumbered. `read_mesh` also calls `make_mesh`.
 
     **Arguments:**
 
@@ -344,15 +347,15 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
         array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, all vertices at exactly the same position count as one vertex. Faces then use the
-        lowest-numbered of these vertices. The other vertices remain, but are unreferenced. Welding closes
-        seams along which some programs duplicate vertices.
+    - `weld`: if True, all vertices at exactly the same position count as one vertex, and faces use the
+        lowest-numbered of these vertices. The other vertices at this position remain, but are unreferenced.
+        Welding closes seams along which some programs duplicate vertices.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
 
-    A `Mesh`. Its `notes` report how many faces were dropped or changed by welding, how many vertices appear
-    to be duplicated along a seam, and how many vertices are unreferenced.
+    A `Mesh`, whose `notes` report how many faces were dropped or changed by welding. They also report how
+    many vertices appear to be duplicated along a seam, and how many vertices are unreferenced.
 
     **Raises:**
 
@@ -424,7 +427,8 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
     unreferenced = int((~mesh.referenced_vertices).sum())
     if unreferenced:
         notes.append(
-            f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} vertices."
+            f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} "
+            "vertices."
         )
     return notes
 
@@ -447,7 +451,7 @@ def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
 
 
 def _check_resolution(mesh: Mesh) -> None:
-    """Refuse a mesh with a vertex so far away that rounding could merge neighbouring positions."""
+    """Refuse a mesh with a vertex so far away that rounding errors are comparable to edge lengths."""
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
     median = np.median(lengths[lengths > 0])
     referenced = np.flatnonzero(mesh.referenced_vertices)

@@ -64,11 +64,11 @@ class SurfaceSamples(NamedTuple):
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    In this Poisson-disk sampling, no two samples are closer in space than a smallest distance, and no
-    candidate can be added. The smallest distance follows from the area and the number of samples. The
-    candidates are one vertex per box of a grid, whose boxes are a third of the smallest distance wide. Two
-    sheets of surface that are closer to each other than the smallest distance share their samples. For many
-    samples, the function is much faster than `farthest_point_samples`.
+    This is Poisson-disk sampling. No two samples are closer to each other in space than a minimum distance,
+    and no further candidate has this distance from all samples. The minimum distance follows from the area
+    and the number of samples. The candidates are one vertex per box of a grid, whose boxes are a third of the
+    minimum distance wide. Two sheets of surface that are closer to each other than the minimum distance share
+    their samples. For many samples, the function is much faster than `farthest_point_samples`.
 
     **Arguments:**
 
@@ -79,7 +79,7 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
     candidates = np.flatnonzero(mesh.referenced_vertices)
-    # A maximal set of samples with this smallest distance has about 0.7 area / distance² members.
+    # With this minimum distance, a maximal set of samples has about 0.7 area / distance² samples.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # The candidates are thinned to one vertex, the lowest-numbered, per box of a grid around the centroid.
     positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)
@@ -102,8 +102,8 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     about 5000 evenly spread samples. Two samples are connected if an edge of the mesh connects two vertices
     to which these samples are nearest.
 
-    **Returns:** The edges (e, 2), as pairs of vertices of the mesh, and the node nearest to each vertex (n,),
-    as a vertex of the mesh.
+    **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
+    are given as vertices of the mesh.
     """
     n = len(mesh.vertices)
     if n <= _DENSE:
@@ -121,8 +121,8 @@ _DENSE, _SPREAD = 15_000, 5000
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
     """Choose a maximal set of vertices of a graph that are more than `radius` edges apart.
 
-    The algorithm is that of Luby, "A simple parallel algorithm for the maximal independent set problem", SIAM
-    J. Comput. 1986. Its random numbers come from a fixed seed.
+    The algorithm is described in Luby, "A simple parallel algorithm for the maximal independent set problem",
+    SIAM J. Comput. 1986. The random numbers come from a fixed seed.
 
     **Arguments:**
 

@@ -14,7 +14,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` requires that elevation and radial are 2
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` requires 2 bins of elevation and distance
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
@@ -30,9 +30,9 @@ def shot_descriptors(
     """Compute SHOT descriptors (signatures of histograms of orientations), one per vertex.
 
     SHOT is defined by Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and
-    texture description", CVIU 2014. The neighbours of a vertex are all vertices within the radius. Their
-    weighted scatter matrix gives the axes of a local reference frame. The x and z axes point to the side of
-    the majority of the neighbours.
+    texture description", CVIU 2014. The neighbours of a vertex are all vertices within the radius. The
+    weighted scatter matrix of the neighbours gives the axes of a local reference frame. The x and z axes
+    point to the side on which most neighbours are.
 
     The frame divides the neighbourhood into 32 sectors, by 8 ranges of azimuth, 2 of elevation and 2 of
     distance. Each sector has a histogram of the cosine between a neighbour's normal and the z axis, with 11
@@ -187,7 +187,7 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Ties occur on regular meshes. The arbitrary signs of `eigh` must not decide them.
+        # Ties occur on regular meshes. The arbitrary signs of `eigh` must not decide ties.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

@@ -47,10 +47,10 @@ def initial_map(
           signature or the wavelet signature, which do not distinguish left from right.
         - `"functional"`: the pointwise map of a functional map that preserves SHOT and commutes with the
           Laplacian.
-        - an integer array (m,): a pointwise map, as 0-based vertices of Y. It is checked and returned.
+        - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
         - m `SurfacePoints` on Y: a map to points, each of which is moved to the nearest corner of its face.
-        - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The map is
-          given by nearest neighbours in SHOT and in geodesic distances to the landmarks.
+        - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The initial
+          map then consists of nearest neighbours in SHOT and in geodesic distances to the landmarks.
 
     **Returns:** The initial map as an integer array (m,), 0-based vertices of Y.
 
@@ -66,7 +66,8 @@ def initial_map(
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
         raise InputError(
-            f"the initial map has type {given.dtype}, but must contain vertex indices: convert it to integers."
+            f"the initial map has type {given.dtype}, but must be integer vertex indices: convert the map to "
+            "integers."
         )
     if given.ndim == 1:
         return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
@@ -80,7 +81,7 @@ _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 
 
 def _features(sampled: SampledPair, init: str) -> _Features:
-    """Compute the features of both shapes for a named initial map, which matches nearest neighbours."""
+    """Compute the features in which a named initial map searches for nearest neighbours, on both shapes."""
     if init == "shot":
         features = paired_shot(sampled)
     elif init in SIGNATURES:

@@ -13,8 +13,8 @@ from jaxsmw.geometry.geodesics import geodesic_distances
 # a distance of half the square root of the area counts as much as the length of a SHOT descriptor. On pairs
 # of real bodies, weights from 1 to 3 give nearly the same maps.
 _WEIGHT = 2.0
-# This finite value replaces infinite distances between two connected components. It is larger than any
-# distance within a component.
+# This finite value replaces the infinite distance between two connected components. The value is larger than
+# any distance within a component.
 _ELSEWHERE = 100.0
 
 

@@ -1,4 +1,4 @@
-"""Pointwise maps and landmarks in files.
+"""Readers and writers of pointwise maps, and readers of landmarks.
 
 A file is text with one row per line, an array in NumPy's `.npy` format, or a matrix in MATLAB's `.mat`
 format. Files do not say whether their indices count from 0 or from 1. By default, indices count from 1 in
@@ -32,14 +32,14 @@ def read_pointwise_map(
 
     **Arguments:**
 
-    - `path`: a text file with one target vertex per line, a `.npy` file or a `.mat` file. A `.mat` file
-      contains either a single list of numbers, or a list called `T12` among other variables (X is shape 1, Y
-      is shape 2).
-    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-    - `index_base`: the index of the first vertex in the file, 0 or 1. The default is 1 for `.mat` files and 0
-      for all other files, although many published maps count from 1.
+    - `path`: a `.npy` file, a `.mat` file, or a text file with one target vertex per line. A `.mat` file
+      contains either a single list of numbers, or a list called `T12` among other variables. The name `T12`
+      means that X is shape 1 and Y is shape 2.
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
+    - `index_base`: the index of the first vertex in the file, 0 or 1. The default None means 1 for `.mat`
+      files and 0 for all other files. Many published maps in text files count from 1.
 
-    **Returns:** The target vertex of each source vertex (m,), 0-based.
+    **Returns:** The target vertex of each source vertex, as an int64 array (m,), 0-based.
 
     **Raises:** `InputError` if the file cannot be read, does not have m rows, or contains a number that is
     not a vertex of Y. The message names the file, the line and the fault.
@@ -52,17 +52,18 @@ def read_pointwise_map(
 def read_landmarks(
     path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
 ) -> Int64[np.ndarray, "l 2"]:
-    """Read landmarks: pairs of a vertex of X and the corresponding vertex of Y, in two columns.
+    """Read landmarks from a file. Each row contains a vertex of X and its match on Y.
 
     **Arguments:**
 
-    - `path`: a text file with two vertices per line, a `.npy` file or a `.mat` file. A `.mat` file contains
+    - `path`: a `.npy` file, a `.mat` file, or a text file with two vertices per line. A `.mat` file contains
       either a single matrix with two columns, or such a matrix called `T12` among other variables.
-    - `mesh_x`, `mesh_y`: the source X and the target Y.
-    - `index_base`: the index of the first vertex in the file, 0 or 1. The default is 1 for `.mat` files and 0
-      for all other files.
+    - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
+    - `index_base`: the index of the first vertex in the file, 0 or 1. The default None means 1 for `.mat`
+      files and 0 for all other files.
 
-    **Returns:** Pairs of vertices (l, 2), 0-based: a vertex of X and its match on Y in each row.
+    **Returns:** The l landmarks as an int64 array (l, 2), 0-based, with a vertex of X and its match on Y in
+    each row.
 
     **Raises:** `InputError` if the file cannot be read, does not have two columns, or contains a number that
     is not a vertex. The message names the file, the line and the fault.
@@ -76,16 +77,17 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     """Write a pointwise map T: X -> Y.
 
     The suffix of the file determines the format. A `.mat` file contains the column `T12` of 1-based vertices,
-    as in MATLAB. A `.npy` file contains an array of 0-based vertices. A file with any other suffix is text
-    with one 0-based vertex per line. The write is atomic: an incomplete file never appears under this name.
+    as is usual in MATLAB. A `.npy` file contains an array (m,) of 0-based vertices. A file with any other
+    suffix is text with one 0-based vertex per line. The write is atomic: an incomplete file never appears
+    under this name.
 
     **Arguments:**
 
     - `path`: the file to create or to replace.
     - `pointwise_map`: the target vertex of each source vertex (m,), 0-based integers.
 
-    **Raises:** `InputError` if the array is not a list of vertices, the suffix belongs to another kind of
-    file (see `check_map_name`), or the file cannot be written.
+    **Raises:** `InputError` if the array is not a list of vertices, the suffix is `.npz`, `.baryc_gt`, `.vts`
+    or `.json`, or the file cannot be written.
     """
     check_map_name(path)
     targets = np.asarray(pointwise_map)
@@ -105,7 +107,9 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Check that the suffix of a file name does not belong to another kind of file than a pointwise map.
+    """Check that a pointwise map can be written under a file name.
+
+    Suffixes that belong to other kinds of files are refused.
 
     **Arguments:**
 
@@ -126,16 +130,16 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 
 
 class Table:
-    """The numbers of a file as a matrix: one row per line of text, or per row of a stored array.
+    """The numbers of a file as a matrix, with one row per line of text or per row of a stored array.
 
     Maps, landmarks and ground truth are all read through this class, so the same fault causes the same
-    message. In text files, spaces or tabs separate numbers. Commas are refused: with a decimal comma, the
-    single number `3,5` would become the two vertices 3 and 5.
+    message. In text files, spaces or tabs separate numbers. Commas are refused, because with a decimal comma,
+    the single number `3,5` would become the two vertices 3 and 5.
 
     **Arguments:**
 
-    - `path`: the file: `.npy`, `.mat`, or text with any other suffix.
-    - `columns`: the required number of columns; None accepts any number.
+    - `path`: a `.npy` file, a `.mat` file, or a text file with any other suffix.
+    - `columns`: the required number of columns. None accepts any number of columns.
 
     **Attributes:**
 
@@ -160,13 +164,16 @@ class Table:
         self.rows, self.columns = self.values.shape
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
-        """Read an array in the `.npy` format. If `columns` is 1, the array may be a list or a single row."""
+        """Read an array in the `.npy` format as a matrix.
+
+        A list becomes a matrix with one column. If `columns` is 1, a single row also becomes a column.
+        """
         data = io.BytesIO(read_bytes(self.path))
         try:
             array = np.lib.format.read_array(data, allow_pickle=False)
         except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
             raise InputError(
-                f"{self.path}: is not an array saved by NumPy: save it with numpy.save, or as text."
+                f"{self.path}: is not an array saved by NumPy: save the array with numpy.save, or as text."
             ) from error
         is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
         table = array.reshape(-1, 1) if is_list else array
@@ -180,7 +187,10 @@ class Table:
         return table.astype(np.float64)
 
     def _read_text(self, columns: int | None) -> list[list[str]]:
-        """Read a text file, and return the words of each line after a check that every word is a number."""
+        """Read a text file and return the words of each line.
+
+        **Raises:** `InputError` if a word is not a number, or if a line has a wrong number of words.
+        """
         path = self.path
         try:
             text = read_bytes(path).decode("utf-8-sig")
@@ -214,19 +224,19 @@ class Table:
 
         **Arguments:**
 
-        - `chosen`: the user's choice; None uses the default for this file.
-        - `default`: the default for files other than `.mat` files. For `.mat` files the default is 1.
+        - `chosen`: the user's choice, 0 or 1, or None for the default of this file.
+        - `default`: the default for files that are not `.mat` files. For `.mat` files the default is 1.
         """
         if chosen is not None:
             return chosen
         return 1 if is_mat_file(self.path) else default
 
     def place(self, row: int) -> str:
-        """Return the file and the line of a row (0-based), as text for messages."""
+        """Return the file name and the line number of a row (0-based), as text for messages."""
         return f"{self.path}, {'line' if self._is_text else 'row'} {row + 1}"
 
     def word(self, row: int, column: int) -> str:
-        """Return a number as it is written in the file, for messages. Row and column are 0-based."""
+        """Return the text of a number in the file, for messages. Row and column are 0-based."""
         return self._words[row][column][:40] if self._is_text else f"{self.values[row, column]:.15g}"
 
     def require_rows(self, mesh_x: Mesh) -> None:
@@ -247,11 +257,12 @@ class Table:
 
         **Arguments:**
 
-        - `column`: the position of the column.
+        - `column`: the 0-based position of the column.
         - `mesh`: the mesh to which the vertices belong.
-        - `base`: the index of the first vertex in the file.
+        - `base`: the index of the first vertex in the file, 0 or 1.
 
-        **Raises:** `InputError` that names the first row whose number is not a vertex of the mesh.
+        **Raises:** `InputError` if a number is not a vertex of the mesh. The message names the first such
+        row.
         """
         return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
 
@@ -260,13 +271,13 @@ class Table:
 
         **Arguments:**
 
-        - `column`: the position of the column.
-        - `count`: the number of indexed elements, such as vertices or faces.
+        - `column`: the 0-based position of the column.
+        - `count`: the number of existing elements, such as vertices or faces of a mesh.
         - `what`: the name of these elements in messages, in the plural.
         - `base`: the index of the first element in the file, 0 or 1.
 
-        **Raises:** `InputError` that names the first row whose number is not a valid index. If all numbers
-        are consistent with the other index base, the message recommends it.
+        **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
+        all numbers are valid for the other index base, the message recommends the other index base.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)

@@ -1,9 +1,10 @@
-"""Variables in MATLAB's `.mat` files.
+"""Readers and writers of variables in MATLAB's `.mat` files.
 
 MATLAB code for functional maps uses the following names. `T12` is the pointwise map from shape 1 to shape 2,
 with 1-based vertices. `C21` is the functional map that takes functions on shape 2 to functions on shape 1. A
-shape is a struct with the fields `surface` (`X`, `Y`, `Z`, `TRIV`), `evals`, `evecs` and the areas `A`. In
-this library, X is shape 1 and Y is shape 2, so `T12` is T and `C21` is C.
+shape is a struct with the fields `surface`, `evals`, `evecs` and `A`. The field `surface` is a struct with
+the coordinates `X`, `Y` and `Z` and the faces `TRIV`. The field `A` contains the areas. In this library, X is
+shape 1 and Y is shape 2, so `T12` is T and `C21` is C.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def is_mat_file(path: str | os.PathLike[str]) -> bool:
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
-    """Parse the variables of a `.mat` file. Structs become dictionaries, and axes of length 1 are dropped.
+    """Parse the contents of a `.mat` file into a dictionary of its variables.
+
+    Structs become dictionaries, and axes of length 1 are dropped.
 
     **Arguments:**
 
@@ -40,8 +43,8 @@ def parse_variables(data: bytes) -> dict[str, Any]:
 
     **Returns:** A dictionary from the names of the variables to their values.
 
-    **Raises:** `InputError` if the contents are damaged, implausibly large (see
-    `jaxsmw.io.mat_format.unpacked`), or in format 7.3. The message does not name the file.
+    **Raises:** `InputError` if the contents are damaged, in format 7.3, or too large
+    (`jaxsmw.io.mat_format.unpacked` documents the limit). The message does not name the file.
     """
     try:
         variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
@@ -75,10 +78,10 @@ def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mappin
 
     **Arguments:**
 
-    - `variables`: the variables of a file. The file itself counts as a struct with an empty name.
+    - `variables`: the variables of a file, which also count as the fields of a struct with an empty name.
     - `fields`: the names of the required fields.
 
-    **Returns:** A dictionary from the full names of the structs, such as `S.surface`, to the structs.
+    **Returns:** A dictionary that maps the full names of the structs, such as `S.surface`, to the structs.
     """
     found: dict[str, Mapping[str, Any]] = {}
     pending: list[tuple[str, Mapping[str, Any]]] = [("", variables)]
@@ -97,20 +100,20 @@ def read_matrix(
 ) -> Float64[np.ndarray, "rows columns"]:
     """Read a matrix of real numbers from a `.mat` file.
 
-    If the file contains only one suitable matrix, that matrix may have any name. A matrix with a single row
-    is read as a column, because a list in MATLAB may be either a row or a column.
+    If the file contains only one suitable matrix, the matrix may have any name. A matrix with a single row is
+    read as a column, because a list in MATLAB may be either a row or a column.
 
     **Arguments:**
 
     - `path`: the file.
-    - `name`: the name of the matrix, if the file contains several suitable matrices.
-    - `columns`: the number of columns, where 1 means a list. Matrices with another number of columns are
-      ignored. None accepts any number of columns.
+    - `name`: the name of the matrix to read if the file contains several suitable matrices.
+    - `columns`: the number of columns. Matrices with another number of columns are not suitable. The number 1
+      means a list, and None accepts any number of columns.
 
     **Returns:** The matrix (rows, columns), float64.
 
-    **Raises:** `InputError` if the file cannot be read, contains no suitable matrix, or contains several and
-    none has the given name. The message names the file and the variables.
+    **Raises:** `InputError` if the file cannot be read, if it contains no suitable matrix, or if it contains
+    several suitable matrices without the given name. The message names the file and the variables.
     """
     variables = read_variables(path)
     matrices = {key: value for key, value in variables.items() if is_real(value)}
@@ -135,7 +138,7 @@ def read_matrix(
 
 
 def is_real(value: Any) -> bool:
-    """Return whether a variable is a non-empty list or matrix of real numbers."""
+    """Return whether a variable is a non-empty list or a non-empty matrix of real numbers."""
     return (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "iuf"
@@ -145,9 +148,9 @@ def is_real(value: Any) -> bool:
 
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
-    """Write variables to a `.mat` file. Lists are written as columns.
+    """Write variables to a `.mat` file.
 
-    The write is atomic: an incomplete file never appears under this name.
+    Lists are written as columns. The write is atomic: an incomplete file never appears under this name.
 
     **Arguments:**
 
@@ -161,5 +164,5 @@ def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) 
             scipy.io.savemat(file, dict(variables), do_compression=True, oned_as="column")
         except MatWriteError:
             raise InputError(
-                f"{path}: a variable is larger than a .mat file can hold (4 GiB): write fewer eigenvectors."
+                f"{path}: a variable is larger than 4 GiB, the limit of .mat files: write fewer eigenvectors."
             ) from None

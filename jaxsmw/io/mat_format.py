@@ -1,10 +1,11 @@
 """A check of the size of a `.mat` file's contents before SciPy reads them.
 
 A compressed variable can unpack to a thousand times its size. A cell array can declare a billion cells that
-the file does not contain. SciPy allocates memory for all of these bytes and cells. Therefore this module
-unpacks the variables itself, up to a limit, and adds up the sizes of all arrays, including nested arrays.
+the file does not contain. SciPy allocates memory for all unpacked bytes and for all declared cells. Therefore
+this module unpacks the variables itself, up to a limit, and adds up the sizes of all arrays, including nested
+arrays.
 
-Format: The MathWorks, "MAT-File Format", level 5.
+The format is described in The MathWorks, "MAT-File Format", level 5.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import largest_contents
 
 _MATRIX, _COMPRESSED = 14, 15
-# The number of bytes per number, by data type; 1 for all data types that are not listed.
+# The number of bytes per number for each data type. Data types that are not listed have 1 byte per number.
 _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18: 4}
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# SciPy takes at least 10 microseconds for every array, which is as long as it takes for a few KiB of numbers.
+# SciPy takes at least 10 microseconds per array, in which it can read a few KiB of numbers. Therefore every
+# array counts as at least this number of bytes.
 _LEAST_BYTES_OF_ARRAY = 4096
-# The longest list of a struct's field names: 64 bytes for each of 1000 fields. Shapes have about ten fields.
+# The largest accepted size of the list of a struct's field names, which is 64 bytes for each of 1000 fields.
+# The structs of shapes have about ten fields.
 _LONGEST_NAMES = 64 * 1000
 
 
@@ -40,9 +43,9 @@ def unpacked(data: bytes) -> bytes:
 
     **Returns:** The contents of an equivalent file in which no variable is compressed.
 
-    **Raises:** `InputError` for format 7.3, and for contents larger than
-    `jaxsmw.runtime.files.largest_contents`, which is 1 GiB or, if larger, four times the size of the file.
-    The message does not name the file. `ValueError`, `struct.error` or `zlib.error` if the file is damaged.
+    **Raises:** `InputError` for format 7.3, and for contents that are larger than both 1 GiB and four times
+    the size of the file (`jaxsmw.runtime.files.largest_contents`). The message does not name the file.
+    `ValueError`, `struct.error` or `zlib.error` if the file is damaged.
     """
     if data.startswith((b"MATLAB 7.3", b"\x89HDF")) or matfile_version(io.BytesIO(data))[0] == 2:
         raise InputError(
@@ -67,26 +70,33 @@ def unpacked(data: bytes) -> bytes:
 
 
 def _inflated(data: bytes, order: str, limit: int) -> bytes:
-    """Unpack a variable to the size that its tag declares; `limit` is the largest allowed size in bytes."""
+    """Unpack a variable to the size that its tag declares.
+
+    **Raises:** `InputError` if the declared size is above `limit` bytes.
+    """
     stream = zlib.decompressobj()
     tag = stream.decompress(data, 8)
     _, size = struct.unpack(f"{order}II", tag)
     if size > limit:
         raise _too_large()
-    contents = stream.decompress(stream.unconsumed_tail, size) if size else b""  # 0 would mean no limit
+    # In `decompress`, a size of 0 would mean that there is no limit.
+    contents = stream.decompress(stream.unconsumed_tail, size) if size else b""
     if len(contents) < size:
         raise ValueError("a compressed variable ends early")
     return tag + contents
 
 
 def _memory(variable: bytes, order: str, limit: int) -> int:
-    """Return the memory in bytes that a variable takes if every number becomes a float64."""
+    """Return the memory in bytes that a variable takes if every number becomes a float64.
+
+    **Raises:** `InputError` if the memory is above `limit` bytes.
+    """
     memory, pending = 0, [(0, len(variable), False)]
     while pending:
         position, stop, in_container = pending.pop()
         while position + 8 <= stop:
             kind, size = struct.unpack_from(f"{order}II", variable, position)
-            if kind >> 16:  # a small element, whose tag contains its data of up to 4 bytes
+            if kind >> 16:  # the tag of a small element also contains the element's data of up to 4 bytes
                 position += 8
                 continue
             start, end = position + 8, position + 8 + size
@@ -117,7 +127,7 @@ def _is_container(variable: bytes, start: int, size: int, order: str) -> bool:
     if flags & 0xFF not in _CONTAINERS:
         return False
     shape = struct.unpack_from(f"{order}{min(bytes_of_shape, size) // 4}i", variable, start + 24)
-    # Every element takes at least a tag of 8 bytes.
+    # Every element takes at least the 8 bytes of its tag.
     if min(shape) < 0 or math.prod(shape) > size // 8:
         raise ValueError("a cell array declares more cells than it contains")
     return True

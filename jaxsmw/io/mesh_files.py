@@ -1,9 +1,9 @@
-"""Mesh files: OFF, OBJ, PLY, STL and MAT.
+"""Readers of mesh files in the formats OFF, OBJ, PLY, STL and MAT, and writers of OFF and PLY files.
 
-This module has its own readers for two reasons: vertices must keep their order, and a damaged file must cause
-one clear error message. libigl's reader accepts indices out of range and aborts the process on some invalid
-headers. trimesh splits and drops vertices of OBJ files, and cannot read polygons of mixed size from binary
-PLY files.
+This module does not use the readers of other libraries, because vertices must keep their order and a damaged
+file must cause one clear error message. The reader of libigl accepts indices out of range and aborts the
+process on some invalid headers. The reader of trimesh splits and drops vertices of OBJ files, and it cannot
+read binary PLY files whose polygons have different numbers of corners.
 """
 
 from __future__ import annotations
@@ -29,32 +29,36 @@ from jaxsmw.runtime.files import atomic_write, read_bytes
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     """Read a triangle mesh from an OFF, OBJ, PLY, STL or MAT file.
 
-    Vertex i of the mesh is the i-th vertex of the file. An STL file contains only the corners of triangles,
-    so corners at exactly the same position become one vertex. Vertices are numbered in the order in which
-    their positions first appear. Faces with more than three corners are split into fans of triangles. Colors,
-    normals and texture coordinates are ignored.
+    Vertices keep the order of the file. An STL file contains only the corners of triangles, so corners at
+    exactly the same position become one vertex. The vertices of an STL file are numbered in the order in
+    which their positions first appear. Faces with more than three corners are split into fans of triangles.
+    Colours, normals and texture coordinates are ignored.
 
     **Arguments:**
 
     - `path`: the file. The suffix, in upper or lower case, determines the format:
-        - OFF: text, optionally with colors or normals (COFF, NOFF).
-        - OBJ: the `v` and `f` lines.
-        - PLY: text or binary, in either byte order.
-        - STL: text or binary.
-        - MAT: a struct with X, Y, Z (or VERT) and 1-based TRIV, such as `surface` in the TOSCA data set. The
-          struct may be a field of another struct, as in the files of `write_spectrum`.
-    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position; see
-        `make_mesh`. Welding has no effect on an STL file, whose corners are always merged.
+        - `.off`: a text file, optionally with colours or normals (COFF, NOFF).
+        - `.obj`: a text file, of which only the `v` and `f` lines are read.
+        - `.ply`: a text file, or a binary file in either byte order.
+        - `.stl`: a text file or a binary file.
+        - `.mat`: a file with a struct that has the coordinates X, Y and Z (or a matrix VERT) and the 1-based
+          faces TRIV, such as `surface` in the TOSCA data set. The struct may be a field of another struct, as
+          in the files of `write_spectrum`.
+    - `weld`: if True, all vertices at exactly the same position count as one vertex, and faces use the
+        lowest-numbered of these vertices. Welding has no effect on an STL file, whose corners are always
+        merged.
 
     **Returns:**
 
-    A `Mesh` whose name is its path. Positions keep the unit of the file, and faces are 0-based. The `notes`
-    of the mesh list repairs and peculiarities.
+    A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based faces (f, 3).
+    The `notes` of the mesh report changes such as dropped faces, and peculiarities such as unreferenced
+    vertices.
 
     **Raises:**
 
-    `InputError` if the file cannot be read, does not match its suffix, ends early or continues after its
-    end, or if `make_mesh` refuses the mesh.
+    `InputError` if the file cannot be read, does not have the format of its suffix, ends early, or contains
+    data after the declared end. Also `InputError` if `make_mesh` refuses the mesh, for example because an
+    index is out of range, a position is not finite, or all faces are degenerate.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -77,7 +81,10 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
 
 class _Polygons(NamedTuple):
-    """The polygons of a file: vertex positions, the corners of all faces in one list, and face sizes."""
+    """The polygons of a file: vertex positions, the list of the corners of all faces, and face sizes.
+
+    The size of a face is its number of corners.
+    """
 
     vertices: Float64[np.ndarray, "n 3"]
     corners: np.ndarray
@@ -100,7 +107,7 @@ def _fans(corners: np.ndarray, sizes: Int64[np.ndarray, " f"]) -> np.ndarray:
 
 def _text(data: bytes) -> str:
     """Decode the text of a file, convert all line ends to newlines, and remove comments."""
-    # Latin-1 decodes every byte, and the parsers need only ASCII characters.
+    # Latin-1 can decode every byte, and the parsers need only ASCII characters.
     text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
     return re.sub("#[^\n]*", "", text) if "#" in text else text
 
@@ -132,7 +139,7 @@ def _excerpt(line: str) -> str:
 
 
 def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], Int64[np.ndarray, " f"]]:
-    """Parse faces written as `size corner corner …`, one per line, into corners and sizes."""
+    """Parse lines of the form `size corner corner …`, one per face, into corners and sizes."""
     sizes = _numbers(lines, 1)[:, 0]
     longest = max(map(len, lines), default=0)
     possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
@@ -152,9 +159,10 @@ def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], I
 
 
 def _parse_off(data: bytes) -> _Polygons:
-    """Parse the Object File Format, as text with 3D vertices: http://www.geomview.org/docs/html/OFF.html."""
+    """Parse a text file in the Object File Format (http://www.geomview.org/docs/html/OFF.html)."""
     lines = [line for line in _text(data).split("\n") if line and not line.isspace()]
-    # Some programs write the counts on the line of the keyword, sometimes without a space between them.
+    # Some programs write the numbers of vertices and faces on the line of the keyword, sometimes without a
+    # space after the keyword.
     keyword = re.match(r"\s*(?:ST)?C?N?OFF\s*(.*)", lines[0]) if lines else None
     if keyword is None:
         raise InputError("does not begin with OFF, COFF or NOFF: export the mesh again as an OFF file.")
@@ -178,7 +186,7 @@ def _parse_off(data: bytes) -> _Polygons:
 
 
 def _parse_obj(data: bytes) -> _Polygons:
-    """Parse the `v` and `f` statements of Wavefront OBJ. All groups and objects become one mesh."""
+    """Parse the `v` and `f` lines of a Wavefront OBJ file. All groups and objects become one mesh."""
     text = re.sub(r"\\\n+", " ", _text(data)) if b"\\" in data else _text(data)
     vertex, face = (re.compile(rf"^[^\S\n]*{keyword}(?!\S)[^\S\n]*(.*)$", re.MULTILINE) for keyword in "vf")
     vertices = _numbers(vertex.findall(text), 3)
@@ -186,14 +194,14 @@ def _parse_obj(data: bytes) -> _Polygons:
         raise InputError("has no line that begins with v: export the mesh again as an OBJ file.")
     lines = face.findall(text)
     ends_in_face = bool(lines) and not text.endswith("\n") and text.endswith(lines[-1])
-    if any("/" in line for line in lines):  # texture and normal indices: corner/texture/normal
+    if any("/" in line for line in lines):  # corners of the form vertex/texture/normal
         lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
     corners, sizes = _polygon_lines([f"{len(line.split())} {line}" for line in lines])
     if ends_in_face and sizes[-1] < 3:
         raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
-    if (corners < 0).any():  # negative indices count backward from the last vertex above the face
+    if (corners < 0).any():  # negative indices count backward from the last vertex before the face
         vertex_at = [match.start() for match in vertex.finditer(text)]
         face_at = [match.start() for match in face.finditer(text)]
         above = np.repeat(np.searchsorted(vertex_at, face_at), sizes)
@@ -205,10 +213,11 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 
 
 def _parse_stl(data: bytes) -> _Polygons:
-    """Parse an STL file, a list of separate triangles: https://www.fabbers.com/tech/STL_Format."""
+    """Parse an STL file, which is a list of separate triangles (https://www.fabbers.com/tech/STL_Format)."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
-    # Binary files may also begin with "solid", so the length of the file determines whether it is binary.
+    # Text files and some binary files begin with "solid", so the length of a file determines whether the file
+    # is binary.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
         corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
@@ -219,8 +228,8 @@ def _parse_stl(data: bytes) -> _Polygons:
         facets = len(re.findall(r"\bendfacet\b", text))
         if len(corners) != 3 * facets or "endsolid" not in text:
             raise InputError(
-                f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in all "
-                "are not triangles, so the file is truncated or damaged: export the mesh again."
+                f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in total are "
+                "not triangles, so the file is truncated or damaged: export the mesh again."
             )
     elif len(data) >= header:
         raise InputError(
@@ -246,21 +255,25 @@ _PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endia
 
 
 class _Property(NamedTuple):
-    """A property of a PLY element: one number per row, or a list whose length is stored as type `length`."""
+    """A property of a PLY element, which has one number or one list of numbers per row.
+
+    `type` is the type of the numbers. `length` is the type of the lengths of the lists, or None for a
+    property with one number per row.
+    """
 
     type: np.dtype
     length: np.dtype | None
 
 
 class _Column(NamedTuple):
-    """All numbers of one property in one array, and the count of numbers in each row."""
+    """All numbers of one property in one array, and how many of these numbers each row has."""
 
     values: np.ndarray
     sizes: np.ndarray
 
 
 def _parse_ply(data: bytes) -> _Polygons:
-    """Parse the Polygon File Format, text or binary: https://paulbourke.net/dataformats/ply/."""
+    """Parse a text or binary file in the Polygon File Format (https://paulbourke.net/dataformats/ply/)."""
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if first is None:
         raise InputError("does not begin with ply: export the mesh again as a PLY file.")
@@ -312,7 +325,7 @@ def _parse_ply(data: bytes) -> _Polygons:
 
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
-    """Return the encoding, and by element name the number of rows and the properties."""
+    """Return the encoding, and a dictionary from element names to numbers of rows and properties."""
     formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
     if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
         raise InputError(
@@ -394,7 +407,12 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """Return the offset and the count of each property's values in a row, and the offset of the row's end."""
+    """Return where the values of a row are stored, and the offset of the row's end.
+
+    For each property of the row, the first result contains the offset and the number of the values.
+
+    **Raises:** `EOFError` if the body ends within the row.
+    """
     spans = []
     for kind, length in properties.values():
         size = 1
@@ -416,7 +434,10 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
 
 
 def _parse_mat(data: bytes) -> _Polygons:
-    """Parse a struct of a `.mat` file, at any depth, with faces TRIV and columns X, Y, Z (or matrix VERT)."""
+    """Parse a `.mat` file with one struct that has faces TRIV and columns X, Y, Z (or a matrix VERT).
+
+    The struct may be nested in other structs.
+    """
     structs = find_structs(parse_variables(data), "TRIV")
     if len(structs) > 1:
         raise InputError(
@@ -454,21 +475,22 @@ MESH_SUFFIXES = tuple(_PARSERS)
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None) -> None:
-    """Write a mesh to an OFF (text) or PLY (binary, little endian) file.
+    """Write a mesh to an OFF file (text) or to a PLY file (binary, little endian).
 
-    `read_mesh` then returns the same faces, and bit for bit the same vertex positions. The write is atomic:
+    `read_mesh` reads the same faces and exactly the same vertex positions from the file. The write is atomic:
     an incomplete file never appears under this name.
 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix, `.off` or `.ply`, determines the format.
-    - `mesh`: the mesh with n vertices.
-    - `colors`: the red, green and blue of each vertex (n, 3), as floats from 0 to 1 or as uint8. An OFF file
-        with colors begins with COFF.
+    - `mesh`: the mesh with n vertices, a `Mesh`.
+    - `colors`: the red, green and blue components of the colour of each vertex (n, 3), as floats from 0 to 1
+        or as uint8. None, the default, writes no colours. An OFF file with colours begins with COFF.
 
     **Raises:**
 
-    `InputError` for another suffix, colors of another shape or range, or a file that cannot be written.
+    `InputError` for another suffix, colours of another shape, type or range, or a file that cannot be
+    written.
     """
     path = Path(path)
     form = _FORMATTERS.get(path.suffix.lower())
@@ -492,13 +514,13 @@ def _bytes_of_colors(colors: ArrayLike, n: int) -> UInt8[np.ndarray, "n 3"]:
         return array
     if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
         raise InputError(
-            "colors are neither uint8 nor floats from 0 to 1: convert the colors to one of these."
+            "colors are neither uint8 nor floats from 0 to 1: convert the colors to one of these types."
         )
     return np.rint(255 * array.astype(np.float64)).astype(np.uint8)
 
 
 def _format_off(mesh: Mesh, colors: UInt8[np.ndarray, "n 3"] | None) -> bytes:
-    # `repr` returns the shortest text that parses to the same float.
+    # `repr` returns the shortest text from which `float` restores the same number.
     vertices = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     if colors is not None:
         vertices = [f"{v} {r} {g} {b} 255" for v, (r, g, b) in zip(vertices, colors.tolist(), strict=True)]

@@ -1,6 +1,6 @@
-"""Spectra and functional maps from files and from other libraries.
+"""Readers and writers of spectra and functional maps, and the conversion of spectra of other libraries.
 
-`docs/exchange.md` explains the conventions. This module recognizes objects of other libraries by their
+`docs/exchange.md` explains the conventions. This module recognises objects of other libraries by their
 attributes and does not import these libraries.
 """
 
@@ -34,10 +34,11 @@ from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
 SpectrumLike: TypeAlias = Any
 MassMatrix: TypeAlias = Any
 
-# Eigenvectors of a lumped mass matrix deviate less from orthonormality, even in single precision.
-# Eigenvectors of a finite-element mass matrix deviate far more with respect to lumped areas.
+# The largest accepted deviation of eigenvectors from orthonormality with respect to vertex areas.
+# Eigenvectors that were computed with a lumped mass matrix deviate less, even in single precision.
+# Eigenvectors that were computed with a finite-element mass matrix deviate far more.
 _ORTHONORMALITY_TOLERANCE = 1e-3
-# The tolerated rounding error of eigenvalues, relative to the largest eigenvalue.
+# The largest accepted rounding error of an eigenvalue, relative to the largest eigenvalue.
 _EIGENVALUE_TOLERANCE = 1e-5
 
 
@@ -48,23 +49,26 @@ def make_spectrum(
     *,
     name: str = "spectrum",
 ) -> Spectrum:
-    """Check an eigenbasis that was computed elsewhere, and scale its surface to area 1.
+    """Make a `Spectrum` from an eigenbasis that was computed elsewhere.
 
-    For a surface of area a, eigenvalues are multiplied by a, eigenvectors are multiplied by the square root
-    of a, and vertex areas are divided by a. To convert a functional map between bases on surfaces of areas
-    a_X and a_Y to the scaled bases, multiply the map by sqrt(a_Y / a_X).
+    The arrays are checked and scaled to a surface of area 1. If the surface has area a, the eigenvalues are
+    multiplied by a, the eigenvectors are multiplied by the square root of a, and the vertex areas are divided
+    by a. A functional map C between unscaled eigenbases on surfaces of areas a_X and a_Y becomes
+    the map sqrt(a_Y / a_X) C between the scaled eigenbases.
 
     **Arguments:**
 
-    - `eigenvalues`: (k,), ascending and not negative, in units of 1 / length². Alternatively, as the only
-        argument, a shape of another library: a `TriMesh` of pyFM after `process` (any object with
-        `eigenvalues`, `eigenvectors` and `vertex_areas`), or a shape of geomfum with its `basis`.
-    - `eigenvectors`: (n, k), orthonormal with respect to the vertex areas.
-    - `vertex_areas`: (n,), in units of length², or the lumped mass matrix (n, n), dense or sparse. Vertices
-        of zero area are masked. The unit of length is arbitrary.
+    - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If
+        `eigenvectors` and `vertex_areas` are None, `eigenvalues` is instead a shape of another library. The
+        shape is a `TriMesh` of pyFM after `process` (any object with `eigenvalues`, `eigenvectors` and
+        `vertex_areas`), or a shape of geomfum with its `basis`.
+    - `eigenvectors`: the eigenvectors (n, k), orthonormal with respect to the vertex areas.
+    - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
+        sparse. Vertices of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
 
-    **Returns:** A `Spectrum` of JAX's default float type, for total area 1, without positions and normals.
+    **Returns:** A `Spectrum` with n vertices and k eigenvectors, for total area 1, without descriptors,
+    positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the arrays do not fit each other, are not finite real numbers, or are not an
     eigenbasis.
@@ -81,7 +85,7 @@ def make_spectrum(
         )
     total = areas.sum()
     if (areas < 0).any() or not total > 0:
-        raise InputError(f"{name}: some vertex areas are negative or all are zero: correct the areas.")
+        raise InputError(f"{name}: some vertex areas are negative, or all are zero: correct the areas.")
     largest = np.abs(values).max()
     if values.min() < -_EIGENVALUE_TOLERANCE * largest:
         raise InputError(
@@ -119,12 +123,12 @@ def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
 
 
 def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
-    """Return vertex areas as a list. A mass matrix is lumped: each vertex area is the sum of a row.
+    """Return vertex areas as a list. If `areas` is a mass matrix, the vertex areas are the sums of its rows.
 
     `shape` is the shape (n, k) of the eigenvectors.
     """
     areas = to_host(areas)
-    if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a tensor of PyTorch
+    if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a sparse tensor of PyTorch
         matrix = areas.to_sparse_coo().coalesce()
         areas = sp.coo_array((np.asarray(matrix.values()), np.asarray(matrix.indices())), shape=matrix.shape)
     if sp.issparse(areas) or np.ndim(areas) == 2:
@@ -146,7 +150,7 @@ def _real(values: Any, what: str, name: str) -> np.ndarray:
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
         raise InputError(
-            f"{name}: the {what} are not an array of real numbers: give an array of real numbers."
+            f"{name}: the {what} are not an array of real numbers: convert them to an array of floats."
         )
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
@@ -155,16 +159,20 @@ def _real(values: Any, what: str, name: str) -> np.ndarray:
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """Read an eigenbasis from a `.npz` file of `write_spectrum`, or from a `.mat` file.
+    """Read the eigenbasis of a shape from a `.npz` file of `write_spectrum`, or from a `.mat` file.
+
+    The surface is scaled to area 1, as `make_spectrum` explains. The unit of length in the file is arbitrary.
 
     **Arguments:**
 
-    - `path`: the file. A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas`
-        (n,). A `.mat` file contains either one struct, or the fields of one struct as variables. The fields
-        are `evals` (k), `evecs` (n, k) and the vertex areas. The areas are either `A`, a mass matrix (n, n)
-        or its diagonal, or a list `area` (n). The unit of length is arbitrary.
+    - `path`: the file.
+        - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
+        - A `.mat` file contains one struct with the following fields, or the same fields as variables.
+          `evals` (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given
+          by `A`, the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
 
-    **Returns:** A `Spectrum` of JAX's default float type, for total area 1; see `make_spectrum`.
+    **Returns:** A `Spectrum` with n vertices and k eigenvectors, for total area 1, without descriptors,
+    positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
     does not contain exactly one eigenbasis. The message names the file and the fault.
@@ -208,21 +216,27 @@ def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
-    """Write an eigenbasis to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
+    """Write the spectrum of a shape to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
 
     A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). In a `.mat`
-    file, `S` has the fields `evals`, `evecs`, the sparse mass matrix `A`, the total `area`, `sqrt_area` and
-    the number of vertices `nv`. If a mesh is given, `S` also has the number of faces `nf`, and `surface` with
-    `X`, `Y`, `Z` and 1-based `TRIV`. The surface is scaled to the area of the spectrum (usually 1), so all
-    fields describe the same surface. Numbers are written in double precision. To compute the spectrum in
-    double precision as well, use `jax.enable_x64`.
+    file, `S` has the following fields.
+
+    - `evals` (k) and `evecs` (n, k) are the eigenvalues and eigenvectors.
+    - `A` (n, n) is the lumped mass matrix, as a sparse matrix.
+    - `area` is the total area, `sqrt_area` its square root, and `nv` the number of vertices.
+    - If a mesh is given, `nf` is the number of faces. `surface` is a struct with the coordinates `X`, `Y` and
+      `Z` and the 1-based faces `TRIV`. The coordinates are scaled to the area of the spectrum (usually 1), so
+      all fields describe the same surface.
+
+    Numbers are written in double precision. To compute the spectrum in double precision as well, use
+    `jax.enable_x64`.
 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
-    - `spectrum`: the eigenbasis (n vertices, k eigenvectors). Its positions, normals, mask and descriptors
-        are not written.
-    - `mesh`: the mesh of the spectrum (n vertices). A `.npz` file does not contain the mesh.
+    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors). The positions, normals, mask and descriptors of
+        the spectrum are not written.
+    - `mesh`: the mesh of the spectrum (n vertices), or None. A `.npz` file does not contain the mesh.
 
     **Raises:** `InputError` for another suffix, a mesh with another number of vertices, or a file that cannot
     be written.
@@ -275,17 +289,19 @@ def check_spectrum_path(path: str | os.PathLike[str]) -> None:
 def read_functional_map(
     path: str | os.PathLike[str], spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> Float64[np.ndarray, "k_x k_y"]:
-    """Read a functional map (pullback, from functions on Y to functions on X) from a `.mat` file.
+    """Read a functional map from a `.mat` file.
+
+    The functional map is a pullback, which takes functions on Y to functions on X.
 
     **Arguments:**
 
-    - `path`: the file. The file contains either a single matrix, or a matrix `C21` among other variables (X
-        is shape 1, Y is shape 2).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, whose eigenbases the map uses. The map may use only
-        the first few eigenvectors of each.
+    - `path`: the file. The file contains either a single matrix, or a matrix `C21` among other variables. The
+        name `C21` means that X is shape 1 and Y is shape 2.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. The functional map may use only
+        the first eigenvectors of each spectrum.
 
-    **Returns:** The functional map C (k_X, k_Y), as stored, float64. k_X and k_Y are at most the numbers of
-    eigenvectors of the spectra.
+    **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. k_X and k_Y are at
+    most the numbers of eigenvectors of the spectra.
 
     **Raises:** `InputError` if the file cannot be read, contains no suitable matrix, or contains a matrix
     that is too large for the spectra or not finite. The message names the file and the fault.
@@ -297,11 +313,11 @@ def read_functional_map(
         if np.less_equal(matrix.shape[::-1], most).all():
             cure = "transpose the map"
         raise InputError(
-            f"{path}: the functional map has shape {matrix.shape}, but from functions on Y to functions on X "
-            f"the shape can be at most {most}: {cure}."
+            f"{path}: the functional map has shape {matrix.shape}, but the shape of a map from "
+            f"functions on Y to functions on X can be at most {most}: {cure}."
         )
     if not np.isfinite(matrix).all():
-        raise InputError(f"{path}: the functional map is not finite: compute it again.")
+        raise InputError(f"{path}: the functional map is not finite: compute the map again.")
     return matrix
 
 
@@ -315,8 +331,8 @@ def write_functional_map(
     **Arguments:**
 
     - `path`: the file to create or to replace, with the suffix `.mat`.
-    - `functional_map`: the pullback C (k_X, k_Y), from functions on Y to functions on X, between eigenbases
-        on area 1, as `write_spectrum` writes them.
+    - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. The
+        eigenbases belong to surfaces of area 1, as in the spectra of this library.
 
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.

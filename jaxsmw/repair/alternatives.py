@@ -1,4 +1,4 @@
-"""Alternative initial maps, for pairs on which nearest neighbours in SHOT exchange limbs."""
+"""Alternative initial maps, for pairs on which the usual initial map exchanges limbs."""
 
 from __future__ import annotations
 
@@ -42,21 +42,23 @@ def alternative_initial_maps(
 ) -> Iterator[Int64[np.ndarray, " m"]]:
     """Yield alternative initial maps, which are computed one by one.
 
-    On a pair on which one initial map exchanges limbs, another initial map often does not.
+    If one initial map of a pair exchanges limbs, another initial map often does not.
 
-    The first maps come from functional maps. Nearest neighbours in SHOT from X to Y and from Y to X each give
-    a functional map. The weighted mean of both functional maps is filtered as in the MWP paper and converted
-    to a pointwise map. `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+    The first alternative initial maps come from functional maps. A nearest-neighbour search in SHOT from X to
+    Y gives one functional map, and a search from Y to X gives another functional map. The weighted mean of
+    both functional maps is filtered as in the MWP paper and converted to a pointwise map.
+    `RepairSettings.alternatives` lists the radii of SHOT and the weights.
 
-    For two full shapes with descriptors (`describe`), further maps come from pairings of their extremities.
-    The pairings are selected by the distances between extremities. Each pairing gives a map by nearest
-    neighbours in SHOT and in distances to the extremities. A coarse regression refines this map. Among the
-    refined maps that differ from each other, the maps with the best scores are yielded.
+    For two full shapes with descriptors (`describe`), further maps come from pairings of the extremities of X
+    with those of Y. The pairings are selected by the distances between extremities. Each pairing gives a map
+    by nearest-neighbour search in SHOT and in distances to the extremities, which is refined by a coarse
+    feature regression. Among the refined maps that differ from each other, the maps with the best scores are
+    yielded.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units; see `paired_spectra`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units, from `paired_spectra`.
     - `settings`: the settings of the repair.
 
     **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
@@ -88,10 +90,10 @@ def _in_both_directions(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
 ) -> Int64[np.ndarray, " m"]:
-    """Compute the map that follows from the mean of the functional maps in both directions.
+    """Compute the pointwise map that follows from the weighted mean of two functional maps.
 
-    The functional maps come from nearest neighbours of the features from X to Y, and from Y to X. `weight` is
-    the weight of the second functional map.
+    One functional map comes from a nearest-neighbour search in feature space from X to Y, the other from a
+    search from Y to X. `weight` is the weight of the second functional map.
     """
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
@@ -118,7 +120,10 @@ def _decode_mean(
 def _by_extremities(
     sampled: SampledPair, shot: _Shot, spectrum_x: Spectrum, settings: RepairSettings
 ) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Yield maps from pairings of extremities. `spectrum_x`, of all vertices of X, is used for the scores."""
+    """Yield maps from pairings of extremities.
+
+    `spectrum_x` is the spectrum at all vertices of X, which is needed for the scores.
+    """
     pair = sampled.pair
     refinement = _CoarseRefinement(sampled, settings)
     ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
@@ -146,10 +151,10 @@ def _by_extremities(
 
 
 class _CoarseRefinement:
-    """Maps by nearest neighbours of features, refined by a coarse feature regression.
+    """A function that computes maps by nearest-neighbour search and refines them by a feature regression.
 
-    The coarse regression suffices to determine the match of each limb. The regression starts with few
-    eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
+    The feature regression is coarse, which suffices to determine the match of each limb. The feature
+    regression begins with few eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
     """
 
     def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
@@ -174,7 +179,7 @@ class _CoarseRefinement:
         )
 
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
-        """Return the outcome of the regression, without its distortion. The regression may have failed."""
+        """Return the outcome of the feature regression, which may have failed, without its distortion."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
         padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
         first = jax.device_put(padded.astype(np.int32))

@@ -1,4 +1,4 @@
-"""An estimate of the error of every match, without ground truth."""
+"""An estimate of the geodesic error of every match, which needs no ground truth."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ def expected_error(
     """Estimate the geodesic error of every match without ground truth.
 
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
-    first is the distance between a vertex and the vertex to which the reverse map takes its match. The second
-    is the mean change in length of the edges at a vertex. Where limbs look swapped (`discontinuous_parts`,
-    `orientation_reversal`), the expected error also grows with the size of the limb. docs/accuracy.md
-    measures how well the estimate ranks vertices. The estimate does not detect a map that is wrong but
-    consistent everywhere.
+    first quantity is the detour: T takes a vertex to its match, the reverse map takes the match back to X,
+    and the detour is the distance between the original vertex and the resulting vertex. The second quantity
+    is the mean change in length of the edges at a vertex.
+
+    Where limbs look swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows
+    with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices. If a
+    map is wrong but consistent everywhere, the expected error does not reveal the fault.
 
     **Arguments:**
 
@@ -36,8 +38,8 @@ def expected_error(
     - `spectrum_x`: the spectrum of X, in `Pair.units_of_length` and without padding.
     - `settings`: the weights of the estimate.
 
-    **Returns:** The expected distance of every match from the true match (m,), divided by the square root of
-    Y's area.
+    **Returns:** The expected geodesic distance between every match and the true match (m,), divided by the
+    square root of Y's area.
     """
     mesh_x = pair.mesh_x
     unit_x, unit_y = pair.units_of_length
@@ -54,7 +56,7 @@ def expected_error(
     heat = np.exp(-settings.heat_time * eigenvalues) * (eigenvectors.T @ (areas * signs))
     misplaced = discontinuous_parts(pair, pointwise_map)
     misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x)
-    # The matches of a misplaced limb can be as far from the true matches as the limb is large.
+    # On a misplaced limb, the distance between a match and the true match can be as large as the limb.
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]

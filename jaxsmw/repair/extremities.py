@@ -15,22 +15,22 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import coarse_edges, poisson_disk_samples
 from jaxsmw.repair.settings import ExtremitySettings
 
-# The distance between two connected components: larger than any distance within a component, and equal on
-# both bodies.
+# This finite value replaces the infinite distance between two connected components. The value is larger than
+# any distance within a component, and it is the same for both bodies.
 _ELSEWHERE = 10.0
 
 
 class Extremities(NamedTuple):
     """The extremities of a body, in descending order of their remoteness.
 
-    The remoteness of a vertex is its root mean square distance to the surface.
+    The remoteness of a vertex is the root mean square of its distances to all points of the surface.
 
     **Attributes:**
 
     - `vertices`: the vertices at the extremities (e,).
     - `distances`: the distances between extremities (e, e) along the surface, in units of the mean remoteness
       of the extremities; inf between connected components.
-    - `remoteness`: the remoteness of each extremity (e,), in the same unit.
+    - `remoteness`: the remoteness of each extremity (e,), in units of the mean remoteness of the extremities.
     """
 
     vertices: Int64[np.ndarray, " e"]
@@ -42,18 +42,20 @@ def extremities(
     mesh: Mesh,
     settings: ExtremitySettings = ExtremitySettings(),  # noqa: B008 (immutable)
 ) -> Extremities:
-    """Find the extremities of a body: the local maxima of the mean squared distance to the whole surface.
+    """Find the extremities of a body, such as the ends of its limbs.
 
-    The mean squared distance is taken from Hilaga et al., "Topology matching for fully automatic similarity
-    estimation of 3D shapes", SIGGRAPH 2001. Distances are measured along edges and are a few per cent too
-    long everywhere.
+    Extremities are the local maxima of the mean squared distance to the whole surface. The mean squared
+    distance is a function on the surface from Hilaga et al. 2001, "Topology matching for fully automatic
+    similarity estimation of 3D shapes". Distances are measured along edges, so all distances are a few per
+    cent too long.
 
     **Arguments:**
 
     - `mesh`: the surface.
-    - `settings`: the number of samples, the smallest distance between extremities, and their largest number.
+    - `settings`: the number of samples, the smallest distance between extremities, and the largest number of
+      extremities.
 
-    **Returns:** The `Extremities`, at most `settings.most`.
+    **Returns:** The `Extremities`, at most `settings.most` of them.
     """
     edges, nearest = coarse_edges(mesh)
     nodes, tails_and_heads = np.unique(edges, return_inverse=True)
@@ -80,17 +82,19 @@ def extremities(
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
     """Return pairings of the extremities of two bodies, the most plausible pairing first.
 
-    Every extremity of the body with fewer extremities has a partner on the other body. A pairing is plausible
-    if the distances between extremities, and their remoteness, are similar on both bodies. The cost of a
-    pairing is the sum of the squared differences. Distances do not tell left from right.
+    A pairing gives every extremity of one body a different partner on the other body. If the bodies have
+    different numbers of extremities, some extremities of one body have no partner. A pairing is plausible if
+    the distances between extremities, and the remoteness of extremities, are similar on both bodies. The cost
+    of a pairing is the sum of the squared differences of distances and of remoteness. The cost does not
+    distinguish left from right.
 
     **Arguments:**
 
     - `x`, `y`: the extremities of X and of Y.
-    - `number`: the largest number of pairings.
+    - `number`: the largest number of pairings to return.
 
-    **Returns:** A list of arrays (l, 2), where l is the smaller number of extremities. Each row gives the
-    index of an extremity of X and the index of its partner on Y.
+    **Returns:** A list of arrays (l, 2), where l is the number of extremities of the body with fewer
+    extremities. Each row gives the index of an extremity of X and the index of its partner on Y.
     """
     fewer, more = (x, y) if len(x.vertices) <= len(y.vertices) else (y, x)
     partners = np.array(list(permutations(range(len(more.vertices)), len(fewer.vertices))))

@@ -1,4 +1,4 @@
-"""The outcome of several stages of refinement, its score, and the decision whether it needs repair."""
+"""The outcome of several stages of refinement, its score, and the decision whether repair is needed."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Outcome(NamedTuple):
     **Attributes:**
 
     - `refinements`: one `Refinement` per stage, up to the first stage that failed.
-    - `initial_map`: the map from which the first stage started, (m,), 0-based vertices of Y. Like the maps of
-      the refinements, it may be padded.
-    - `distortion`: `jaxsmw.repair.scores.distortion` of the last map; None if it was not computed.
+    - `initial_map`: the initial map of the first stage (m,), 0-based vertices of Y. The initial map and the
+      maps of the refinements may be padded.
+    - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
     """
 
@@ -41,22 +41,22 @@ class Outcome(NamedTuple):
 
     @property
     def pointwise_map(self) -> Int[Array, " m"]:
-        """The map of the last stage (m,), or the initial map if no stage has run."""
+        """The map of the last stage that has run (m,), or the initial map if no stage has run."""
         return self.refinements[-1].pointwise_map if self.refinements else self.initial_map
 
 
 def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncertainty_weight) -> float:
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
-    The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty is that of the
-    last refiner state that has an uncertainty, or zero if no state has one.
+    The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty comes from the
+    last stage whose refiner computes an uncertainty. Without such a refiner, the uncertainty counts as zero.
 
     **Arguments:**
 
-    - `outcome`: the outcome. A missing distortion counts as 1.
+    - `outcome`: the outcome. If its distortion was not computed, the distortion counts as 1.
     - `uncertainty_weight`: the weight of the uncertainty; see `RepairSettings`.
 
-    **Returns:** The score, without unit; infinity if a stage failed.
+    **Returns:** The score, without unit. The score is infinite if a stage failed.
     """
     if not outcome.successful:
         return np.inf
@@ -72,9 +72,9 @@ class Judge:
     **Attributes:**
 
     - `pair`: the source X (m vertices) and the target Y.
-    - `spectrum_x`: X's spectrum with the largest number of eigenvectors, because more eigenvectors show
-      faults better. The spectrum may be padded.
-    - `settings`: the thresholds and weights.
+    - `spectrum_x`: the spectrum of X with the largest available number of eigenvectors, because more
+      eigenvectors show faults better. The spectrum may be padded.
+    - `settings`: the thresholds and weights of the repair.
     """
 
     pair: Pair
@@ -92,15 +92,15 @@ class Judge:
         return outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
 
     def score(self, outcome: Outcome) -> float:
-        """Return the score of an outcome with the weight in the settings; lower is better. See `score`."""
+        """Return the `score` of an outcome with the uncertainty weight of the settings; lower is better."""
         return score(outcome, self.settings.uncertainty_weight)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
         """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
 
-        One fault is the set of vertices with orientation reversal, the other is the set of discontinuous
-        parts. A fault is left out if its share of the area is too small or too large (`negligible_area` and
-        `excessive_area` in the settings).
+        One fault consists of the vertices with orientation reversal. The other fault consists of the vertices
+        in discontinuous parts. A fault is not returned if its share of X's area is at most `negligible_area`
+        or at least `excessive_area` in the settings.
         """
         mesh_x, found, scores = self.pair.mesh_x, self._matches(outcome), self.settings.scores
         both = (
@@ -114,19 +114,19 @@ class Judge:
     def looks_right(self, outcome: Outcome) -> bool:
         """Return whether a judged outcome needs no further repair.
 
-        This is the case if the outcome is not suspicious, or if its distortion is below `doubtful` in the
-        settings and it has no faults.
+        An outcome needs no further repair if it is not suspicious. A suspicious outcome needs no further
+        repair if its distortion is below `doubtful` in the settings and it has no faults.
         """
         assert outcome.distortion is not None
         slightly_distorted = outcome.distortion < self.settings.doubtful
         return not outcome.suspicious or (slightly_distorted and not self.faults(outcome))
 
     def same(self, first: Outcome, second: Outcome) -> bool:
-        """Return whether the maps of two outcomes agree except for details; see `same_map`."""
+        """Return whether the maps of two outcomes agree on nearly all of X; see `same_map`."""
         return same_map(self.pair, self._matches(first), self._matches(second), self.settings.scores)
 
     def largest_group(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
-        """Return the largest group of outcomes whose maps all agree with the map of one member.
+        """Return the largest group of outcomes whose maps all agree with the map of one outcome in the group.
 
         **Raises:** `ValueError` if there are no outcomes.
         """

@@ -34,29 +34,31 @@ def refine_in_stages(
     """Refine the initial map of a pair by the given stages in order, and repair a map that looks wrong.
 
     If the initial map exchanges symmetric limbs, refinement does not correct this error. The reason is that
-    each limb has the shape of the other limb, except for its orientation and its connection to the body. With
-    `repair`, the outcome is checked for orientation reversal and discontinuities (`jaxsmw.repair.scores`). An
-    outcome that looks correct is returned. Otherwise repair proceeds as follows.
+    both limbs have the same shape and differ only in their orientation and their connection to the body. With
+    `repair`, the outcome is checked for orientation reversal and discontinuities (`jaxsmw.repair.scores`). If
+    the outcome looks wrong, repair takes the following three steps. The stage at position `repair.stage` is
+    called the repaired stage.
 
-    1. Rounds: the repaired stage and all later stages run again. They start from a functional map without
-       the faults of the previous round. Vertices with orientation reversal and discontinuous parts are left
-       out in alternate rounds.
+    1. Rounds: the repaired stage and all later stages run again. In the repaired stage, vertices with a fault
+       in the previous round have no weight. If there are both kinds of faults, rounds without the vertices of
+       orientation reversal alternate with rounds without discontinuous parts.
     2. Fallback: the repaired stage, with `fallback_levels`, and all later stages run from the best outcome.
-       The fallback is preferred if it looks correct and its score is worse by less than `score_tolerance`.
-       Otherwise the outcome with the better score is kept.
+       The map of the fallback is kept if it looks correct and its score is worse by less than
+       `score_tolerance`, or if its score is better. Otherwise the previous map is kept.
     3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to the repaired
        stage, which then runs again in rough rounds. The best of these outcomes are refined by all stages and
-       repaired. The outcome with the best score among those that look correct is returned. If no outcome
-       looks correct, but at least `agreeing` initial maps lead to the same map, this map is returned.
-       Otherwise the outcome with the best score is returned.
+       repaired. Among the outcomes that look correct, the outcome with the best score is returned. If no
+       outcome looks correct, but at least `agreeing` initial maps lead to the same map, this map is returned.
+       If fewer initial maps agree, the outcome with the best score is returned.
 
     **Arguments:**
 
     - `prepared`: the pair with its spectra and its initial map.
-    - `stages`: the stages, in order.
-    - `repair`: the settings of the repair; None for no repair.
-    - `alternatives`: alternative initial maps (m,), computed one by one and only if needed. By default they
-      come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`; otherwise there are none.
+    - `stages`: the stages, in the order in which they run.
+    - `repair`: the settings of the repair, or None for no repair.
+    - `alternatives`: alternative initial maps (m,), as an iterable that is consumed only if needed. By
+      default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
+      initial maps, there are no alternatives by default.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** An `Outcome` with padded maps. Refinement stops at the first stage that fails.
@@ -98,14 +100,17 @@ _View = tuple[Spectrum, Spectrum]
 
 @dataclass(frozen=True)
 class _Runner:
-    """A runner of stages on one pair. `steps` contains each stage with its view of the spectra."""
+    """A runner of stages on one pair. Each item of `steps` is a stage with its view of the spectra."""
 
     prepared: PreparedPair
     steps: list[tuple[_View, Stage]]
     history: bool
 
     def run(self, first: int, before: Outcome, last: int | None = None) -> Outcome:
-        """Run the stages from position `first` up to, but not including, `last`, and return the outcome."""
+        """Run the stages from position `first` up to, but not including, position `last`.
+
+        **Returns:** The outcome `before`, extended by the refinements of these stages.
+        """
         for view, stage in self.steps[first:last]:
             if not before.successful:
                 break
@@ -113,7 +118,7 @@ class _Runner:
         return before
 
     def run_one(self, view: _View, stage: Stage, before: Outcome) -> Outcome:
-        """Run one more stage and return the outcome."""
+        """Run one more stage and return the extended outcome."""
         found = stage.run(
             *view,
             before.pointwise_map,
@@ -126,14 +131,14 @@ class _Runner:
 
 @dataclass(frozen=True)
 class _Repairer:
-    """A repairer of outcomes, which repeats the stage at position `settings.stage` and all later stages."""
+    """A repairer of outcomes. It repeats the stage at position `settings.stage` and all later stages."""
 
     runner: _Runner
     judge: Judge
     settings: RepairSettings
 
     def begun(self, first: Int[Array, " m"]) -> Outcome:
-        """Run all stages up to and including the repaired stage; the outcome is not yet judged."""
+        """Run all stages up to and including the repaired stage. The returned outcome is not yet judged."""
         return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
 
     def finished(self, outcome: Outcome) -> Outcome:
@@ -148,9 +153,9 @@ class _Repairer:
             tuple(min(level, stage.number_of_eigenvectors) for level in self.settings.fallback_levels)
         )
         last = self.finished(self._repeated(outcome, spectrum_x, fallback))
-        # The fallback depends least on the faults that misled earlier rounds. It is preferred if it looks
-        # correct and its score is not much worse. The tolerance excludes upside-down maps, whose scores are
-        # much worse.
+        # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
+        # fallback is preferred if it looks correct and its score is not much worse. The tolerance excludes
+        # upside-down maps, whose scores are much worse.
         score = self.judge.score
         preferred = (
             self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
@@ -159,16 +164,16 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Return the best among a suspicious outcome and the outcomes of alternative initial maps."""
+        """Return the best of a suspicious outcome and the outcomes from alternative initial maps."""
         rough = self._rough_outcomes(alternatives)
-        # All alternatives are tried, because a later alternative may be better than an earlier one.
+        # The search does not stop at the first map that looks correct, because a later map may be better.
         finished, tried = [best], [best, *rough]
         for outcome in islice(distinct(rough, self.judge.same), self.settings.finalists):
             finished.append(self.repaired(self.finished(outcome)))
         best = min(finished, key=lambda outcome: (outcome.suspicious, self.judge.score(outcome)))
         if best.suspicious:
             # With topological noise, correct maps also look discontinuous. Most wrong maps differ from each
-            # other, so a map on which several initial maps agree is probably correct.
+            # other, so a map to which several initial maps lead is probably correct.
             group = self.judge.largest_group(tried)
             if len(group) >= self.settings.agreeing:
                 known = [outcome for outcome in finished if self.judge.same(outcome, group[0])]
@@ -181,7 +186,10 @@ class _Repairer:
         return best
 
     def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
-        """Refine alternative initial maps up to the repaired stage; return the outcomes, best score first."""
+        """Refine alternative initial maps up to the repaired stage, and repair them in rough rounds.
+
+        **Returns:** The successful outcomes, with the best score first.
+        """
         rough: list[Outcome] = []
         for number, first in enumerate(alternatives, 2):
             logger.info("initial map %d ...", number)
@@ -191,7 +199,11 @@ class _Repairer:
         return sorted((outcome for outcome in rough if outcome.successful), key=self.judge.score)
 
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
-        """Run rounds of repair, each without a fault of the previous round, and return the best outcome."""
+        """Run rounds of repair and return the best outcome.
+
+        In each round, the vertices of one fault of the previous round have no weight. If `finish` is True,
+        each round also runs all stages after the repaired stage.
+        """
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)
         best = last = outcome
@@ -206,7 +218,10 @@ class _Repairer:
         return best
 
     def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
-        """Run `stage` from the last map instead of the repaired stage; the outcome is not yet judged."""
+        """Run `stage` instead of the repaired stage, starting from the final map of an outcome.
+
+        The returned outcome is not yet judged.
+        """
         (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
         found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))
         before = outcome.refinements[: self.settings.stage]

@@ -1,4 +1,4 @@
-"""Scores of a pointwise map that need no ground truth."""
+"""Scores that measure the quality of a pointwise map without ground truth."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def dirichlet_energy_ratio(
     spectrum_x: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> float:
-    """Return the Dirichlet energy of the matched positions divided by that of X's own positions.
+    """Return the Dirichlet energy of the matched positions, divided by the energy of X's own positions.
 
-    Both energies are computed in the span of X's eigenvectors. This excludes the scatter of single matches,
-    which grows with the density of the mesh. For the true map the ratio is about 1 between poses of one body,
-    for any triangulations, and up to 1.1 between non-isometric shapes. Discontinuous maps have larger ratios.
+    Both energies are computed in the span of X's eigenvectors. The restriction to this span removes the
+    scatter of single matches, which grows with the density of the mesh. The ratio of the true map is about 1
+    between poses of one body, for any triangulations. The ratio of the true map is up to 1.1 between
+    non-isometric shapes. Discontinuous maps have larger ratios.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors. Padding beyond the vertices of X is
-      ignored.
+    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors, which may be padded.
     - `settings`: the settings of the scores.
 
     **Returns:** The ratio, without unit, for positions in `Pair.units_of_length`.
@@ -67,14 +67,15 @@ def distortion(
     spectrum_x: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> float:
-    """Return the distortion of a map: 1 for isometries, larger for worse maps.
+    """Return the distortion of a map, which is 1 for isometries and larger for worse maps.
 
-    The distortion is the `dirichlet_energy_ratio`, or its inverse if the ratio is below 1, times
-    `1 + orientation_weight * share`. Here `share` is the share of X's area with `orientation_reversal`. The
-    energy ratio alone would prefer the mirror image of a body to a map with swapped legs. For a partial pair
-    the inverse is not taken, because large parts of the full shape have no match.
+    The distortion is the `dirichlet_energy_ratio` times `1 + orientation_weight * share`, where `share` is
+    the share of X's area with `orientation_reversal`. Without this factor, a map that mirrors the body would
+    have a smaller distortion than a map with swapped legs. If the energy ratio is below 1, its inverse is
+    used instead, except for a partial pair. The reason for the exception is that large parts of the full
+    shape have no match.
 
-    Correct maps by `Registration` have a distortion of at most 1.12 between poses of one body, and at most
+    Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
     1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
 
     **Arguments:**
@@ -99,9 +100,10 @@ def discontinuous_parts(
 ) -> Bool[np.ndarray, " m"]:
     """Find the vertices of X that discontinuities of the map separate from the largest part of X.
 
-    Discontinuous edges are removed from X (`ScoreSettings.discontinuity_distance`). All connected components
-    except the component of largest area are discontinuous parts. An example is a limb that is swapped as a
-    whole.
+    An edge is discontinuous if its ends have matches that are far apart (`ScoreSettings` has the thresholds).
+    After the removal of discontinuous edges, X consists of one or more connected components. All components
+    except the component of largest area are discontinuous parts. An example of a discontinuous part is a
+    swapped limb.
 
     **Arguments:**
 
@@ -128,9 +130,9 @@ def orientation_reversal(
 ) -> Bool[np.ndarray, " m"]:
     """Find the vertices of X around which the map exchanges left and right, as on swapped limbs.
 
-    The matches of the corners of each triangle of X form a triangle on Y. The area of this triangle counts as
-    negative if its orientation is opposite to that of Y's surface. The density of this signed area is
-    smoothed in the span of X's first eigenvectors and compared with a threshold.
+    The matches of the three corners of a triangle of X form a triangle on Y. The area of the triangle on Y
+    counts as negative if its orientation is opposite to the orientation of Y's surface. The density of this
+    signed area on X is smoothed in the span of X's first eigenvectors and compared with a threshold.
 
     **Arguments:**
 
@@ -139,7 +141,7 @@ def orientation_reversal(
     - `spectrum_x`: the spectrum of X in `Pair.units_of_length`, which may be padded.
     - `settings`: the settings of the scores.
 
-    **Returns:** A mask (m,), True where the orientation is reversed.
+    **Returns:** A mask (m,), True for vertices around which the orientation is reversed.
     """
     mesh_x, mesh_y = pair.meshes
     unit_x, unit_y = pair.units_of_length
@@ -150,7 +152,8 @@ def orientation_reversal(
     covered = 0.5 * np.sum(np.cross(b - a, c - a) * normals, axis=1) / unit_y**2
     if mesh_x.is_inside_out != mesh_y.is_inside_out:
         covered = -covered
-    # The limit prevents a single triangle whose matches are far apart from outweighing all of its neighbours.
+    # Without this limit, a single triangle whose corners have matches far apart could outweigh all of its
+    # neighbours.
     most = 2 * mesh_x.face_areas / unit_x**2
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
@@ -165,10 +168,10 @@ def same_map(
     second: Int64[np.ndarray, " m"],
     settings: ScoreSettings = _DEFAULT,
 ) -> bool:
-    """Return whether two maps agree except for details.
+    """Return whether two maps agree on nearly all of X.
 
-    Two maps agree if their matches differ by more than `settings.same_map_distance`, in Euclidean distance,
-    on less than the share `settings.same_map_area` of X's area.
+    The matches of a vertex differ if their Euclidean distance exceeds `settings.same_map_distance`. Two maps
+    agree if the vertices whose matches differ have less than the share `settings.same_map_area` of X's area.
 
     **Arguments:**
 
@@ -183,7 +186,7 @@ def same_map(
 
 
 def distinct(items: Iterable[_Item], same: Callable[[_Item, _Item], bool]) -> Iterator[_Item]:
-    """Yield the items that are not the same as an earlier yielded item.
+    """Yield the items that differ from all items that were yielded earlier.
 
     **Arguments:**
 
@@ -208,7 +211,8 @@ def edge_lengths(
     - `edges`: pairs of vertices of X (e, 2).
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
 
-    **Returns:** The lengths on X (e,) and the Euclidean distances on Y (e,), both in `Pair.units_of_length`.
+    **Returns:** The lengths of the edges on X (e,), and the Euclidean distances between the matches on Y
+    (e,), both in `Pair.units_of_length`.
     """
     unit_x, unit_y = pair.units_of_length
     placed = (pair.mesh_x.vertices / unit_x, pair.mesh_y.vertices[pointwise_map] / unit_y)

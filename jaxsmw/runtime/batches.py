@@ -1,4 +1,4 @@
-"""Refinement of many pairs: shapes are padded to a few common sizes and refined in batches on all devices."""
+"""Refinement of many pairs in batches on all devices. Shapes are padded to a few common sizes."""
 
 from __future__ import annotations
 
@@ -23,26 +23,38 @@ from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
 
-# Larger batches gained nothing on any measured device (scripts/benchmark_batches.py).
+# Larger batches were not faster on any device that scripts/benchmark_batches.py measured.
 _LARGEST_BATCH = 64
-# The memory in bytes of a device that does not report its memory.
+# The assumed memory, in bytes, of a device that does not report its memory.
 _USUAL_MEMORY = 8 * 2**30
 
 Tree = TypeVar("Tree")
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
-    """Returns several shapes as one `Spectrum` for `jax.vmap`, whose arrays have a leading axis.
+    """Returns one `Spectrum` that contains several shapes, for `jax.vmap`.
 
-    All shapes are padded to the number of vertices of the largest shape.
+    Every array of the result has a leading axis, with one entry per shape. All shapes are padded with masked
+    vertices to the number of vertices of the largest shape.
 
-    **Raises:** `ValueError` if the shapes differ in their number of eigenvectors, or if there are no shapes.
+    **Arguments:**
+
+    - `spectra`: at least one `Spectrum`. All spectra need the same number k of eigenvectors and the same
+      optional arrays, such as descriptors.
+
+    **Returns:** The stacked spectrum. For s shapes and n vertices in the largest shape, `eigenvectors` has
+    shape (s, n, k).
+
+    **Raises:** `ValueError` if there are no shapes, or if the shapes differ in the number of eigenvectors or
+    in which optional arrays they have.
     """
     if not spectra:
         raise ValueError("there are no shapes to stack: give at least one spectrum")
     sizes = {spectrum.eigenvalues.shape[0] for spectrum in spectra}
     if len(sizes) > 1:
-        raise ValueError(f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them first")
+        raise ValueError(
+            f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them to one number first"
+        )
     largest = max(spectrum.mask.shape[0] for spectrum in spectra)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(spectrum.pad(largest) for spectrum in spectra))
 
@@ -62,36 +74,42 @@ def refine_pairs(
     memory: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[tuple[int, Refinement]]:
-    """Refines many pairs of shapes of any sizes, as fast as the devices allow.
+    """Refines many pairs of shapes, of equal or different sizes, in batches on all devices.
 
     Shapes are padded to a few common sizes (`jaxsmw.runtime.padding.padded_size`). One compiled program
-    serves all pairs with the same combination of sizes. All devices share each batch. With several processes
-    (`jax.distributed`), call this function with the same arguments in each process. The function uses the
-    devices of all processes, and every process gets all results.
+    serves all pairs with the same combination of sizes. Each batch is divided among all devices. With several
+    processes (`jax.distributed`), call this function with the same arguments in each process. The function
+    uses the devices of all processes, and every process gets all results.
 
-    The result of a pair agrees with the result of `refine` up to the rounding of sums over padded arrays and
-    of batched products. Functional maps agree to the precision of the float type. Matches can differ only if
-    the distances to two vertices of Y are equal to that precision.
+    For each pair, the result agrees with the result of `refine` up to rounding errors in sums over padded
+    arrays and in batched products. Functional maps agree to the precision of the float type. A match can
+    differ only if the distances to two vertices of Y are equal to that precision.
 
     **Arguments:**
 
-    - `spectra`: the shapes.
-    - `pairs`: the positions of source X and target Y among the shapes, for each pair. A pair may occur
-      several times with different initial maps.
-    - `pointwise_maps`: the initial map T: X -> Y (m,) of each pair, one vertex of Y per vertex of X.
-    - `refiner`, `iterations`, `partial`, `stop_when_unchanged`, `history`: see `refine`.
-    - `samples`: the vertices (s,) of each shape on which the refiner iterates, the same number for all
-      shapes; see `refine`.
-    - `batch_size`: the number of pairs that each device refines at once. The default on CPUs is 1, because
-      larger batches save no time there and need more memory. The default on other devices is as many pairs as
-      fit into `memory`, up to 64.
-    - `memory`: the memory in bytes that a batch may use on each device; by default half of the device's
-      memory.
-    - `devices`: the devices to use; by default all devices of the default backend.
+    - `spectra`: a sequence of shapes, each a `Spectrum`.
+    - `pairs`: for each pair, a tuple of two integers: the indices of source X and target Y in `spectra`,
+      counted from 0. A pair may occur several times with different initial maps.
+    - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one vertex of Y
+      per vertex of X.
+    - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
+    - `iterations`: the number of iterations, an integer of at least 1.
+    - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
+      number s must be the same for all shapes. With None, all iterations use all vertices.
+    - `partial`: whether one shape of each pair is a part of the other. If True, both shapes must have the
+      same unit of length.
+    - `stop_when_unchanged`: whether to skip the remaining iterations of a pair once no match changes.
+    - `history`: whether to record a `History` of each pair.
+    - `batch_size`: the number of pairs that each device refines at the same time. The default on CPUs is 1,
+      because larger batches save no time there and need more memory. The default on other devices is as many
+      pairs as fit into `memory`, up to 64.
+    - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
+      is half of the device's memory.
+    - `devices`: the JAX devices to use. The default is all devices of the default backend.
 
-    **Returns:** An iterator over tuples of the position of a pair among the pairs and the `Refinement` of
-    this pair. Pairs of equal size follow each other. Numerical failures raise no error: check the `result` of
-    each refinement.
+    **Returns:** An iterator over tuples of two elements: the index of a pair in `pairs`, and the `Refinement`
+    of this pair. Pairs of equal size follow each other. Numerical failures raise no error, so compare the
+    `result` of each refinement with `RESULTS.successful`.
 
     **Raises:** `ValueError` if the numbers of pairs, initial maps and samples do not fit together, a pair
     refers to a shape that does not exist, an initial map is not one integer per vertex of X, a shape is not a
@@ -117,8 +135,8 @@ def refine_pairs(
             )
             for begin in range(0, len(positions), per_call):
                 chosen = positions[begin : begin + per_call]
-                # The last batch is filled with copies of a pair, because a smaller batch would need another
-                # program.
+                # The last batch is filled with copies of its last pair, because a smaller batch would need
+                # another program.
                 filled = chosen + chosen[-1:] * (per_call - len(chosen))
                 maps = np.stack([pad_rows(np.asarray(pointwise_maps[p]), sizes.m) for p in filled])
                 batch = _Batch(
@@ -148,28 +166,31 @@ def _check_pairs(
         )
     if samples is not None and len(samples) != len(spectra):
         raise ValueError(
-            f"there are {len(spectra)} shapes, but samples of {len(samples)}: give samples of every shape"
+            f"there are {len(spectra)} shapes, but samples of {len(samples)} shapes: give samples of every "
+            "shape"
         )
     for position, spectrum in enumerate(spectra):
         if not isinstance(spectrum, Spectrum):
             raise ValueError(
-                f"shape {position} is a {type(spectrum).__name__}, but a Spectrum is needed: see "
+                f"shape {position} is a {type(spectrum).__name__}, but a Spectrum is needed: compute it by "
                 "compute_spectrum"
             )
     for position, (pair, pointwise_map) in enumerate(zip(pairs, pointwise_maps, strict=True)):
         if len(pair) != 2 or any(shape not in range(len(spectra)) for shape in pair):
             raise ValueError(
-                f"pair {position} is {tuple(pair)}, but two positions among {len(spectra)} shapes are needed"
+                f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
+                "two shapes, counted from 0"
             )
         if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
             raise ValueError(
-                f"the initial map of pair {position} is of {pointwise_map.dtype}: give integer vertex indices"
+                f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
+                "indices"
             )
         vertices = spectra[pair[0]].mask.shape
         if pointwise_map.shape != vertices:
             raise ValueError(
-                f"the initial map of pair {position} has shape {pointwise_map.shape}, but its X has "
-                f"{vertices[0]} vertices"
+                f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
+                f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
             )
 
 
@@ -183,7 +204,7 @@ class _Settings(TypedDict):
 
 
 class _Sizes(NamedTuple):
-    """The sizes of a pair: padded numbers of vertices, and numbers of eigenvectors."""
+    """The padded numbers of vertices and the numbers of eigenvectors of a pair."""
 
     m: int
     n: int
@@ -191,14 +212,14 @@ class _Sizes(NamedTuple):
     k_y: int
 
     def bytes_per_pair(self, itemsize: int) -> int:
-        """Returns `bytes_per_pair` of these sizes."""
+        """Returns the result of the function `bytes_per_pair` for these sizes."""
         return bytes_per_pair(self.m, self.n, max(self.k_x, self.k_y), itemsize)
 
 
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Returns the positions of all pairs, grouped by the sizes of the pairs."""
+    """Returns the indices of all pairs in `pairs`, grouped by the sizes of the pairs."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
@@ -209,7 +230,7 @@ def _positions_by_size(
 _DIVIDED, _EVERYWHERE = PartitionSpec("pairs"), PartitionSpec()
 
 Side = tuple[Spectrum, Int[Array, "batch s"] | None]
-"""One side of a batch of pairs: spectra with a leading axis, and samples or None."""
+"""The sources or the targets of a batch of pairs: spectra with a leading axis, and samples or None."""
 
 
 class _Batch(NamedTuple):
@@ -221,7 +242,7 @@ class _Batch(NamedTuple):
 
 
 class _Stack:
-    """The shapes on one side of some pairs, padded to one size and copied to all devices."""
+    """The sources or the targets of several pairs, padded to one size and copied to all devices."""
 
     def __init__(
         self,
@@ -258,14 +279,14 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
-    # The solvers of optimistix do not run within `shard_map`. The compiler divides the batch anyway, because
-    # the pairs do not depend on each other.
+    # `shard_map` is not used, because the solvers of optimistix do not run within it. The compiler still
+    # divides the batch among the devices, because the pairs do not depend on each other.
     refined = lax.map(one, batch) if len(batch.initial_maps) == 1 else jax.vmap(one)(batch)
     return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
 
 
 def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Iterator[Refinement]:
-    """Refines a batch and returns the refinement of each pair."""
+    """Refines a batch and yields the refinement of each pair."""
     with one_blas_thread():
         refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
         refined = multihost_utils.process_allgather(refined, tiled=True)
@@ -274,7 +295,10 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 
 
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
-    """Returns 1 on CPUs. On other devices, returns the number of pairs that fit into the memory, up to 64."""
+    """Returns the default number of pairs per device: 1 on CPUs, and at most 64 on other devices.
+
+    On other devices, it is the number of pairs that fit into the memory.
+    """
     if _one_at_a_time(device):
         return 1
     if memory is None:
@@ -284,20 +308,23 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    """Returns whether to refine pairs one by one: on CPUs a batch takes a third longer than single pairs."""
+    """Returns whether to refine pairs one after another, as on CPUs.
+
+    On CPUs, a batch of pairs takes a third more time than the same pairs one after another.
+    """
     return device.platform == "cpu"
 
 
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
-    """Returns the approximate memory of `refine` on a device for one pair, in bytes.
+    """Returns the approximate memory that `refine` uses on a device for one pair, in bytes.
 
-    The memory includes the arrays of the pair. It is linear in m and n.
+    The memory includes the arrays of the pair. It grows linearly with m and n.
 
     **Arguments:**
 
     - `m`, `n`: the numbers of vertices of X and Y.
     - `k`: the number of eigenvectors.
-    - `itemsize`: the size of a number in bytes.
+    - `itemsize`: the size of one floating-point number, in bytes.
     """
     eigenvectors, embeddings, scores = (m + n) * k, 2 * (m + n) * k, 3 * n * BLOCK
     return itemsize * (eigenvectors + embeddings + scores)

@@ -1,8 +1,9 @@
 """A cache on disk for expensive results, such as spectra, SHOT descriptors and geodesic graphs.
 
-The name of an entry is a hash of everything that the result depends on, so entries never go stale. Entries
-are written atomically, so any number of processes share the directory without locks. Checksums are verified
-when an entry is read. If the directory is deleted, only time is lost.
+The name of an entry contains a hash of everything on which the result depends, so an entry never becomes
+outdated. Entries are written atomically, so any number of processes can share the directory without locks.
+Checksums are verified when an entry is read. The directory can be deleted at any time, because the cache
+computes missing results again.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ import platformdirs
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
-# Part of every key. Increment this number when a change of the code changes results for the same inputs.
+# Every key contains this number. Increment the number when a change of the code changes results for the same
+# inputs.
 _FORMAT = 4
 
-# The names of entries, and of temporary files that a killed process left behind.
+# This pattern matches the names of entries, and the names of temporary files that a killed process left
+# behind.
 _OWN_FILES = re.compile(r"([a-z-]+-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
 
 
@@ -35,18 +38,19 @@ def cached(
     inputs: Sequence[np.ndarray | str | int | float],
     compute: Callable[[], dict[str, np.ndarray]],
 ) -> dict[str, np.ndarray]:
-    """Return the result of `compute`, read from the disk if the result was computed before.
+    """Return the result of `compute`, or read the result from the disk if it was computed before.
 
-    The environment variable `JAXSMW_CACHE` names the directory; the default is the user's cache directory,
-    and an empty name or `off` disables the cache. `JAXSMW_CACHE_LIMIT` is the size of the cache in GiB, by
-    default 4; the least recently used entries are removed first. A damaged entry is computed again. If an
-    entry cannot be written, the function warns and returns the result.
+    The environment variable `JAXSMW_CACHE` names the directory of the cache. The default is the user's cache
+    directory. An empty name or `off` disables the cache. The environment variable `JAXSMW_CACHE_LIMIT` limits
+    the size of the cache in GiB, by default to 4. Above this limit, the least recently used entries are
+    removed. A damaged entry is computed again. If an entry cannot be written, the function warns and returns
+    the result.
 
     **Arguments:**
 
     - `kind`: the first part of the entry's name, in lower-case words joined by hyphens.
     - `inputs`: all values on which the result depends, in a fixed order.
-    - `compute`: computes the arrays and returns them by name.
+    - `compute`: a function without arguments, which computes the arrays and returns them by name.
 
     **Returns:** The arrays by name, bit for bit as computed.
 
@@ -67,10 +71,11 @@ def cached(
                 np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
             _remove_oldest(path.parent, limit)
         except (OSError, InputError):
-            # Text and line are the same for all entries, so Python shows this warning only once.
+            # The text and the line number are the same for all entries, so Python shows this warning once.
             warnings.warn(
-                f"results cannot be cached in {place} and will be computed again next time: make room there, "
-                "or name another directory in JAXSMW_CACHE ('off' for no cache).",
+                f"results cannot be cached in {place} and will be computed again next time: make the "
+                "directory writable, free disk space, or set JAXSMW_CACHE to another directory ('off' for no "
+                "cache).",
                 RuntimeWarning,
                 stacklevel=1,
             )
@@ -82,7 +87,10 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Recompute all results in the block, to measure the time. Results are still written to the cache."""
+    """Recompute all results in the block, so that the time of their computation can be measured.
+
+    The results are still written to the cache.
+    """
     token = _recomputing.set(True)
     try:
         yield
@@ -91,11 +99,12 @@ def recomputing() -> Iterator[None]:
 
 
 def cache_compiled_programs() -> None:
-    """Make JAX cache compiled programs for later processes, next to our results, up to 0.25 GiB.
+    """Make JAX store compiled programs on disk for later processes.
 
-    This function sets JAX's environment variables, unless the user has set one of them. It must run before
-    JAX is imported. Each type of processor gets its own directory, because JAX does not distinguish
-    processors, and machines with different processors may share the disk.
+    The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
+    environment variables of JAX, unless the user has set one of these variables. It must run before JAX is
+    imported. Each type of processor has its own directory, because JAX does not distinguish processors, and
+    machines with different processors may share the disk.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -118,7 +127,8 @@ def cache_compiled_programs() -> None:
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
-        # Many small programs take as long to compile as one large one.
+        # Small programs are also stored, because many small programs take as long to compile as one large
+        # program.
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
@@ -127,13 +137,13 @@ def cache_compiled_programs() -> None:
 
 
 def _place() -> Path | None:
-    """Return the directory, or None if the cache is disabled."""
+    """Return the directory of the cache, or None if the cache is disabled."""
     place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
     return None if place in ("", "off") else Path(place)
 
 
 def _limit() -> float:
-    """Return the size limit in bytes."""
+    """Return the largest size of the cache in bytes."""
     text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
     try:
         limit = float(text)
@@ -169,7 +179,10 @@ def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:
-    """Remove our least recently used files until the remaining files fit the limit (in bytes)."""
+    """Remove the least recently used files of the cache until the remaining files fit the limit.
+
+    The limit is in bytes.
+    """
     files = []
     for entry in os.scandir(directory):
         with suppress(FileNotFoundError):  # another process may also remove files

@@ -12,19 +12,20 @@ from pathlib import Path
 from jaxsmw.errors import InputError
 
 LARGEST_FILE = 2**30
-"""The largest file, in bytes, that is read whole: 1 GiB.
+"""The size of the largest file that is read as a whole, in bytes (1 GiB).
 
-Parsing a text file takes up to fifteen times its size in memory. A text file of this size describes a mesh of
-ten million vertices.
+Parsing a text file needs up to fifteen times the size of the file in memory. A text file of 1 GiB describes a
+mesh of ten million vertices.
 """
 
 
 def largest_contents(size_of_file: int) -> int:
-    """Return the largest plausible size of the contents of a compressed file, in bytes.
+    """Return the largest plausible size of the unpacked contents of a compressed file, in bytes.
 
-    1 GiB is always plausible, because a mesh of ten million vertices has this size. Larger contents are
-    eigenvectors, which compress little, so four times the size of their file is a generous limit. A malicious
-    file can unpack to a thousand times its size.
+    A malicious file can unpack to a thousand times its size, so a limit is necessary. Contents of up to 1 GiB
+    are always plausible, because a mesh of ten million vertices has this size. Larger contents are
+    eigenvectors, which compress little. For them, four times the size of the compressed file is a generous
+    limit.
 
     **Arguments:**
 
@@ -38,17 +39,19 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
 
     **Arguments:**
 
-    - `path`: a regular file. Pipes and devices are refused, because they may never end.
-    - `largest`: the largest size in bytes; None for no limit.
+    - `path`: the path of a regular file. Pipes and devices are refused, because reading them may never end.
+    - `largest`: the largest permitted size of the file in bytes; None for no limit.
 
-    **Returns:** The contents.
+    **Returns:** The contents of the file.
 
-    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large or unreadable.
+    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large, or cannot be
+    read.
     """
     size = size_of_file(path)
     if largest is not None and size > largest:
         raise InputError(
-            f"{path}: is larger than {largest >> 30} GiB, the limit for reading: decimate the mesh."
+            f"{path}: is larger than {largest >> 30} GiB, the largest size that can be read: decimate the "
+            "mesh."
         )
     try:
         return Path(path).read_bytes()
@@ -80,10 +83,10 @@ def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> In
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Provide a temporary path to write to, and move the file to `path` when the block succeeds.
 
-    After an exception the temporary file is removed, and `path` is unchanged. The temporary file is in the
-    directory of `path`, so the move is atomic. The temporary file has the suffix of `path`, because writers
-    such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link, the target of the
-    link is replaced.
+    If the block raises an exception, the temporary file is removed, and `path` is unchanged. The temporary
+    file is in the directory of `path`, so the move is atomic. The temporary file has the suffix of `path`,
+    because writers such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link,
+    the target of the link is replaced.
 
     **Arguments:**
 
@@ -91,12 +94,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     **Returns:**
 
-    A context manager that yields the temporary `Path`, which exists and is empty.
+    A context manager that yields the temporary `Path`. The temporary file exists and is empty.
 
     **Raises:**
 
     `InputError` before the block starts, if the directory or the name makes writing impossible. `InputError`
-    after an `OSError` inside the block, for example because the disk is full.
+    also if the block raises an `OSError`, for example because the disk is full.
     """
     target = _target(path)
     temporary = _temporary(target)
@@ -109,20 +112,21 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
-        # The file is gone after success, and was never there if the directory does not exist.
+        # After success, the temporary file was moved to `path`. If the directory does not exist, the
+        # temporary file was never created.
         if os.path.lexists(temporary):
             temporary.unlink()
         _unfinished.discard(temporary)
 
 
-# The temporary files of all open blocks.
+# The temporary files of all open blocks of `atomic_write`.
 _unfinished: set[Path] = set()
 
 
 def remove_unfinished() -> None:
     """Remove the temporary files of all open blocks of `atomic_write`.
 
-    A process calls this function if it ends while a block is open.
+    A process calls this function before it ends while such a block is open.
     """
     for temporary in _unfinished.copy():
         with suppress(OSError):
@@ -130,7 +134,9 @@ def remove_unfinished() -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check, before a long computation, that `atomic_write` can write a file; leave nothing behind.
+    """Check that `atomic_write` can write a file, without leaving a new file behind.
+
+    Call this function before a long computation.
 
     **Raises:**
 
@@ -140,7 +146,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     temporary = _temporary(target)
     try:
         _check_target(path, target)
-        # Permissions alone are not conclusive, because some file systems refuse all new files.
+        # A check of the permissions is not conclusive, because some file systems refuse all new files.
         temporary.touch(exist_ok=False)
         temporary.unlink()
     except OSError as error:
@@ -148,7 +154,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """Return the file of a path, with symbolic links resolved."""
+    """Return the file to which a path leads, with symbolic links resolved."""
     try:
         return Path(os.path.realpath(path))
     except ValueError as error:  # a null character in the name
@@ -163,12 +169,12 @@ def _temporary(target: Path) -> Path:
 def _check_target(path: str | os.PathLike[str], target: Path) -> None:
     """Refuse a target that cannot become a regular file.
 
-    **Raises:** `InputError`; `OSError` if the system does not accept the name.
+    **Raises:** `InputError` if the target is refused; `OSError` if the system does not accept the name.
     """
     if not target.parent.is_dir():
         raise InputError(
             f"{path}: cannot be written because {target.parent} is not a directory: "
-            "create it first or choose another place."
+            "create the directory first, or choose another one."
         )
     try:
         status = os.stat(target)
@@ -177,13 +183,15 @@ def _check_target(path: str | os.PathLike[str], target: Path) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: cannot be written because it is not a file: choose another name.")
     if not os.access(target, os.W_OK):
-        raise InputError(f"{path}: is write-protected: choose another name or change permissions.")
+        raise InputError(
+            f"{path}: is write-protected: choose another name, or change the permissions of the file."
+        )
 
 
 def _unwritable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
     return InputError(
-        f"{path}: cannot be written ({_reason(error)}): choose a valid name in a place with free space where "
-        "you may create files."
+        f"{path}: cannot be written ({_reason(error)}): choose a valid name, in a directory with free space "
+        "where you may create files."
     )
 
 
@@ -193,34 +201,39 @@ def _reason(error: OSError | ValueError) -> str:
 
 
 def check_directory(path: str | os.PathLike[str]) -> None:
-    """Check, before a long computation, that `make_directory` can succeed; leave nothing behind.
+    """Check that `make_directory` can succeed, without leaving a new directory behind.
+
+    Call this function before a long computation.
 
     **Raises:**
 
-    `InputError` if the directory cannot be made, or no file can be written to the directory.
+    `InputError` if the directory cannot be created, or if no file can be written to the directory.
     """
     missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
     try:
         make_directory(path)
     finally:
         for place in missing:
-            with suppress(OSError, ValueError):  # never made, or already in use by another process
+            with suppress(OSError, ValueError):  # never created, or already used by another process
                 place.rmdir()
 
 
 def make_directory(path: str | os.PathLike[str]) -> Path:
-    """Make a directory and its parents, unless they exist.
+    """Create a directory and its parents, unless they exist.
 
     **Returns:** The path of the directory.
 
-    **Raises:** `InputError` if the directory cannot be made, or no file can be written to the directory.
+    **Raises:** `InputError` if the directory cannot be created, or if no file can be written to the
+    directory.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         raise InputError(
-            f"{path}: cannot be made a directory ({_reason(error)}): choose another place."
+            f"{path}: cannot be made a directory ({_reason(error)}): choose another path."
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(f"{path}: cannot be written to: choose another place or change its permissions.")
+        raise InputError(
+            f"{path}: cannot be written to: choose another directory, or change its permissions."
+        )
     return Path(path)

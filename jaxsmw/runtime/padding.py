@@ -7,15 +7,16 @@ from jaxtyping import Shaped
 
 from jaxsmw.core.search import BLOCK
 
-# Sizes are multiples of an eighth of the power of two below them, and of the block size of the search.
-# Padding is at most an eighth of a padded shape, and all shapes from 4000 to 16 000 vertices share 17 sizes.
+# A padded size is a multiple of an eighth of the largest power of two below it. It is also a multiple of the
+# block size of the search. For padded sizes of at least 1024, at most an eighth of the vertices are padding.
+# All shapes from 4000 to 16 000 vertices share 17 padded sizes.
 _SUBDIVISION = 8
 
 
 def padded_size(number_of_vertices: int) -> int:
-    """Returns the common size for a number of vertices: the number of vertices after padding.
+    """Returns the number of vertices to which a shape is padded.
 
-    One program serves all shapes of this size.
+    One compiled program serves all shapes with the same padded size.
     """
     power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
     step = max(power // _SUBDIVISION, BLOCK)
@@ -25,6 +26,7 @@ def padded_size(number_of_vertices: int) -> int:
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
     """Returns an array (n, ...) with rows of zeros appended, up to a given number of rows.
 
-    The rows of a host array then match the rows of a padded `Spectrum`. `number_of_rows` must be at least n.
+    The rows of a NumPy array then correspond to the rows of a padded `Spectrum`. `number_of_rows` must be at
+    least n.
     """
     return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))

@@ -1,4 +1,4 @@
-"""Progress messages with times."""
+"""Messages about the progress of a computation, and the times of its steps."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ logger = logging.getLogger("jaxsmw")
 
 @contextmanager
 def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Logs the name of a step, and stores the wall time of the block in `seconds[name]`, in seconds.
+    """Logs the name of a step, and stores the wall time of the block in `seconds[name]`.
 
-    If the block raises an exception, no time is stored.
+    The time is in seconds. If the block raises an exception, no time is stored.
     """
     logger.info("%s ...", name)
     start = time.perf_counter()

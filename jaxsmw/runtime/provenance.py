@@ -1,4 +1,4 @@
-"""The provenance of a result: versions, code and machine."""
+"""The provenance of a result: the versions of the software, the code and the machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
-    """Return the versions, by name, of Python and of all packages on which results depend."""
+    """Return the version of Python, and of each package on which results depend, by name."""
     return {
         **{package: metadata.version(package) for package in _PACKAGES},
         "python": platform.python_version(),
@@ -28,7 +28,7 @@ def machine() -> str:
     """Return the operating system, the processor and the number of cores in one phrase."""
     processor = platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():  # on Linux the platform module returns only the architecture
+    if cpuinfo.is_file():  # on Linux `platform` gives only the architecture
         lines = cpuinfo.read_text("utf-8", "replace").splitlines()
         models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
         processor = models[0] if models else processor
@@ -36,9 +36,9 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """Return the commit of the library's checkout, with `-dirty` if files have changed.
+    """Return the git commit of the library's checkout, with `-dirty` if files have changed.
 
-    If the library is not in a checkout, or git is missing, return the installed version.
+    If the library is not in a git checkout, or if git is missing, return the installed version.
     """
     call = ["git", "-C", str(_LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:
@@ -53,15 +53,18 @@ def made_with() -> str:
 
 
 def measured_code() -> list[Path]:
-    """Return the files of the modules on which results depend: all except the command line and the report."""
+    """Return the Python files of the library on which results depend.
+
+    These are all files except those of the command line and of the report.
+    """
     left_out = ("report", "cli", "__main__.py")
     return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]
 
 
 def code_digest(paths: Iterable[Path]) -> str:
-    """Return a hash of the code in Python files, 16 hexadecimal digits.
+    """Return a hash of the code in Python files, as 16 hexadecimal digits.
 
-    Comments, docstrings and layout do not affect the hash. The names and the order of the files do.
+    Comments, docstrings and layout do not affect the hash. The names and the order of the files affect it.
     """
     digest = hashlib.sha256()
     for path in paths:

@@ -1,4 +1,5 @@
-// Bundles viewer.js and the parts of three.js that it uses into the package's assets: npm ci && npm run build
+// Bundles viewer.js, with the parts of three.js that it uses, into the package's assets.
+// Run `npm ci && npm run build` in this directory.
 
 import { createHash } from "node:crypto";
 import { readFileSync, writeFileSync } from "node:fs";
@@ -18,7 +19,8 @@ await build({
   target: "es2022",
   charset: "ascii",
   legalComments: "none",
-  // Every page carries a copy of three.js and therefore its licence. A test compares the digest with the source.
+  // Every page contains a copy of three.js, so it must also contain the licence of three.js.
+  // A test compares the digest with the digest of viewer.js.
   banner: { js: `/* Built from viewer.js with SHA-256 ${digest}.\nContains three.js:\n\n${license.trim()}\n*/` },
 });
 writeFileSync(new URL("THREE-LICENSE", assets), license);

@@ -64,8 +64,8 @@ class CubicSpline(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. A single
-      number above 1, or an array of shape ().
+    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. The
+      value is a single number above 1, or an array of shape ().
     - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
       units of 1 / lambda_max. The default is False.
 
@@ -100,8 +100,8 @@ class MexicanHat(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. A single
-      number above 1, or an array of shape ().
+    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. The
+      value is a single number above 1, or an array of shape ().
     - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
       units of 1 / lambda_max. The default is False.
 

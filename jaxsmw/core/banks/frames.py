@@ -54,9 +54,9 @@ def frame_bounds(
     - `bank`: the filter bank, a `FilterBank`.
     - `eigenvalues`: (k,), the eigenvalues of a shape, ascending, in any unit. The last eigenvalue is
       lambda_max.
-    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. These bounds hold for
+    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then hold for
       functions in the span of the corresponding eigenvectors. `"interval"` evaluates G on [0, lambda_max].
-      These bounds hold for every shape with this lambda_max, if the bank depends on no other eigenvalue.
+      The bounds then hold for every shape with this lambda_max, if the bank depends on no other eigenvalue.
     - `resolution`: the number of evenly spaced points at which `"interval"` evaluates G, at least 2. The
       sampled lower bound is slightly too large, and the sampled upper bound is slightly too small. If h is
       the spacing of the points, this error is at most `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G.

@@ -22,10 +22,10 @@ class ExponentialWindow(FilterBank):
 
     **Arguments:**
 
-    - `edge`: the eigenvalue from which the filter is zero, as a fraction of lambda_max, by default 0.2. A
-      single positive number, or an array of shape ().
-    - `slope`: the steepness, by default 1. A single positive number, or an array of shape (). The derivative
-      of the filter at half the edge is `-2 slope / edge`.
+    - `edge`: the eigenvalue from which the filter is zero, as a fraction of lambda_max, by default 0.2. The
+      value is a single positive number, or an array of shape ().
+    - `slope`: the steepness, by default 1. The value is a single positive number, or an array of shape ().
+      The derivative of the filter at half the edge is `-2 slope / edge`.
 
     **Raises:** `ValueError` if a parameter is not a single positive, finite number.
     """
@@ -56,8 +56,8 @@ class LowPass(FilterBank):
 
     **Arguments:**
 
-    - `edge`: the end of the pass band as a fraction of lambda_max, by default 0.25. A single number in
-      (0, 1), or an array of shape ().
+    - `edge`: the end of the pass band as a fraction of lambda_max, by default 0.25. The value is a
+      single number in (0, 1), or an array of shape ().
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """

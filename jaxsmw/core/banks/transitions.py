@@ -110,7 +110,7 @@ class SimpleTight(_DyadicBands):
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
         sine, cosine = jnp.sin(jnp.pi / 2 * ramp), jnp.cos(jnp.pi / 2 * ramp)
-        # This is the angle whose sine is sine², in a form that is smooth at both ends.
+        # This is the angle whose sine is sine², in units of pi / 2. The arctangent is smooth at both ends.
         return 2 / jnp.pi * jnp.arctan2(sine**2, cosine * jnp.sqrt(1 + sine**2))
 
 
@@ -137,17 +137,17 @@ class Held(_TwoBands):
     """A Parseval frame of a low-pass and a high-pass filter, with a cubic transition over one octave.
 
     The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
-    rises. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for
-    k eigenvalues in any unit, low-pass filter first.
+    rises. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for k eigenvalues in any unit,
+    low-pass filter first.
 
     The filters are those of Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the
     Riesz transform", 2010.
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. A
-      single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass filter does
-      not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3.
+      The value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
+      filter does not reach one on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
@@ -170,9 +170,9 @@ class Simoncelli(_TwoBands):
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. A
-      single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass filter does
-      not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3.
+      The value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
+      filter does not reach one on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
@@ -194,9 +194,9 @@ class Papadakis(_TwoBands):
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 3/8. A
-      single number in (0, 1), or an array of shape (). If the edge is above 3/5, the high-pass filter does
-      not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 3/8.
+      The value is a single number in (0, 1), or an array of shape (). If the edge is above 3/5, the high-pass
+      filter does not reach one on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """

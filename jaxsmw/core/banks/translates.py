@@ -110,7 +110,7 @@ class Gabor(FilterBank):
 
     - `filters`: the number of filters, at least 2. The default is 6.
     - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres, by
-      default 0.5. A single positive number, or an array of shape ().
+      default 0.5. The value is a single positive number, or an array of shape ().
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `width` is not a single positive, finite number.

@@ -18,7 +18,7 @@ class Warp(eqx.Module):
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
     are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
     `__call__(points, eigenvalues)`, which returns the warped points. All banks of `jaxsmw.banks` depend only
-    on ratios of eigenvalues, so a constant factor in a warp has no effect on them.
+    on ratios of eigenvalues, so a constant factor in a warp has no effect on these banks.
     """
 
     @abc.abstractmethod

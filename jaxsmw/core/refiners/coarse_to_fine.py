@@ -36,18 +36,22 @@ class CoarseToFineState(State):
 
 
 class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
-    """A refiner that uses more eigenvectors in every iteration, as ZoomOut does (Melzi et al. 2019).
+    """The abstract base class of refiners that use more eigenvectors in every iteration.
 
-    Its state is a `CoarseToFineState`.
+    ZoomOut (Melzi et al. 2019) also increases the number of eigenvectors in this way. Ready subclasses are
+    `FeatureRegression` and `Registration`. A subclass defines the abstract methods of `Refiner`, and its
+    states are subclasses of `CoarseToFineState`.
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors in each iteration, for the shape with more eigenvectors. The other
-      shape uses a proportional number. Iterations beyond the last level use all eigenvectors.
-    - `search`: the search for matches among all vertices: `"exhaustive"`, `"patches"` or `"auto"`.
+    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
+      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
+      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
+      so do all iterations if the tuple is empty (the default).
+    - `search`: how the matches of all vertices are found, `"exhaustive"`, `"patches"` or `"auto"`.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
-    unknown search.
+    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    `search` is unknown.
     """
 
     levels: tuple[int, ...] = eqx.field(static=True, default=(), converter=_whole_numbers)
@@ -61,7 +65,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Returns True for the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses.
+        """Returns which eigenvectors of X and of Y an iteration uses, as Boolean arrays (k_x,) and (k_y,).
 
         **Arguments:**
 
@@ -91,7 +95,10 @@ def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
     """
     numbers = [0 if s.descriptors is None else s.descriptors.shape[1] for s in (spectrum_x, spectrum_y)]
     if numbers[0] != numbers[1]:
-        raise ValueError(f"X has {numbers[0]} descriptors and Y has {numbers[1]}; both need the same number")
+        raise ValueError(
+            f"X has {numbers[0]} descriptors and Y has {numbers[1]}: give both shapes the same number of "
+            "descriptors"
+        )
 
 
 def partial_matching_weights(
@@ -100,16 +107,17 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Returns weights that nearly ignore the vertices of the full shape that the partial shape lacks.
+    """Returns weights that are small for vertices of the full shape that the partial shape lacks.
 
-    The shape with the larger mean residual is treated as the full shape. Its weights become
-    `w / (1 + (r / mean)²)`, where `mean` is the mean residual of the other shape. Then its weights are scaled
-    to sum 1. The weights of the other shape are unchanged.
+    The shape with the larger mean residual is treated as the full shape. The weight w of each of its vertices
+    becomes `w / (1 + (r / mean)²)`. Here r is the residual of the vertex, and `mean` is the mean residual of
+    the other shape. Then the weights of the full shape are scaled to sum 1. The weights of the other shape
+    stay the same.
 
     **Arguments:**
 
     - `weights_x`, `weights_y`: the weights of the vertices of X (m,) and of Y (n,), each with sum 1.
-    - `residuals_x`, `residuals_y`: the squared distance of each vertex to its match (m,) and (n,), in the
+    - `residuals_x`, `residuals_y`: the squared distance of each vertex to its match, (m,) and (n,), in the
       same unit.
 
     **Returns:** The new weights of the vertices of X (m,) and of Y (n,), each with sum 1.

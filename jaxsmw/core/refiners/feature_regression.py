@@ -22,39 +22,45 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
-# The ridge of the regression and the smallest residual variance, relative to features of variance about 1.
-# Values from a third of these numbers to three times these numbers hardly change the results.
+# _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is the smallest residual variance. Both are
+# relative to features with a variance of about 1. If either number is divided or multiplied by a factor of up
+# to 3, the results hardly change.
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
 class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
-    """Finds matches along which the features of both shapes predict each other best, from coarse to fine.
+    """A refiner that finds matches by linear regression between the features of both shapes.
 
-    The features of a vertex are the values of the eigenvectors and the descriptors, if the spectra have
-    descriptors. Each iteration regresses the features of X on those of Y along the matches of both
-    directions. Eigenvectors are regressed on eigenvectors, which gives the functional map by least squares
-    (Ovsjanikov et al. 2012). Descriptors are regressed on descriptors. The covariance of the residuals
-    measures how reliable each combination of features is. The next matches are the nearest vertices in the
-    Mahalanobis distance of this covariance. In the same way, the features of Y are regressed on those of X
-    for the reverse map. The number of eigenvectors grows with the iterations, as in ZoomOut (Melzi et al.
-    2019).
+    The features of a vertex are the values of the eigenvectors and, if the spectra have descriptors, the
+    descriptors (`Spectrum.descriptors`). Each iteration regresses the features of X on the features of Y,
+    along the matches of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which
+    gives the functional map by least squares (Ovsjanikov et al. 2012). Descriptors are regressed on
+    descriptors. The covariance of the residuals measures how reliable each combination of features is. The
+    next match of a vertex of X is the nearest vertex of Y in the Mahalanobis distance of this covariance. For
+    the reverse map, the features of Y are regressed on the features of X in the same way. The number of
+    eigenvectors grows with the iterations, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. If the initial map is as good as the outcome of
-    `WaveletPreservation`, the result is closer to the ground truth than this initial map. docs/accuracy.md
-    has the measurements.
+    The method does not assume isometry. If the initial map is as good as a result of `WaveletPreservation`,
+    the refined map is closer to the ground truth than the initial map. The measurements are in
+    docs/accuracy.md.
 
-    For partial shapes, vertices of the full shape whose matches fit badly get smaller weights
-    (`partial_matching_weights`).
+    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape whose matches fit badly get
+    smaller weights (`partial_matching_weights`).
 
     **Arguments:**
 
-    - `levels`: see `CoarseToFine`.
-    - `search`: the search for the last matches, among all vertices. `"exhaustive"` compares all vertices with
-      all vertices. `"patches"` compares eigenvectors alone, without descriptors, and skips patches of the
-      target that are too far away. `"auto"` uses patches on CPUs from 15 000 vertices.
+    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
+      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
+      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
+      so do all iterations if the tuple is empty (the default).
+    - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
+      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` compares
+      eigenvectors only, without descriptors, and skips patches of Y that are too far away. `"auto"` chooses
+      `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least 15 000, and
+      `"exhaustive"` otherwise.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
-    unknown search.
+    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    `search` is unknown.
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
@@ -103,14 +109,17 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
-        """Returns the vertex of Y nearest to each vertex of X in the Mahalanobis distance."""
+        """Returns the vertex of Y that is nearest to each vertex of X in the Mahalanobis distance, (m,)."""
         if prepared.patches is None:
             return state.forward.search(prepared.x, prepared.all_y)
         queries, database = self._eigenvector_embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
-        """Returns the vertex of X nearest to each vertex of Y in the `embeddings` of `recover`, (n,)."""
+        """Returns the vertex of X that is nearest to each vertex of Y, (n,).
+
+        The nearest vertices are those in the `embeddings`, as for `recover`.
+        """
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         embed = self.embeddings if patches is None else self._eigenvector_embeddings
         database, queries = embed(prepared, state)
@@ -127,16 +136,18 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
         """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
 
-        Their distance is the Mahalanobis distance between the features of X and the predictions from Y.
+        The distance between two points is the Mahalanobis distance between the features of the vertex of X
+        and the prediction of these features from the vertex of Y.
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Returns the coordinates that depend on eigenvectors alone, in which patches are compact.
+        """Returns the coordinates of the `embeddings` that depend on eigenvectors alone.
 
-        These coordinates are the first k_x coordinates, because the whitening is triangular.
+        Patches are compact in these coordinates. They are the first k_x coordinates, because the whitening is
+        triangular.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
@@ -144,7 +155,11 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The vertices of one shape: eigenvectors and descriptors, shares of the area, and the mask."""
+    """The features of the vertices of one shape: their values, shares of the area, and the mask.
+
+    The values are the values of the eigenvectors, followed by the descriptors if the spectrum has
+    descriptors.
+    """
 
     values: Float[Array, "n d"]
     weights: Float[Array, " n"]
@@ -153,7 +168,8 @@ class _Features(NamedTuple):
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
         area = jnp.sum(spectrum.vertex_areas)
-        values = spectrum.eigenvectors * jnp.sqrt(area)  # mean square 1 in every unit of length
+        # The scaled eigenvectors have mean square 1, whatever the unit of length.
+        values = spectrum.eigenvectors * jnp.sqrt(area)
         if spectrum.descriptors is not None:
             values = jnp.concatenate([values, spectrum.descriptors], axis=1)
         return cls(values, spectrum.vertex_areas / area, spectrum.mask)
@@ -164,10 +180,10 @@ class PreparedFeatures(Prepared):
 
     **Attributes:**
 
-    - `x`, `y`: the features of the vertices to be matched: of the samples, or of all vertices.
+    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices.
     - `all_x`, `all_y`: the features of all vertices.
     - `patches`: the patches of X and Y, or None if the search uses no patches.
-    - `partial`: see `Problem`.
+    - `partial`: whether one shape is a part of the other.
     """
 
     x: _Features
@@ -179,12 +195,15 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """Linear maps from the features of both shapes to points that are close together where features agree.
+    """Two linear maps from features to points. Distances between points measure errors of prediction.
+
+    The distance between a query point and a target point is the Mahalanobis distance between the features of
+    the query vertex and their prediction from the features of the target vertex.
 
     **Attributes:**
 
-    - `queries`: the map (d_out, d_out) of the predicted features.
-    - `database`: the map (d_in, d_out) of the features from which the prediction is made.
+    - `queries`: the matrix (d_out, d_out) that takes the features of a query vertex to its point.
+    - `database`: the matrix (d_in, d_out) that takes the features of a target vertex to its point.
     - `uncertainty`: half the logarithm of the determinant of the residual covariance of the active features.
     """
 
@@ -199,19 +218,25 @@ class Prediction(NamedTuple):
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
-        """Returns the nearest target vertex of every query vertex, (m,)."""
+        """Returns the target vertex that is nearest to each query vertex, (m,)."""
         return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """Returns the squared distance of every query vertex to its match, (m,), without unit."""
+        """Returns the squared distance from each query vertex to its match, (m,), without unit."""
         points, database = self.embeddings(queries, targets)
         return jnp.sum((points - database[matches]) ** 2, axis=1)
 
 
 class Regression(CoarseToFineState):
-    """The state of `FeatureRegression`: predictions of X from Y (`forward`) and of Y from X (`backward`)."""
+    """The state of `FeatureRegression`.
+
+    **Attributes:**
+
+    - `forward`: the prediction of the features of X from the features of Y.
+    - `backward`: the prediction of the features of Y from the features of X.
+    """
 
     forward: Prediction
     backward: Prediction
@@ -220,15 +245,16 @@ class Regression(CoarseToFineState):
     def uncertainty(self) -> Float[Array, ""]:
         """The mean logarithm of the standard deviations of the residuals, over the features of both shapes.
 
-        The standard deviations are those of the principal components of the residuals. So the mean is half
-        the logarithm of the determinants of both residual covariances, divided by the number of features.
+        The standard deviations are those of the principal components of the residuals. The mean therefore
+        equals half the sum of the logarithms of the determinants of both residual covariances, divided by the
+        number of features.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features
 
 
 class _Moments(NamedTuple):
-    """Mean products of features along matches."""
+    """Weighted mean products of the features of matched vertices."""
 
     xx: Float[Array, "d_x d_x"]
     xy: Float[Array, "d_x d_y"]
@@ -249,14 +275,14 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """Returns the functional map, and the prediction of x from y, both with the active eigenvectors only."""
+    """Returns the functional map, and the prediction of x from y. Both use only the active eigenvectors."""
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
     keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
     xx = jnp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
     xy = jnp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
     yy = jnp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
-    # Eigenvectors are regressed on eigenvectors, descriptors on descriptors.
+    # Eigenvectors are regressed only on eigenvectors, and descriptors only on descriptors.
     eigenvectors_x, eigenvectors_y = (jnp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
     gram = jnp.where(eigenvectors_y[:, None] == eigenvectors_y[None, :], yy, 0)
     gram = gram + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
@@ -266,8 +292,8 @@ def _regress(
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
     factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
-    # The whitening is triangular: each coordinate depends only on the features up to its own index. Inactive
-    # features are left out, because they would add an equal amount, with a rounding error, to all distances.
+    # The whitening is triangular, so each coordinate depends only on the features up to its own index.
+    # Inactive features are left out. They would add the same amount to all distances, and rounding errors.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

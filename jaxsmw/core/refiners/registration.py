@@ -1,4 +1,4 @@
-"""Refinement by registration: each surface is deformed onto the other, low frequencies first."""
+"""Refinement by registration: each surface is deformed onto the other, from low to high frequencies."""
 
 from __future__ import annotations
 
@@ -26,62 +26,69 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
-# Weights relative to positions in units of the square root of the area: of unit normals, and of the first
-# eigenfunctions, each divided by the square root of its eigenvalue plus one. The last number is the number of
-# these eigenfunctions.
+# Positions have weight 1, in units of the square root of the area. _NORMALS is the weight of unit normals.
+# _EIGENFUNCTIONS is the weight of the first _NUMBER_OF_EIGENFUNCTIONS eigenfunctions, each of which is
+# divided by sqrt(1 + eigenvalue).
 _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
-# The weight of descriptors (of mean square 1) is _DESCRIPTORS / level**_FALLING: descriptors outweigh
-# positions at coarse levels and have little effect at the last level.
+# Descriptors have mean square 1. Their weight is _DESCRIPTORS / level**_FALLING. Descriptors therefore
+# outweigh positions at coarse levels and have little effect at the last level.
 _DESCRIPTORS, _FALLING = 2.8, 1.5
-# Heat flow of this duration averages over the neighbourhood of a vertex, a disk of radius 0.1. With few
-# eigenvectors the duration is longer, so that the last eigenvector decays to exp(-_DECAY) or less.
+# Heat flow of duration _HEAT_TIME averages over a disk around each vertex, whose radius is 0.1 times the
+# square root of the area. If the spectrum has few eigenvectors, the duration is longer: the heat flow reduces
+# the last eigenvector to exp(-_DECAY) of its size or less.
 _HEAT_TIME, _DECAY = 3e-3, 4.0
-# The ridge relative to the mean square of the eigenvectors, for fits with small weights of some vertices.
+# Least-squares fits in which some vertices have small weights use this ridge. It is relative to the mean
+# square of the eigenvectors.
 _RIDGE = 1e-3
-# After this number of squarings, a matrix is nearly the projection onto its first eigenvector.
+# After this number of squarings, a matrix is nearly the projection onto the eigenvector of its largest
+# eigenvalue.
 _SQUARINGS = 12
 
 
 class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
-    """Finds matches by deforming X onto Y, and Y onto X, from low to high frequencies.
+    """A refiner that deforms X onto Y, and Y onto X, from low to high frequencies.
 
-    The low frequencies of a deformed surface are the positions of the matches, projected onto the first
-    eigenvectors. Every iteration uses more eigenvectors, as in smooth shells (Eisenberger, Lähner, Cremers
-    2020). The remaining details of the surface are rotated with their neighbourhood, as in
-    as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best rotation around each vertex is computed
-    from averages by heat flow. With all vertices of full shapes, each step is a filter, without a linear
-    solve. On samples and on partial shapes, eigenvectors are not orthonormal, and coefficients are computed
-    by least squares.
+    In each iteration, the positions of the matches are projected onto the first eigenvectors. The projection
+    gives the low frequencies of the deformed surface. Every iteration uses more eigenvectors, as in smooth
+    shells (Eisenberger, Lähner, Cremers 2020). The remaining details of the surface rotate with the
+    neighbourhoods of the vertices, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best
+    rotation around each vertex is computed from averages by heat flow. If all vertices of full shapes are
+    matched, no linear system is solved. On samples and on partial shapes, eigenvectors are not orthonormal,
+    so coefficients are computed by least squares.
 
-    The next matches are the nearest vertices in a joint space of both surfaces. Its coordinates are
-    positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra have
-    descriptors. The weight of descriptors decreases with every level. A mirrored shape is matched by
-    rotations that include a reflection.
+    The next matches are the nearest vertices in a joint space of both surfaces. The coordinates of this space
+    are positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra
+    have descriptors. The weight of the descriptors decreases from level to level. If one shape is a mirror
+    image, all rotations include a reflection.
 
-    The initial map must be nearly right. The result is then closer to the ground truth than the results of
-    methods that use only eigenfunctions (docs/accuracy.md has the measurements). The spectra need positions
-    and normals, which `jaxsmw.compute_spectrum` provides.
+    The initial map must be nearly right. The refined map is then closer to the ground truth than the results
+    of methods that use only eigenfunctions. The measurements are in docs/accuracy.md. The spectra need
+    positions and normals, which `jaxsmw.compute_spectrum` provides and `Spectrum.with_positions` adds.
 
-    Full shapes are both scaled to area 1. Partial shapes are both scaled by the same factor. For partial
-    shapes, vertices of the full shape whose matches fit badly get smaller weights
-    (`partial_matching_weights`).
+    Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are
+    instead scaled by the same factor. Vertices of the full shape whose matches fit badly then get smaller
+    weights (`partial_matching_weights`).
 
     **Arguments:**
 
-    - `levels`: see `CoarseToFine`.
-    - `search`: how the last matches, among all vertices, are found. `"exhaustive"` compares all vertices with
-      all vertices. `"patches"` finds the same matches but skips patches of the target that are too far away.
-      `"auto"` uses patches on CPUs from 15 000 vertices.
+    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
+      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
+      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
+      so do all iterations if the tuple is empty (the default).
+    - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
+      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` finds the same
+      matches but skips patches that are too far away. `"auto"` chooses `"patches"` on CPUs if the geometric
+      mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` for a level below 1 or an
-    unknown search.
+    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    `search` is unknown.
     """
 
     def prepare(self, problem: Problem) -> PreparedSurfaces:
         """Scales both surfaces and prepares the search.
 
-        **Raises:** `ValueError` if a spectrum has no positions or normals, or the numbers of descriptors
-        differ.
+        **Raises:** `ValueError` if a spectrum has no positions or no normals, or if the shapes have different
+        numbers of descriptors.
         """
         spectrum_x, spectrum_y = problem.spectrum_x, problem.spectrum_y
         check_descriptors(spectrum_x, spectrum_y)
@@ -111,7 +118,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         active_x, active_y = self.active_eigenvectors(prepared, iteration)
         level = jnp.maximum(jnp.sum(active_x), jnp.sum(active_y)).astype(x.weights.dtype)
         weight = _DESCRIPTORS / level**_FALLING
-        if previous is None:  # The first reverse map compares Y with X deformed onto Y.
+        if previous is None:  # The first reverse map compares Y only with X deformed onto Y.
             forward = Deformation.along(x, all_y, pointwise_map, active_x)
             reverse_map = nearest_vertices(y.points, forward.points(all_x), all_x.mask, patches)
         else:
@@ -126,29 +133,31 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " m"]:
-        """Returns the vertex of Y nearest to each vertex of X in the `embeddings`."""
+        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
-        """Returns the vertex of X nearest to each vertex of Y in the `embeddings`, (n,)."""
+        """Returns the vertex of X that is nearest to each vertex of Y in the `embeddings`, (n,)."""
         database, queries = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.x.mask, prepared.reverse_patches)
 
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the `objective` of the matches by which X was deformed."""
+        """Returns the `objective` of the matches from which the deformation of X was computed."""
         return self.objective(prepared, state, pointwise_map)
 
     def embeddings(
         self, prepared: PreparedSurfaces, state: Registered
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Returns weighted positions, normals, eigenfunctions and descriptors, on both surfaces at once.
+        """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-        Each row of the first array has coordinates of a vertex of X deformed onto Y, and then of the vertex
-        of X itself. Each row of the second array has coordinates of a vertex of Y itself, and then of this
-        vertex deformed onto X. Positions are in units of the square root of the area.
+        The coordinates are weighted positions, normals, eigenfunctions and descriptors. Each row of the first
+        array contains the coordinates of a vertex of X deformed onto Y, followed by the coordinates of the
+        same vertex without deformation. Each row of the second array contains the coordinates of a vertex of
+        Y without deformation, followed by the coordinates of the same vertex deformed onto X. Positions are
+        in units of the square root of the area.
         """
         return _product_space(prepared.x, prepared.all_y, state, state.descriptor_weight)
 
@@ -156,7 +165,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
 class _Surface(NamedTuple):
     """Some vertices of a shape, in units of the square root of the area.
 
-    `points` are positions, normals and eigenfunctions, each times its weight.
+    `points` contains positions, normals and eigenfunctions, each multiplied by its weight.
     """
 
     eigenvectors: Float[Array, "n k"]
@@ -175,8 +184,8 @@ class _Surface(NamedTuple):
         """Returns all vertices of a spectrum, scaled from the given area to area 1."""
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
-                "Registration needs positions and normals, which a spectrum lacks: compute_spectrum gives "
-                "them, and Spectrum.with_positions adds them"
+                "Registration needs positions and normals, but a spectrum lacks them: use compute_spectrum, "
+                "which provides them, or add them by Spectrum.with_positions"
             )
         dtype = spectrum.eigenvectors.dtype
         weights = spectrum.vertex_areas / jnp.sum(spectrum.vertex_areas)
@@ -202,7 +211,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Returns some of the vertices, with their sampled spectrum."""
+        """Returns the surface with only the given vertices (s,), whose sampled spectrum is `spectrum`."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -223,11 +232,12 @@ class PreparedSurfaces(Prepared):
 
     **Attributes:**
 
-    - `x`, `y`: the vertices to be matched: the samples, or all vertices.
+    - `x`, `y`: the vertices to be matched, which are the samples or all vertices.
     - `all_x`, `all_y`: all vertices.
-    - `patches`, `reverse_patches`: the patches for the search on Y and for the search on X; None for
-      exhaustive searches.
-    - `partial`: see `Problem`.
+    - `patches`: the patches for searches among the vertices of Y; None if these searches are exhaustive.
+    - `reverse_patches`: the patches for searches among the vertices of X; None if these searches are
+      exhaustive.
+    - `partial`: whether one shape is a part of the other.
     """
 
     x: _Surface
@@ -240,12 +250,15 @@ class PreparedSurfaces(Prepared):
 
 
 class Deformation(NamedTuple):
-    """A deformation of one surface onto another: coefficients of the surface's eigenvectors.
+    """A deformation of one surface onto another, as coefficients of the first surface's eigenvectors.
 
-    - `own`, `matched`: coefficients of the surface's positions (k_x, 3), and of the positions, normals and
-      eigenfunctions of their matches (k_x, d), for the active eigenvectors.
-    - `moments`: coefficients (k_x, 24) of the averages of positions, of matched positions, of the products of
-      both, and of the products of normals.
+    **Attributes:**
+
+    - `own`: the coefficients of the surface's positions (k_x, 3), zero for inactive eigenvectors.
+    - `matched`: the coefficients of the positions, normals and eigenfunctions of the matches (k_x, d), zero
+      for inactive eigenvectors.
+    - `moments`: coefficients (k_x, 24) of averages by heat flow. The averaged quantities are positions,
+      matched positions, the products of both, and the products of normals with matched normals.
     """
 
     own: Float[Array, "k_x 3"]
@@ -287,7 +300,7 @@ class Deformation(NamedTuple):
         )
 
     def points(self, surface: _Surface) -> Float[Array, "s d"]:
-        """Returns the deformed vertices of the surface, (s, d): positions, normals and eigenfunctions."""
+        """Returns the deformed vertices of the surface, (s, d), as positions, normals and eigenfunctions."""
         low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
         own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
         rotations = _rotations(moments, surface)
@@ -315,7 +328,11 @@ class Registered(CoarseToFineState):
 def _product_space(
     x: _Surface, y: _Surface, state: Registered, weight: Float[Array, ""]
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns points of both surfaces that are close where each deformed surface is close to the other."""
+    """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
+
+    The points of two vertices are close if each vertex, deformed onto the other surface, is close to the
+    other vertex.
+    """
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
         jnp.concatenate([y.points, state.backward.points(y), weight * y.descriptors], axis=1),
@@ -328,9 +345,9 @@ def _without_missing_parts(
     pointwise_map: Int[Array, " s"],
     reverse_map: Int[Array, " t"],
 ) -> tuple[_Surface, _Surface]:
-    """Returns both surfaces with `partial_matching_weights`.
+    """Returns both surfaces, weighted by `partial_matching_weights`.
 
-    The residuals are the squared distances between matched points without descriptors.
+    The residuals are the squared distances between matched points of the joint space, without descriptors.
     """
     x, y = prepared.x, prepared.y
     no_descriptors = jnp.zeros_like(state.descriptor_weight)
@@ -343,13 +360,14 @@ def _without_missing_parts(
 
 
 def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-    """Returns the rotations that best align the neighbourhoods of vertices with those of their matches.
+    """Returns the rotations that best align neighbourhoods of vertices with neighbourhoods of matches.
 
-    All rotations include a reflection if the surface as a whole is mirrored.
+    If one surface is a mirror image of the other, all rotations include a reflection.
     """
     own, matched = moments[:, :3], moments[:, 3:6]
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
-    # In the tangent plane the variance is twice the heat time; unit normals have square 1.
+    # In the tangent plane, the variance of positions under heat flow is twice the heat time. The division
+    # scales this variance to 1, which is the squared length of normals.
     covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
     mirrored = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
     sign = jnp.where(mirrored, -1, 1).astype(covariance.dtype)
@@ -357,14 +375,14 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
-    """Returns the rotations R that maximise the trace of R S, by unit quaternions (Horn 1987).
+    """Returns the rotation R that maximises the trace of R S for each covariance S (Horn 1987).
 
-    R and the trace are quadratic in the quaternion, so the best quaternion is an eigenvector.
+    R and the trace are quadratic in the unit quaternion of R, so the best quaternion is an eigenvector.
     """
     table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
     quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
     sizes = jnp.sqrt(jnp.sum(quadratic**2, axis=(1, 2), keepdims=True))
-    # The identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers.
+    # Adding the identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers.
     powers = quadratic / jnp.where(sizes > 0, sizes, 1) + jnp.eye(4, dtype=covariances.dtype)[None]
 
     def squared(_: Any, powers: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
@@ -380,10 +398,10 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 @cache
 def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
-    """Returns the matrix from products of a quaternion's components to the entries of its rotation."""
+    """Returns the matrix from products of a quaternion's components to entries of its rotation matrix."""
     signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
     units = np.arange(4)
-    multiplication = np.zeros((4, 4, 4))  # the product of two units is plus or minus a unit
+    multiplication = np.zeros((4, 4, 4))  # the product of two quaternion units is plus or minus a unit
     multiplication[units[:, None], units, units[:, None] ^ units] = signs
-    rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])  # q v q*
+    rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])  # v -> q v q*
     return rotations[1:, 1:].reshape(9, 16)

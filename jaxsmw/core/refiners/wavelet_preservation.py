@@ -27,8 +27,8 @@ class PreparedWavelets(Prepared):
 
     **Attributes:**
 
-    - `wavelets`: both shapes, with the responses of the filter bank at their eigenvalues.
-    - `solution`: the result of `Solution.prepare`.
+    - `wavelets`: both shapes, together with the responses of the filter bank at their eigenvalues.
+    - `solution`: the values that `Solution.prepare` returns.
     - `patches`: the patches of X and Y, or None if the search uses no patches.
     """
 
@@ -38,28 +38,33 @@ class PreparedWavelets(Prepared):
 
 
 class WaveletPreservation(Refiner[PreparedWavelets, State]):
-    """Multiscale spectral manifold wavelets preservation: Algorithm 1 of the MWP paper, with any frame.
+    """The refiner of the MWP paper: Algorithm 1, with any filter bank and any solution.
 
-    The functional map preserves the wavelets of all scales. The pointwise map follows by nearest neighbours
-    in `spectral_embeddings`.
+    In each iteration, the refiner computes a functional map that preserves the wavelets of all scales. A
+    nearest-neighbour search in the `spectral_embeddings` of this functional map then gives the pointwise map.
+    Use the refiner with `jaxsmw.refine`, `refine_pairs`, `refine_softly` or a `Stage`.
 
     **Arguments:**
 
-    - `bank`: the filters.
-    - `solution`: the computation of the functional map. `Filtering()` (eq. 8) is meant for Parseval frames,
-      whose squared filters sum to one; `LeastSquares()` is exact for every frame; `RegularizedLeastSquares()`
-      adds further energy terms.
-    - `convention`: the direction of C; see `jaxsmw.core.functional_map`. `"pushforward"` is the paper's
-      notation. It is meant for study only, because it fails on real pairs (`spectral_embeddings` says why).
-    - `lambda_max`: the eigenvalue at which the bank ends. `"own"` is each shape's largest eigenvalue, which
-      cancels a difference in size. `"common"` is the largest eigenvalue of both shapes together.
-    - `search`: the search for nearest neighbours. `"exhaustive"` compares all vertices with all vertices.
-      `"patches"` finds the same neighbours but skips patches of the target that are too far away. It is
-      several times as fast on a CPU, but its compilation takes seconds longer. `"auto"` uses patches on CPUs
-      from 15 000 vertices.
+    - `bank`: the filter bank, a `FilterBank`. The default is `Meyer()`, the Parseval frame of the MWP paper.
+    - `solution`: the `Solution` that computes the functional map from a pointwise map. `Filtering()` (eq. (8)
+      of the MWP paper, the default) is meant for Parseval frames, whose squared filters sum to one.
+      `LeastSquares()` is exact for every frame. `RegularizedLeastSquares()` adds further energy terms.
+      `NearestOrthogonal()` makes the map of another solution orthogonal.
+    - `convention`: the direction of the functional map C. A `"pullback"` (k_X, k_Y) takes functions on Y to
+      functions on X. A `"pushforward"` (k_Y, k_X) takes functions on X to functions on Y, as in the notation
+      of the MWP paper. It is meant for study only, because it fails on real pairs. The docstring of
+      `spectral_embeddings` gives the reason.
+    - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"`, it is the largest eigenvalue
+      of each shape, so a difference in size between the shapes has no effect. With `"common"`, it is the
+      larger of the two shapes' largest eigenvalues.
+    - `search`: how nearest neighbours are found. `"exhaustive"` compares all vertices of X with all vertices
+      of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. On a CPU it is
+      several times as fast, but its compilation takes some seconds longer. `"auto"` chooses `"patches"` on
+      CPUs if the geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
-    **Raises:** `TypeError` if the bank is not a `FilterBank` or the solution not a `Solution`; `ValueError`
-    for an unknown choice.
+    **Raises:** `TypeError` if `bank` is not a `FilterBank` or `solution` is not a `Solution`; `ValueError` if
+    `convention`, `lambda_max` or `search` is unknown.
     """
 
     bank: FilterBank = Meyer()
@@ -76,14 +81,14 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Returns both shapes with the responses of the bank at their eigenvalues.
+        """Returns both shapes with the responses of the filter bank at their eigenvalues.
 
         **Arguments:**
 
         - `spectrum_x`, `spectrum_y`: source X and target Y.
         - `sampled`: whether the spectra contain samples only.
 
-        **Raises:** `ValueError` if the responses of the bank are not of shape (filters, points).
+        **Raises:** `ValueError` if the responses of the bank do not have shape (filters, eigenvalues).
         """
         eigenvalues_x, eigenvalues_y = spectrum_x.eigenvalues, spectrum_y.eigenvalues
         layout_x, layout_y = eigenvalues_x, eigenvalues_y
@@ -99,7 +104,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         )
 
     def prepare(self, problem: Problem) -> PreparedWavelets:
-        """Evaluates the bank, and prepares the solution and the search."""
+        """Evaluates the filter bank, and prepares the solution and the nearest-neighbour search."""
         spectrum_x, spectrum_y = problem.query_spectra()
         wavelets = self.problem(spectrum_x, spectrum_y, sampled=problem.samples is not None)
         patches = chosen_patches(self.search, spectrum_x, spectrum_y)
@@ -108,18 +113,24 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Returns the state with the functional map of `Solution.solve`, and the result of this solution."""
+        """Returns the state with the functional map of the solution, and the outcome of the solution.
+
+        The outcome is a member of `RESULTS`.
+        """
         before = None if previous is None else previous.functional_map
         found, result = self.solution.solve(prepared.wavelets, prepared.solution, pointwise_map, before)
         return State(found), result
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Returns the vertex of Y nearest to each vertex of X in the `embeddings`; see `decode`."""
+        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,).
+
+        `decode` finds the same vertices.
+        """
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " n"]:
-        """Returns the vertex of X nearest to each vertex of Y in the `embeddings`, (n,)."""
+        """Returns the vertex of X that is nearest to each vertex of Y in the `embeddings`, (n,)."""
         queries, database = self.embeddings(prepared, state)[::-1]
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
@@ -127,7 +138,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the energy of eq. (5) in the area norm; see `WaveletProblem.energy`."""
+        """Returns the energy of eq. (5) of the MWP paper, in the area norm; see `WaveletProblem.energy`."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(

@@ -80,7 +80,7 @@ class DescriptorPair(eqx.Module):
         *,
         operators: bool = False,
     ) -> DescriptorPair:
-        """Returns the pair of functions on X and Y whose values at the vertices are given.
+        """Returns a `DescriptorPair` from the values of corresponding functions at the vertices of X and Y.
 
         **Arguments:**
 

@@ -57,15 +57,15 @@ class RegularizedLeastSquares(Solution[None]):
 
     Each term is scaled so that its value is about k_out if C = 0, or if one side of its difference is zero.
     Weights near one are therefore comparable, for all banks and all units of descriptors. The wavelet term is
-    divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled to the
-    squared norm k_out. The operators `D_out` are scaled by a common factor such that their squared norms sum
-    to k_out.
+    divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled such
+    that its squared norm is k_out. The operators `D_out` are scaled by a common factor such that their
+    squared norms sum to k_out.
 
-    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. Both
-    are first reduced to k_in columns without approximation. Then `optimistix.least_squares` takes
-    Gauss–Newton steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver
-    starts from the functional map of the previous iteration, if there is one. C is differentiable, by
-    implicit differentiation at the minimum.
+    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. The
+    columns of both terms together are first reduced to k_in columns, without approximation. Then
+    `optimistix.least_squares` takes Gauss–Newton steps. Conjugate gradients solve each step without a matrix
+    of size k² x k². The solver starts from the functional map of the previous iteration, if there is one. C
+    is differentiable, by implicit differentiation at the minimum.
 
     **Arguments:**
 
@@ -76,8 +76,8 @@ class RegularizedLeastSquares(Solution[None]):
       Descriptor commutativity needs `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
       by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: the tolerance at which the solver stops, relative to C and to the residuals. A positive
-      number, by default 1e-3.
+    - `tolerance`: the tolerance at which the solver stops, relative to C and to the residuals. The tolerance
+      is a positive number, by default 1e-3.
     - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
@@ -113,7 +113,10 @@ class RegularizedLeastSquares(Solution[None]):
                 "weights need descriptors: give both or neither"
             )
         if not self.tolerance > 0 or self.max_steps < 1:
-            raise ValueError(f"tolerance={self.tolerance} and max_steps={self.max_steps} must be positive")
+            raise ValueError(
+                "tolerance and max_steps must be positive, but "
+                f"tolerance={self.tolerance} and max_steps={self.max_steps}"
+            )
         if (
             self.descriptor_commutativity is not None
             and self.descriptors is not None
@@ -267,11 +270,14 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the sum of the squared residuals in the given units, and reports convergence.
+        """Minimises the sum of the squared residuals, with the entries of C in the given units.
+
+        Returns the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
 
         If the problem is not solvable, its residuals are replaced by zeros, so the solver stops immediately.
         """
-        import lineax as lx  # imported here because the import takes as long as computing an eigenbasis
+        # These imports are inside the method because they take as long as computing an eigenbasis.
+        import lineax as lx
         import optimistix as optx
 
         precision = 0.1 * self.tolerance
@@ -310,8 +316,9 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
     """Returns the given energy as a term with k_in columns, up to a constant.
 
     The energy is a sum of squares over many columns. The Cholesky factor of the gram matrix has the same
-    inner products as these columns, so it can replace them. A ridge of the size of the rounding error is
-    added to the gram matrix. With this ridge the factor exists even if the energy alone does not determine C.
+    inner products as these columns, so the factor can replace the columns. A ridge of the size of the
+    rounding error is added to the gram matrix. With this ridge the factor exists even if the energy alone
+    does not determine C.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))

@@ -42,10 +42,10 @@ class MethodInput:
       iterate on samples.
     - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, for methods whose attribute
       `both_directions` is True; otherwise None.
-    - `meshes`: X and Y, for methods that need edges or faces.
+    - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
     - `partial`: whether one shape is a partial shape of the other. The two spectra are then comparable only
-      up to the smaller of their largest eigenvalues.
+      up to the smaller of the largest eigenvalue of X and the largest eigenvalue of Y.
     - `prepared`: the prepared pair as in `jaxsmw.match`, for methods that run a preset.
     """
 

@@ -10,8 +10,8 @@ four steps:
 2. `_improve_coverage`: vertices without a preimage get a preimage from the reverse map, where possible. Steps
    1 and 2 run twice in each iteration.
 3. `_smooth`: the images of neighbouring vertices are averaged in space.
-4. `_repair`: vertices in small regions that discontinuous edges separate from the rest get new images. The new
-   images are interpolated from the images of the surrounding vertices.
+4. `_repair`: vertices in small regions that discontinuous edges separate from the rest get new images. The
+   new images are interpolated from the images of the surrounding vertices.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
@@ -23,8 +23,8 @@ of the steps were chosen on 8 of these pairs.
 
 `BCICP` has the settings of the benchmark: 50 eigenvectors and 10 iterations.
 
-All steps use only referenced vertices, which are renumbered from 0, and scale each shape to area 1. Functional
-maps have the pullback convention of `jaxsmw.core.functional_map`.
+All steps use only referenced vertices, which are renumbered from 0. Each shape is scaled to area 1.
+Functional maps have the pullback convention of `jaxsmw.core.functional_map`.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge of X is discontinuous if the distance between the images of its ends exceeds two thresholds: 0.1 times
-# the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands of vertices
-# the first threshold is the length of a few edges, and is short compared with a limb. On coarse meshes the
-# second threshold is larger.
+# An edge of X is discontinuous if the distance between the images of its ends exceeds two thresholds: 0.1
+# times the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands of
+# vertices the first threshold is the length of a few edges, and is short compared with a limb. On coarse
+# meshes the second threshold is larger.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
 # A region that discontinuous edges separate from the rest of X is an outlier if its area is less than this
 # share of the area of X.
@@ -135,8 +135,8 @@ def bcicp(
 
     **Arguments:**
 
-    - `mesh_x`, `mesh_y`: X with m vertices and Y with n. Boundaries, several connected components,
-      non-manifold edges and unreferenced vertices are allowed.
+    - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices. Boundaries, several
+      connected components, non-manifold edges and unreferenced vertices are allowed.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not, with the same number of eigenvectors.
       The benchmark uses 50 eigenvectors.
     - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. Padded maps may be longer.
@@ -144,8 +144,8 @@ def bcicp(
     - `smoothing`: the number of smoothing rounds in the first iteration, at least 0. The number decreases to
       1 in the last iteration. If `smoothing` is 0, no map is smoothed.
 
-    **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and masked
-    vertices keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
+    **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and
+    masked vertices keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
 
     **Raises:** `InputError` if `iterations` or `smoothing` is too small, if the arguments do not fit each
     other, or if an initial map sends a vertex to an unreferenced, masked or missing vertex.
@@ -303,9 +303,9 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
     """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
-    Two vertices of Y are far apart if their distance along edges exceeds both 0.1 times the square root of the
-    area of Y and twice the mean edge length of Y, or if no path connects them. The thresholds and the distance
-    along edges are our choice.
+    Two vertices of Y are far apart if their distance along edges exceeds both 0.1 times the square root of
+    the area of Y and twice the mean edge length of Y, or if no path connects them. The thresholds and the
+    distance along edges are our choice.
     """
     tail, head = t_xy[x.edges].T
     return ~np.asarray(y.near[tail, head], dtype=bool).ravel()

@@ -10,16 +10,16 @@ recovery is then a non-rigid registration of two point sets in k dimensions. The
 the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed. In the statistical
 model, a data point is uniform noise with probability w. Otherwise it is drawn from a mixture of isotropic
 Gaussians around the centroids with a common variance s. All vertices have equal weight; their areas are
-ignored. The displacement of the centroids is a linear combination of Gaussian kernels at the initial centroids
-`Y`, with the kernel matrix `G` (n, n). With d dimensions and moved centroids T, expectation maximisation (EM)
-alternates between the steps
+ignored. The displacement of the centroids is a linear combination of Gaussian kernels at the initial
+centroids `Y`, with the kernel matrix `G` (n, n). With d dimensions and moved centroids T, expectation
+maximisation (EM) alternates between the steps
 
     P_ji proportional to exp(-||x_i - t_j||^2 / 2 s), the noise to (2 pi s)^(d/2) w n / ((1 - w) m)
     (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y,    T = Y + G W
     s = sum_ij P_ji ||x_i - t_j||^2 / (d sum P)
 
-until the penalised likelihood no longer changes. The match of a data point is its most probable centroid,
-which is the nearest centroid.
+EM stops when the penalised likelihood no longer changes. The match of a data point is its most probable
+centroid, which is the nearest centroid.
 
 No matrix of size m x n or n x n is stored. P is computed for one block of data points at a time. G is
 replaced by a factorisation `L L^T` of low rank (`kernel_factor`). With `G W = L b`, the M-step is a ridge
@@ -30,8 +30,8 @@ regression of the displacements on the columns of L,
 This system follows from Woodbury's identity, in a form that never divides by small numbers. Its solution is
 exact if L has full rank.
 
-`CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a functional
-map and recovers a pointwise map.
+`CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a
+functional map and recovers a pointwise map.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ from jaxsmw.evaluation.opponents.presets import Refined
 
 # The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
-# EM stops when the variance s is below this threshold of Myronenko's program. For point sets of unit variance, a
-# smaller variance is a rounding error.
+# EM stops when the variance s is below this threshold of Myronenko's program. For point sets of unit
+# variance, a smaller variance is a rounding error.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -97,9 +97,9 @@ def coherent_point_drift(
     Each point set is first scaled to zero mean and unit variance. The defaults are those of Myronenko's
     program, except for the rank. His program uses the exact kernel matrix by default, and optionally the rank
     sqrt(n). The rank was varied on a real pair with 5000 vertices. With 30 eigenvectors and ranks 70, 300 and
-    1200, the mean geodesic errors are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors and ranks 150, 600 and
-    1200, the mean geodesic errors are 17.2, 11.4 and 11.3 x 10^-3. The docstring of this module contains the
-    equations.
+    1200, the mean geodesic errors are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors and ranks 150, 600
+    and 1200, the mean geodesic errors are 17.2, 11.4 and 11.3 x 10^-3. The docstring of this module contains
+    the equations.
 
     **Arguments:**
 
@@ -108,7 +108,7 @@ def coherent_point_drift(
     - `data_mask`, `centroids_mask`: masks (m,) and (n,), False for rows that are ignored; by default all rows
       are used.
     - `width`: beta of the papers, a positive number: the standard deviation of the Gaussian kernel for point
-      sets of unit variance. A wider kernel moves more points together.
+      sets of unit variance. With a wider kernel, more points move together.
     - `stiffness`: lambda of the papers, a positive number: the weight of the smoothness of the displacement.
     - `outliers`: w of the papers, the expected share of uniform noise in the data; at least 0 and below 1.
     - `rank`: the number of columns of the kernel factor, at least 1; see `kernel_factor`.
@@ -185,9 +185,10 @@ def recover_by_drift(
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
     with the nearest unmasked vertex of Y.
 
-    The settings are those of a published run of the method on FAUST, with 30 eigenvectors and a functional map
-    from spectral ICP (`exp_teaser` of github.com/daviddao/GPU-Programming-TUM). The run has 50 iterations, after
-    which the centroids hardly move. The other settings are the defaults of `coherent_point_drift`.
+    The settings are those of a published run of the method on FAUST, with 30 eigenvectors and a functional
+    map from spectral ICP (`exp_teaser` of github.com/daviddao/GPU-Programming-TUM). The run has 50
+    iterations, after which the centroids hardly move. The other settings are the defaults of
+    `coherent_point_drift`.
 
     **Arguments:**
 
@@ -224,7 +225,7 @@ class DriftRecovery(WaveletPreservation):
 
     - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
 
-    **Raises:** `ValueError` for the pushforward convention.
+    **Raises:** `ValueError` if `convention` is `"pushforward"`.
     """
 
     bank: FilterBank = Identity()
@@ -308,8 +309,8 @@ def _drift(
 class _State(NamedTuple):
     """The state of EM between two iterations.
 
-    `objective` is the value of the objective before the most recent M-step. `change` is the relative change of
-    `objective` in the most recent iteration.
+    `objective` is the value of the objective before the most recent M-step. `change` is the relative change
+    of `objective` in the most recent iteration.
     """
 
     coefficients: Float[Array, "rank d"]

@@ -1,59 +1,65 @@
-r"""Partial functional maps: finds a functional map and the region of Y that X covers, in alternation.
+r"""Partial functional maps: finds a functional map and the region of Y that X covers.
 
 E. Rodolà, L. Cosmo, M. M. Bronstein, A. Torsello, D. Cremers, *Partial functional correspondence*, Computer
 Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper was available for this
-reconstruction. So no equation numbers are given, and W and its decay are from memory.
+reconstruction. This docstring therefore gives no equation numbers. The weights W and their decay were written
+from memory.
 
-X is the partial shape, Y the full shape. Functions F on X correspond to functions G on Y, but only inside the
-region of Y that X covers. A membership function v on Y describes the region: eta(v) is 1 inside and 0
-outside the region. The definitions are
+X is the partial shape, and Y is the full shape. Functions F on X correspond to functions G on Y, but only
+inside the region of Y that X covers. A membership function v on Y describes the region: eta(v) is 1 inside
+the region and 0 outside. The definitions are
 
     eta(t) = (tanh(6 (t - 1/2)) + 1) / 2,    A = Phi_X^+ F,    B(v) = Phi_Y^+ (eta(v) G).
 
-The paper alternately minimises over its functional map C (the transpose of C in the code, where the pullback
-takes functions on Y to functions on X) and over v
+In the paper, the functional map C takes functions on X to functions on Y. In the code, C is the pullback,
+which is the transpose of this matrix. The paper minimises the following energy alternately over C and v:
 
     ||C A - B(v)||_{2,1}
         + mu_1 ||C * W||^2 + mu_2 sum_{i != j} (C^T C)_ij^2 + mu_3 sum_i ((C^T C)_ii - d_i)^2
         + mu_4 (area(X) - integral of eta(v))^2 + mu_5 integral of xi(v) ||grad v||
 
-The first line is the fidelity term. The second line regularises the map, and the third line regularises the
-region. W grows with the distance from a slanted diagonal: the r-th eigenvalue of X is about as large as the
-k-th eigenvalue of Y, with r / k near the ratio of the areas. d_i is 1 for i <= r and 0 for larger i.
+The first line of the energy is the fidelity term. The second line regularises the functional map, and the
+third line regularises the region. The weights W grow with the distance from a slanted diagonal. Its slope is
+`r / k`, where the r-th eigenvalue of X is about as large as the k-th eigenvalue of Y. This slope is about the
+ratio of the areas of X and Y. The number d_i is 1 for i <= r and 0 for larger i.
 
 The reconstruction departs from the paper in the following points. Each departure gave better results, or
 replaces a detail that was not available.
 
-- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. Here C starts from
-  the functional map of the initial map, because all methods start from the initial map.
-- **Iterations.** A few steps of spectral ICP follow each minimisation over C. They use the rank-r
-  orthogonality of the refinement at the end of the paper. Without these steps the region is wrong. On three
-  real pairs the intersection with the true region is 39, 21 and 21 % of the union without these steps, and
-  83, 81 and 43 % with them.
+- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. Here the first C
+  is the functional map of the initial map, because all compared methods start from the initial map.
+- **Iterations.** A few steps of spectral ICP follow each minimisation over C. In these steps the rows of C
+  are orthonormal, as in the refinement at the end of the paper. Without these steps the computed region is
+  wrong: on three real pairs, its intersection with the true region is 39, 21 and 21 % of their union. With
+  these steps, the intersection is 83, 81 and 43 % of the union.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
-  [0, 1]. A start from v = 1 or from the last v keeps wrong regions, because the derivative of eta nearly
-  vanishes at these values.
-- **Descriptors.** F and G are the constant function and the first principal components of SHOT on both
-  shapes, scaled to mean square 1. The paper uses all 352 numbers of SHOT. These numbers are nonnegative, so
-  their constant part is large. Here the constant has as much weight as all components together. Any number of
-  components from 10 to 30 made little difference. With a hundred components, the true map of the true region
-  had a higher energy than C = 0.
+  [0, 1]. If a minimisation starts from v = 1 or from the previous v, wrong regions remain, because the
+  derivative of eta nearly vanishes at these values.
+- **Descriptors.** F and G are the constant function and the first principal components of the SHOT
+  descriptors of both shapes, scaled to mean square 1. The paper uses all 352 entries of the SHOT descriptors.
+  These entries are nonnegative, so their constant part is large. Here the constant function has as much
+  weight as all principal components together. Between 10 and 30 components, the number made little
+  difference. With 100 components, the true functional map and region had a higher energy than C = 0.
 - **Rank.** Only the r nonzero columns of the paper's C are stored.
-- **Length.** xi = 1, so the length term is the total variation, which worked in an earlier attempt. The
-  narrow xi of the paper vanishes wherever v is not near 1/2. This xi was not tried again.
+- **Length.** Here xi is 1, so the term of mu_5 is the total variation of v, which worked in an earlier
+  attempt. The xi of the paper is narrow: it vanishes wherever v is not near 1/2. The narrow xi was not tried
+  again.
 - **Weights.** Y has area 1, and column norms are averaged instead of summed. The weights therefore have other
   units than the published weights. mu_1 = mu_3 = 1 and mu_2 = 100 are the published values, and the fidelity
   term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs; mu_4 was not varied.
-- **Recovery.** Nearest neighbours are searched among all vertices of Y. A search among the vertices of the
-  region gave the same maps, or worse maps if the region was wrong.
-- **Solver.** Limited-memory BFGS of optimistix minimises the energies, with a bounded number of steps and
-  with v in the metric of the vertex areas. All norms are smoothed at zero.
+- **Recovery.** The search for nearest neighbours includes all vertices of Y. A search among only the vertices
+  of the region gave the same maps, or worse maps if the region was wrong.
+- **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
+  number of steps. The variable v is scaled by the square roots of the vertex areas. All norms are smoothed at
+  zero.
 
-On 12 other pairs of SHREC'16 the mean geodesic error is 0.015 on 6 cuts and 0.018 on 6 holes. The initial
-maps have 0.135 and 0.160. MWP from the same initial maps has 0.011 and 0.017.
+The reconstruction was tested on 12 other pairs of SHREC'16. On 6 pairs with cuts, the mean geodesic error is
+0.135 for the initial maps, 0.015 for the reconstruction, and 0.011 for MWP from the same initial maps. On 6
+pairs with holes, the mean geodesic error is 0.160 for the initial maps, 0.018 for the reconstruction, and
+0.017 for MWP.
 
-`PARTIAL_FUNCTIONAL_MAPS` has the settings in use: 100 eigenvectors, 15 descriptors, 5 iterations. Functional
-maps are in the pullback convention of `jaxsmw.core.functional_map`.
+`PARTIAL_FUNCTIONAL_MAPS` has the settings of the benchmark: 100 eigenvectors, 15 descriptors and 5
+iterations. Functional maps have the pullback convention of `jaxsmw.core.functional_map`.
 """
 
 from __future__ import annotations
@@ -82,19 +88,19 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""The weight of the fidelity term relative to the terms of mu_1 to mu_3, for averaged column norms."""
+"""The weight of the fidelity term, with averaged column norms, relative to the terms of mu_1 to mu_3."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
-"""mu_1, mu_2 and mu_3, as published."""
+"""The published weights mu_1, mu_2 and mu_3 of the terms that regularise the functional map."""
 REGION_WEIGHTS = (10.0, 0.01)
-"""mu_4 and mu_5, for areas and lengths in the unit in which Y has area 1."""
+"""The weights mu_4 and mu_5 of the terms that regularise the region, for the unit in which Y has area 1."""
 
 # The rate at which the slanted weights decay towards high frequencies (sigma of W in the paper).
 _DECAY = 0.03
-# Norms of columns and of gradients are smoothed below this number. It is a thousandth of the norm of a
-# descriptor, and a thousandth of the gradient of a function that changes by 1 over Y.
+# The norms of columns and of gradients are smoothed below this number. The number is 0.1 % of the norm of a
+# descriptor, and 0.1 % of the gradient of a function that changes by 1 across Y.
 _SMOOTHING = 1e-3
-# The largest numbers of L-BFGS steps in a minimisation over C and over v. Most minimisations use most of the
-# steps.
+# The largest number of L-BFGS steps in a minimisation over C, and in a minimisation over v. Most
+# minimisations use most of these steps.
 _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
@@ -105,8 +111,8 @@ class SurfaceGradient(eqx.Module):
     **Attributes:**
 
     - `faces`: the corners of each face (f, 3), 0-based. The array is padded with faces of area zero.
-    - `hats`: the gradient on each face of the hat function of each corner (f, 3, 3), zero on faces of area
-      zero.
+    - `hats`: for each face and each of its corners, the gradient of the corner's hat function on this face
+      (f, 3, 3). The gradient is zero on faces of area zero.
     - `areas`: the area of each face (f,).
     """
 
@@ -121,7 +127,7 @@ class SurfaceGradient(eqx.Module):
         **Arguments:**
 
         - `mesh`: the mesh, with n vertices and f faces.
-        - `spectrum`: its spectrum, padded or not.
+        - `spectrum`: the spectrum of the mesh, padded or not.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -131,8 +137,8 @@ class SurfaceGradient(eqx.Module):
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         doubled = np.linalg.norm(normals, axis=1)
         opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
-        # The gradient is `n x e / (2 area)` for the unit normal n and the opposite edge e. The normals here
-        # have length 2 area.
+        # The gradient of a hat function is `n x e / (2 area)` for the unit normal n and the opposite edge e.
+        # The vectors in `normals` have the length 2 area.
         squared = np.where(doubled > 0, doubled, np.inf)[:, None, None] ** 2
         hats = np.cross(normals[:, None], opposite) / squared
         size = padded_size(len(mesh.faces))
@@ -144,9 +150,10 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Returns the integral of the gradient's length over the surface (the Mumford-Shah term with xi = 1).
+        """Returns the total variation of a function (the Mumford-Shah term of the paper with xi = 1).
 
-        The length of the gradient is smoothed at zero.
+        The total variation is the integral of the gradient's length over the surface. The length is smoothed
+        at zero.
 
         **Arguments:**
 
@@ -185,23 +192,23 @@ def partial_functional_map(
     """Matches a partial shape X with a full shape Y by partial functional maps (Rodolà et al. 2017).
 
     The function is pure and can be compiled. The result does not depend on the signs of eigenvectors or on
-    padding. The docstring of this module has the equations.
+    padding. The docstring of this module contains the equations.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and of Y in one unit of length, in which Y has area 1, cut
-      to their common range (`jaxsmw.pair.common_range`). k_X is then the rank r of the paper. If k_X is
-      larger than k_Y, only the first k_Y eigenvectors of X are used. Both spectra need the same number of
-      comparable descriptors, scaled to mean square 1.
-    - `gradient_y`: the gradient on Y.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the unit of length in which Y has area 1, cut to
+      their common range of eigenvalues (`jaxsmw.pair.common_range`). The number k_X of eigenvectors of X is
+      then the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors of X are used.
+      Both spectra need the same number of comparable descriptors, scaled to mean square 1.
+    - `gradient_y`: the gradient of functions on Y.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
-    - `iterations`: the number of minimisations over C and over v; at least 1.
+    - `iterations`: the number of iterations, at least 1. Each iteration minimises over C, then over v.
     - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
 
-    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check its `result`.
+    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check its status code `result`.
 
-    **Raises:** `ValueError` if `iterations` is less than 1, or if the spectra do not have the same number of
-    descriptors, at least 1.
+    **Raises:** `ValueError` if `iterations` is less than 1, if a spectrum has no descriptors, or if the
+    numbers of descriptors differ.
     """
     if iterations < 1:
         raise ValueError(f"partial functional maps need at least 1 iteration, not {iterations}")
@@ -219,7 +226,8 @@ def partial_functional_map(
     state, _ = lax.scan(iterate, (initial, energies.covered(initial)), None, length=iterations)
     functional_map, membership = state
     region = jnp.where(spectrum_y.mask, eta(membership), 0)
-    # If an energy overflows, the minimisations leave C and v unchanged; only the energy shows the fault.
+    # If an energy overflows, the minimisations leave C and v unchanged. Only the value of the energy shows
+    # that the computation failed.
     left = fidelity(functional_map, energies.coefficients_x, energies.inside(membership))
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
@@ -229,16 +237,16 @@ def partial_functional_map(
 
 
 class _Energies(eqx.Module):
-    """The energies of one pair, and their minimisers over C and over v.
+    """The energies of one pair, with methods that minimise them over C and over v.
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra. X has r eigenvectors, at most k_Y.
-    - `gradient_y`: the gradient on Y.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. X has r eigenvectors, at most k_Y.
+    - `gradient_y`: the gradient of functions on Y.
     - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
     - `coefficients_x`: A, the coefficients of the descriptors and of the constant function on X (r,
       functions).
-    - `functions_y`: G, the same functions on Y (n, functions).
+    - `functions_y`: G, the descriptors and the constant function on Y (n, functions).
     """
 
     spectrum_x: Spectrum
@@ -259,24 +267,24 @@ class _Energies(eqx.Module):
                 "partial functional maps need the same number of descriptors on both shapes, at least 1, "
                 f"not {described_x} and {described_y}"
             )
-        # The rows of C are orthonormal, so there are at most k_Y. A shape with many holes can have more than
-        # k_Y eigenvalues in the common range.
+        # C (r, k_Y) has orthonormal rows, so r is at most k_Y. A partial shape with many holes can have more
+        # than k_Y eigenvalues in the common range.
         spectrum_x = spectrum_x.truncate(spectrum_y.eigenvalues.shape[0])
         dual_x, dual_y = (dual_eigenvectors(spectrum, "area") for spectrum in (spectrum_x, spectrum_y))
         coefficients_x = product(dual_x.T, _functions(spectrum_x))
         return cls(spectrum_x, spectrum_y, gradient_y, dual_y, coefficients_x, _functions(spectrum_y))
 
     def covered(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Returns the image of the constant function on X, clipped to [0, 1]."""
+        """Returns the function on Y that corresponds to the constant 1 on X under `c`, clipped to [0, 1]."""
         coefficients = product(c.T, self.coefficients_x[:, -1])
         return jnp.clip(product(self.spectrum_y.eigenvectors, coefficients), 0, 1)
 
     def inside(self, membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
-        """Returns B(v), the coefficients of the functions on Y after their restriction to the region."""
+        """Returns B(v), the coefficients of the functions on Y after restriction to the region."""
         return product(self.dual_y.T, eta(membership)[:, None] * self.functions_y)
 
     def best_map(self, c: Float[Array, "r k_y"], membership: Float[Array, " n"]) -> Float[Array, "r k_y"]:
-        """Returns the functional map that minimises the energy, starting from `c`."""
+        """Minimises the energy over the functional map for a fixed membership function, starting from `c`."""
         coefficients_y = self.inside(membership)
         weights = slanted_weights(*c.shape).astype(self.coefficients_x.dtype)
 
@@ -287,9 +295,9 @@ class _Energies(eqx.Module):
         return _minimum(energy, c, _MAP_TOLERANCE, _MAP_STEPS)
 
     def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Returns the membership function that minimises the energy, starting from `covered`."""
+        """Minimises the energy over the membership function for a fixed `c`, starting from `covered(c)`."""
         area_x = jnp.sum(self.spectrum_x.vertex_areas)
-        # With the variable u = v sqrt(area), the density of the mesh has no influence on the solver.
+        # The solver uses the variable u = v sqrt(vertex area), so the density of the mesh does not affect it.
         metric = jnp.sqrt(jnp.where(self.spectrum_y.mask, self.spectrum_y.vertex_areas, 1))
 
         def energy(scaled: Float[Array, " n"]) -> Float[Array, ""]:
@@ -306,7 +314,7 @@ def eta(membership: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
-    """Returns W of the paper for the pullback (k_x, k_y): weights that grow with the distance to a diagonal.
+    """Returns the weights W of the paper (k_x, k_y), which grow with the distance to a slanted diagonal.
 
     The slanted diagonal starts at the first entry and moves k_x / k_y rows per column. The weight of an entry
     is its distance to the diagonal, measured in entries, times `exp(-0.03 sqrt(i^2 + j^2))`. Rows i and
@@ -314,7 +322,7 @@ def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
 
     **Arguments:**
 
-    - `k_x`, `k_y`: the numbers of rows and columns of the functional map.
+    - `k_x`, `k_y`: the numbers of rows and columns of the functional map, in the pullback convention.
     """
     row, column = jnp.meshgrid(*(jnp.arange(1, k + 1, dtype=float) for k in (k_x, k_y)), indexing="ij")
     slope = k_x / k_y
@@ -329,8 +337,8 @@ def fidelity(
 ) -> Float[Array, ""]:
     """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
 
-    The value is the mean norm of the columns of descriptors, plus the norm of the last column, which belongs
-    to the constant function.
+    The last column belongs to the constant function, and the other columns belong to descriptors. The value
+    is the mean norm of the descriptor columns plus the norm of the last column.
 
     **Arguments:**
 
@@ -342,14 +350,14 @@ def fidelity(
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """Returns the sum of the terms of mu_1 to mu_3, multiplied by these weights.
+    """Returns the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
 
-    The terms keep C near the slanted diagonal, and keep its rows orthonormal.
+    These terms keep C near the slanted diagonal, and keep its rows orthonormal.
 
     **Arguments:**
 
     - `functional_map`: C in the pullback convention (k_x, k_y).
-    - `weights`: the result of `slanted_weights` (k_x, k_y).
+    - `weights`: the weights (k_x, k_y) that `slanted_weights` returns.
     """
     slant, orthogonality, length = MAP_WEIGHTS
     gram = product(functional_map, functional_map.T)
@@ -367,9 +375,10 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """Returns the sum of the terms of mu_4 and mu_5, multiplied by these weights.
+    """Returns the energy that regularises the region: the weighted terms of mu_4 and mu_5.
 
-    The terms keep the region as large as X, and keep its boundary short.
+    The term of mu_4 keeps the area of the region close to the area of X. The term of mu_5 keeps the boundary
+    of the region short.
 
     **Arguments:**
 
@@ -383,7 +392,7 @@ def region_energy(
 
 
 def _functions(spectrum: Spectrum) -> Float[Array, "n functions"]:
-    """Returns the descriptors and, as the last column, the constant function."""
+    """Returns the descriptors and, in the last column, the constant function 1."""
     assert spectrum.descriptors is not None
     constant = spectrum.mask.astype(spectrum.descriptors.dtype)
     return jnp.concatenate([spectrum.descriptors, constant[:, None]], axis=1)
@@ -399,7 +408,8 @@ def _spectral_icp(
 ) -> Float[Array, "k_x k_y"]:
     """Refines C by some steps of spectral ICP (the refinement at the end of the paper).
 
-    Each step searches nearest neighbours, then computes the nearest C with orthonormal rows.
+    Each step searches for nearest neighbours, encodes the matches as a functional map, and replaces this map
+    by the nearest matrix with orthonormal rows.
     """
 
     def step(c: Float[Array, "k_x k_y"], nothing: None) -> tuple[Float[Array, "k_x k_y"], None]:
@@ -417,11 +427,11 @@ def _minimum(
     tolerance: float,
     steps: int,
 ) -> Float[Array, " ..."]:
-    """Returns the point that L-BFGS reaches in at most `steps` steps.
+    """Minimises an energy by at most `steps` steps of L-BFGS, and returns the final point.
 
-    It is not an error if the point is not yet a minimum.
+    No error is raised if the final point is not yet a minimum.
     """
-    import optimistix as optx  # imported here because the import is slow
+    import optimistix as optx  # optimistix is imported here because its import is slow
 
     solver: optx.LBFGS = optx.LBFGS(tolerance, tolerance)
     return optx.minimise(lambda y, _: energy(y), solver, initial, max_steps=steps, throw=False).value
@@ -429,11 +439,11 @@ def _minimum(
 
 @dataclass(frozen=True)
 class PartialFunctionalMaps(Method):
-    """Matches a partial shape X with a full shape Y by `partial_functional_map`.
+    """A method that matches a partial shape X with a full shape Y by `partial_functional_map`.
 
     **Attributes:** those of `Method`, and
 
-    - `iterations`: see `partial_functional_map`.
+    - `iterations`: the number of iterations; see `partial_functional_map`.
     """
 
     reference: str
