@@ -61,6 +61,14 @@ def test_equal_points_get_different_targets():
     np.testing.assert_array_equal(np.sort(found), np.arange(7))
 
 
+def test_arrays_of_wrong_shapes_are_named(generator, unchecked):
+    x = generator.normal(size=(5, 3))
+    with pytest.raises(InputError, match=r"mask_x has shape \(4,\), but embedding_x has 5 points"):
+        one_to_one_map(x, x, mask_x=np.ones(4, bool))
+    with pytest.raises(InputError, match=r"embedding_y has shape \(5,\): give one point per row"):
+        one_to_one_map(x, x[:, 0])
+
+
 def test_impossible_problems_are_refused(generator, monkeypatch):
     x = generator.normal(size=(5, 3))
     with pytest.raises(InputError, match=r"5 vertices of the source .* 4 of the target: swap"):

@@ -488,6 +488,17 @@ def test_every_point_needs_a_partner():
         geodesic_distances_between(CUBE, [0, 1], [0, 1, 2])
 
 
+def test_an_unknown_method_is_refused(unchecked):
+    for call in (
+        lambda: geodesic_distances(CUBE, [0], method="heat"),
+        lambda: geodesic_distances_between(CUBE, [0], [1], method="heat"),
+    ):
+        with pytest.raises(
+            InputError, match="'heat' is not a method for geodesic distances: choose strips, exact"
+        ):
+            call()
+
+
 def test_no_sources_give_no_distances():
     nothing = np.empty(0, dtype=np.int64)
     for method in ("strips", "exact"):

@@ -45,10 +45,12 @@ def one_to_one_map(
     each other.
     """
     for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):
-        if points.ndim != 2 or (mask is not None and mask.shape != points.shape[:1]):
+        if points.ndim != 2:
+            raise InputError(f"embedding_{side} has shape {points.shape}: give one point per row.")
+        if mask is not None and mask.shape != points.shape[:1]:
             raise InputError(
-                f"embedding_{side} has shape {points.shape}, which does not fit mask_{side}: give one point "
-                "per row, and a mask with one entry per point."
+                f"mask_{side} has shape {mask.shape}, but embedding_{side} has {len(points)} points: give "
+                "one entry per point."
             )
     if embedding_x.shape[1] != embedding_y.shape[1]:
         raise InputError(

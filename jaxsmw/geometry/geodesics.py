@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import igl
 import numpy as np
@@ -303,10 +303,11 @@ def geodesic_distances(
     **Returns:** Distances (s, n), float64, in the unit of the mesh. A distance is inf if no path connects the
     source and the vertex, or if the distance is above the limit.
 
-    **Raises:** `InputError` for sources that are not on the mesh. With `"exact"`, also `InputError` for
-    `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces whose height is
-    almost zero.
+    **Raises:** `InputError` for sources that are not on the mesh, or an unknown method. With `"exact"`, also
+    `InputError` for `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces
+    whose height is almost zero.
     """
+    _check_method(method)
     points = check_points(sources, mesh, "sources")
     if method == "exact":
         distances = np.empty((len(points), len(mesh.vertices)))
@@ -317,6 +318,12 @@ def geodesic_distances(
         return distances
     graph, nodes, _ = _network(mesh, points, np.empty(0, dtype=np.int64))
     return dijkstra(graph, indices=nodes, limit=limit)[:, : len(mesh.vertices)]
+
+
+def _check_method(method: str) -> None:
+    if method not in get_args(GeodesicMethod):
+        choices = ", ".join(get_args(GeodesicMethod))
+        raise InputError(f"{method!r} is not a method for geodesic distances: choose {choices}.")
 
 
 def geodesic_distances_between(
@@ -340,9 +347,10 @@ def geodesic_distances_between(
 
     **Returns:** Distances (p,) in the unit of the mesh; inf where there is no path.
 
-    **Raises:** `InputError` for points that are not on the mesh, for different numbers of points and
-    partners, or if the exact method cannot be used (see `geodesic_distances`).
+    **Raises:** `InputError` for points that are not on the mesh, for an unknown method, for different numbers
+    of points and partners, or if the exact method cannot be used (see `geodesic_distances`).
     """
+    _check_method(method)
     starts, ends = check_points(points, mesh, "points"), check_points(partners, mesh, "partners")
     if len(starts) != len(ends):
         raise InputError(
