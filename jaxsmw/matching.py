@@ -253,13 +253,16 @@ def match(
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following. Presets use fewer eigenvectors and
       samples on small meshes. Stages are used with exactly the given sizes.
+
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
         - `"fast"`: the method of the MWP paper on samples.
         - a `Preset`.
         - a `Stage` or several stages, for example
           `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`.
+
     - `init`: the initial map, which is one of the following.
+
         - `"shot"` (the default), `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
           the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, presets with repair also try alternative initial maps.
@@ -270,6 +273,7 @@ def match(
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
           0-based: vertices are compared by SHOT and by their geodesic distances to the landmarks. Give a few
           landmarks on both sides of the body.
+
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of

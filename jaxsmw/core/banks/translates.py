@@ -43,7 +43,7 @@ class Itersine(_UniformTranslates):
     """A filter bank of evenly spaced translates of the window `sin(pi/2 cos²(pi u))`: a Parseval frame.
 
     u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
-    windows are zero for |u| above 1/2. The first window passes the lowest eigenvalues.
+    windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
     `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
 
     The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
@@ -72,7 +72,7 @@ class HalfCosine(_UniformTranslates):
     """A filter bank of evenly spaced translates of the Hann window `cos²(pi u)`: a Parseval frame.
 
     u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
-    windows are zero for |u| above 1/2. The first window passes the lowest eigenvalues.
+    windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
     `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
