@@ -1,4 +1,4 @@
-"""Descriptors of a pair, which are SHOT at all vertices or at samples, and principal components of SHOT."""
+"""The descriptors of a pair: SHOT at all vertices or at samples, and principal components of SHOT."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from jaxsmw.runtime.threads import side_by_side
 # distinguish vertices whose distance is a few hundredths of the square root of the area. For this resolution,
 # 10 000 samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
-# On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten vertices.
+# On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten or more
+# vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# The number of samples for descriptors with more than the usual radius. Such descriptors vary more slowly
+# The number of samples for descriptors with a larger radius than usual. Such descriptors vary more slowly
 # over the surface than descriptors with the usual radius.
 _SPREAD = 2000
 
@@ -50,7 +51,7 @@ class SampledShape(NamedTuple):
     def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
         """Make a sampled shape from the spectrum at all n vertices of a mesh.
 
-        **Raises:** `InputError` if the spectrum has another number of vertices.
+        **Raises:** `InputError` if the spectrum has another number of vertices than the mesh.
         """
         if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
             raise InputError(
@@ -122,9 +123,9 @@ def describe(
     """Add vertex descriptors, which are principal components of SHOT, to the spectra of both shapes.
 
     SHOT is computed with a radius of 0.06 times the square root of the area. If both meshes have at least
-    2000 vertices and are fine enough, SHOT is also computed with two thirds of this radius. The principal
-    components are computed for both shapes together. Each component is scaled so that its mean square over
-    the areas of both shapes is 1.
+    2000 vertices and are fine enough for a smaller radius, SHOT is also computed with two thirds of this
+    radius. The principal components are computed for both shapes together. Each component is scaled so that
+    its mean square over the areas of both shapes is 1.
 
     **Arguments:**
 
@@ -133,7 +134,8 @@ def describe(
     - `number_of_descriptors`: the number d of components, from 1 to 352. The components of largest variance
       are taken.
 
-    **Returns:** The spectra of X and Y with the attribute `descriptors`, (m, d) and (n, d), without unit.
+    **Returns:** The spectra of X and Y, with `descriptors` of shapes (m, d) and (n, d), without unit. The
+    function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
     **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT, or a
     spectrum of another mesh.
@@ -189,7 +191,7 @@ def paired_shot(
 
     **Arguments:**
 
-    - `sampled`: the pair with its compared vertices.
+    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
     - `radius`: the radius of the neighbourhoods, in `Pair.units_of_length`.
 
     **Returns:** The descriptors of X (m, 352) and of Y (n, 352), where m and n are the numbers of compared

@@ -1,6 +1,6 @@
 """Differentiable soft maps and differentiable refinement.
 
-`docs/gradients.md` explains them.
+The page `docs/gradients.md` explains their use.
 """
 
 from jaxsmw.core.soft_maps import (

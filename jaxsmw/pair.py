@@ -16,8 +16,8 @@ from jaxsmw.runtime.threads import side_by_side
 # With fewer vertices, presets would use fewer than two eigenvectors, because they use at most half as many
 # eigenvectors as vertices.
 _FEWEST_VERTICES = 4
-# The smallest allowed ratio of the smaller area to the larger area of a partial pair. A thousandth of a
-# body's area does not show the shape of the body.
+# The smallest allowed ratio of the smaller area to the larger area of a partial pair. A part with less than a
+# thousandth of a body's area shows too little of the body's shape.
 _SMALLEST_PART = 1e-3
 
 
@@ -73,11 +73,10 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The lengths on X and on Y that count as 1, in the units of the meshes.
+        """The lengths that serve as units on X and on Y, in the units of the meshes.
 
-        For two full shapes, these lengths are the square roots of the areas of X and of Y. Such units
-        compensate for a difference in size. For a partial pair, both lengths are the square root of the
-        larger area.
+        For two full shapes, the units are the square roots of the areas of X and of Y. Such units compensate
+        for a difference in size. For a partial pair, both units are the square root of the larger area.
         """
         roots = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         return (max(roots),) * 2 if self.partial else roots
@@ -112,9 +111,9 @@ def paired_spectra(
     """Compute the spectra of the two meshes of a pair in comparable units.
 
     Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by the same factor, so that the larger shape has area 1. In the spectra of a
-    partial pair, the eigenpairs above the smaller of the two largest eigenvalues are then removed. Therefore
-    k_X and k_Y usually differ for a partial pair.
+    partial pair are scaled by the same factor, so that the larger shape has area 1. For a partial pair,
+    eigenpairs with eigenvalues above the smaller of the two shapes' largest eigenvalues are then removed.
+    Therefore k_X and k_Y usually differ for a partial pair.
 
     **Arguments:**
 
@@ -140,7 +139,7 @@ def paired_spectra(
         lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
         *pair.meshes,
     )
-    # This conversion runs outside of the threads, because they do not inherit `jax.enable_x64`.
+    # This conversion runs outside of the threads, because threads do not inherit `jax.enable_x64`.
     spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
     if not pair.partial:
         return spectrum_x, spectrum_y
@@ -148,7 +147,7 @@ def paired_spectra(
     if min(areas) < _SMALLEST_PART * max(areas):
         raise InputError(
             f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
-            "neither is a part of the other in the same unit of length: scale one of the meshes."
+            "their units of length probably differ: scale one of the meshes."
         )
     scales = (area / max(areas) for area in areas)
     return common_range(

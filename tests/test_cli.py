@@ -91,7 +91,7 @@ def test_the_help_states_the_defaults_of_the_library(run):
     solution = re.search(r"orthogonality \(default: (\S+)\)", words["match"])[1]
     assert solution == "filtering" and isinstance(WaveletPreservation().solution, Filtering)
     geodesics = inspect.signature(geodesic_error).parameters
-    assert f"within 0.5 % of it (default: {geodesics['method'].default})" in words["evaluate"]
+    assert f"less than 0.5 % (default: {geodesics['method'].default})" in words["evaluate"]
     assert f"--evaluation-samples (default: {geodesics['seed'].default})" in words["evaluate"]
 
 

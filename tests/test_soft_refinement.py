@@ -439,6 +439,12 @@ def test_invalid_arguments_are_refused(pair):
         refine_softly(x, y, short)
     with pytest.raises(ValueError, match="Sinkhorn needs at least 1 iteration"):
         Sinkhorn(iterations=0)
+    with pytest.raises((TypeError, TypeCheckError), match="iterations"):
+        Sinkhorn(iterations=2.5)
+    with pytest.raises((TypeError, TypeCheckError), match="number"):
+        NearestFew(2.5)
+    with pytest.raises((TypeError, TypeCheckError), match=r"recovery.of.features"):
+        WaveletPreservationLayer(recovery_of_features=0.1)
     with pytest.raises((ValueError, TypeCheckError), match="features"):
         WaveletPreservationLayer()(x.eigenvectors, y.eigenvectors[:, 1:], x, y)
     with pytest.raises((ValueError, TypeCheckError), match="differentiation"):

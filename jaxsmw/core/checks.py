@@ -52,7 +52,7 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
         return
     shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
     shown = "an array" if isinstance(value, jax.Array) else shown
-    needed = "an array" if kinds[0] is np.ndarray else f"a {kinds[0].__name__}"
+    needed = {np.ndarray: "an array", int: "an integer"}.get(kinds[0], f"a {kinds[0].__name__}")
     raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 

@@ -22,19 +22,21 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class History(eqx.Module):
-    """A record of the iterations of `refine`, which returns it if `history=True`.
+    """A record of the iterations of `refine`, stored in `Refinement.history` if `history=True`.
 
-    Entries are NaN for iterations that an early stop skipped, except in `pointwise_maps`.
+    If the refinement stopped early, the entries of the skipped iterations are NaN, except in
+    `pointwise_maps`.
 
     **Attributes:**
 
     - `changed`: (iterations,), the share, from 0 to 1, of the vertices of X whose match changed in each
       iteration. If the refinement uses samples, `changed` is the share of the samples of X. Its first and
       last entries are then NaN, because these iterations have no earlier map of the same vertices.
-    - `energy`: (iterations,), the result of `Refiner.energy` for the state and for the pointwise map from
-      which the state was computed. For `WaveletPreservation`, this is the energy of eq. (5) of the MWP paper.
-    - `objective`: (iterations,), the result of `Refiner.objective` for the state and for the pointwise map
-      that was recovered from the state.
+    - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
+      the pointwise map that led to this state. For `WaveletPreservation`, this is the energy of eq. (5) of
+      the MWP paper.
+    - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
+      and the pointwise map that was recovered from this state.
     - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Skipped
       iterations repeat the final map. After a failure, all entries are -1. `pointwise_maps` is None if the
       refinement uses samples, because the iterations then map only the samples.
@@ -53,14 +55,16 @@ class Refinement(eqx.Module):
 
     - `pointwise_map`: the refined map T: X -> Y (m,), one vertex of Y per vertex of X; all entries are -1
       after a failure.
-    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. C is a
-      pullback (k_X, k_Y) or a pushforward (k_Y, k_X), depending on the refiner.
+    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. It is a
+      property, equal to `state.functional_map`. C is a pullback (k_X, k_Y), which takes functions on Y to
+      functions on X, unless the refiner's `convention` is `"pushforward"`. A pushforward (k_Y, k_X) takes
+      functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
     - `state`: the final `State` of the refiner, which contains the functional map.
-    - `result`: a member of `RESULTS`. Compare it with `RESULTS.successful`; `RESULTS[result]` explains it in
-      words.
-    - `iterations`: the number of iterations that were run. An early stop makes it smaller than the requested
-      number.
-    - `history`: a `History` if it was requested, else None.
+    - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
+      `RESULTS[result]` is a sentence that explains the status.
+    - `iterations`: the number of iterations that were run. It is smaller than the requested number if the
+      refinement stopped early.
+    - `history`: a `History`, or None if `refine` was called with `history=False`.
     """
 
     pointwise_map: Int32[Array, " m"]
@@ -75,7 +79,7 @@ class Refinement(eqx.Module):
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
-        """Returns the same outcome without the vertices that `Spectrum.pad` added to X.
+        """Returns the same refinement without the vertices that `Spectrum.pad` added to X.
 
         **Arguments:**
 
@@ -105,7 +109,7 @@ def refine(
 ) -> Refinement:
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
-    The loop is Algorithm 1 of the MWP paper, and it accepts any refiner. The function is pure and
+    The loop is Algorithm 1 of the MWP paper, and any refiner can be used. The function is pure and
     jit-compiled. JAX compiles the function again only when sizes or static settings change. For many pairs of
     equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
     `jaxsmw.refine_pairs`.
@@ -129,10 +133,11 @@ def refine(
       length.
     - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
       every pair takes as long as the slowest pair, but the result of a pair stays the same.
-    - `history`: whether to record a `History`. The record increases the run time by about 10 %.
+    - `history`: whether to record a `History`. Recording increases the run time by about 10 %.
 
     **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,), `functional_map` (k_out, k_in)
-    and `result`. Numerical failures raise no error, so compare `result` with `RESULTS.successful`.
+    and `result`. Numerical failures raise no error, so compare `result` with `RESULTS.successful`. After a
+    failure, all entries of `pointwise_map` are -1.
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
     is not a pair, or the two spectra have different float types. `TypeError` if `iterations` or the entries
@@ -193,7 +198,7 @@ class _Record(NamedTuple):
         """Returns the record of a loop on samples, extended by the final search of all vertices.
 
         The first map of the samples and the final map of all vertices have no earlier map of the same
-        vertices. Their `changed` is therefore NaN.
+        vertices. The entries of `changed` for these two maps are therefore NaN.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -204,7 +209,7 @@ class _Record(NamedTuple):
         )
 
     def history(self, successful: Bool[Array, ""]) -> History:
-        """Returns the `History`. All entries of its maps are -1 if the refinement was not successful."""
+        """Returns the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
         maps = self.pointwise_map
         if maps is not None:
             maps = jnp.where(successful, maps, -1)
@@ -246,7 +251,7 @@ class _Loop:
         )
 
     def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        """Runs one iteration, or nothing if the loop has terminated."""
+        """Runs one iteration, or does nothing if the loop has terminated."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
         return lax.cond(
@@ -345,10 +350,11 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Returns the outcome of an update, as a member of `RESULTS`.
+    """Returns the status code of an update.
 
-    If the update reports a failure, the outcome is this failure. Otherwise the outcome depends on the state,
-    which must not contain NaN, infinity or a functional map of zeros.
+    If the update reports a failure, this failure is returned. If the state contains NaN or infinity, or all
+    entries of the functional map are zero, the status code names this failure. Otherwise the status code is
+    `RESULTS.successful`.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -359,17 +365,17 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Returns the outcome of a refinement, as a member of `RESULTS`.
+    """Returns the status code of a refinement.
 
-    If the spectra contain numbers that are not finite, or the initial map is invalid, the outcome states this
-    fault. Otherwise the outcome is `result`.
+    If a spectrum contains numbers that are not finite, or the initial map is invalid, the status code names
+    this fault. Otherwise the status code is `result`.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
     - `matches`: the vertices of Y in the initial map, one or several per vertex of X (m, ...); None if the
       initial map contains no vertex indices.
-    - `result`: the outcome of the refinement itself.
+    - `result`: the status code of the refinement loop.
     """
     if matches is not None:
         vertices_y = spectrum_y.mask.shape[0]

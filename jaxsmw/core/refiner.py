@@ -38,7 +38,8 @@ class Problem(eqx.Module):
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
         """Returns the spectra of X and of Y at the vertices on which the refiner iterates.
 
-        If the problem has samples, the spectra contain only the samples. Otherwise they contain all vertices.
+        If the problem has samples, the spectra contain only the samples. Otherwise the spectra contain all
+        vertices.
         """
         if self.samples is None:
             return self.spectrum_x, self.spectrum_y
@@ -91,21 +92,24 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     Ready subclasses are `jaxsmw.WaveletPreservation`, `jaxsmw.FeatureRegression` and `jaxsmw.Registration`. A
     refiner defines both half-steps of an iteration: `update` computes a state from a pointwise map, and
     `recover` computes a pointwise map from a state. The state contains the functional map. `jaxsmw.refine`
-    calls `prepare` once for all vertices and, if there are samples, once more for the samples. It then calls
+    calls `prepare` once for all vertices and, if there are samples, once more for the samples. Then it calls
     `update` and `recover` in each iteration. JAX traces all methods, so Python code in the methods must not
     branch on the values of arrays.
 
-    A subclass is an equinox module. Below, m is the number of vertices of X to be matched, and n is the
-    number of vertices of Y.
+    A subclass is an equinox module. In the shapes of arrays, m is the number of vertices of X to be matched,
+    and n is the number of vertices of Y.
 
     **Methods that a subclass must define:**
 
-    - `prepare(problem)`: takes a `Problem` and returns a `Prepared`, the values that all iterations share.
+    - `prepare(problem)`: takes a `Problem` and returns a `Prepared`, which contains the values that all
+      iterations share.
     - `update(prepared, pointwise_map, previous)`: takes a pointwise map X -> Y (m,) and the previous `State`
-      (None in the first iteration). It returns the next `State` and a member of `RESULTS`.
+      (None in the first iteration). It returns the next `State` and a status code, which is a member of
+      `RESULTS`.
     - `recover(prepared, state)`: returns the pointwise map X -> Y, an int32 array (m,).
     - `recover_reverse(prepared, state)`: returns the reverse map Y -> X, an int32 array (n,).
-    - `energy(prepared, state, pointwise_map)`: returns a scalar array for `History.energy`.
+    - `energy(prepared, state, pointwise_map)`: returns the quantity that the method minimises, as a scalar
+      array. `jaxsmw.refine` stores this quantity in `History.energy`.
 
     **Methods that a subclass can override:** `embeddings`, `objective` and `is_settled`, and the properties
     `levels` and `convention`.
@@ -124,7 +128,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def update(
         self, prepared: PreparedT, pointwise_map: Int[Array, " m"], previous: StateT | None
     ) -> tuple[StateT, RESULTS]:
-        """Returns the state that follows from a pointwise map, and a member of `RESULTS`.
+        """Returns the state that follows from a pointwise map, and a status code (a member of `RESULTS`).
 
         **Arguments:**
 
@@ -146,12 +150,14 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         """Returns the reverse map Y -> X that follows from a state, (n,).
 
         The map assigns to each vertex of Y the vertex of X that is nearest in the `embeddings`. `prepared`
-        must belong to a problem without samples.
+        must be the result of `prepare` for a problem without samples.
         """
 
     @abc.abstractmethod
     def energy(self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """Returns the quantity that the method minimises, as a scalar array for `History.energy`.
+        """Returns the quantity that the method minimises, as a scalar array.
+
+        `jaxsmw.refine` stores this quantity in `History.energy`.
 
         **Arguments:**
 
@@ -191,10 +197,13 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether all later iterations use the same settings as this iteration.
+        """Returns whether all iterations after a state use the same settings.
 
-        If the settings stay the same, a map that one iteration leaves unchanged also stays unchanged in all
-        later iterations. The default is True.
+        A setting is, for example, the number of eigenvectors.
+
+        With the same settings, a map that one iteration leaves unchanged also stays unchanged in all later
+        iterations. `jaxsmw.refine` therefore stops early only if this method returns True. The default is
+        True.
         """
         return jnp.asarray(True)
 

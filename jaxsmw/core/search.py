@@ -22,16 +22,17 @@ from jaxsmw.core.products import product
 
 # BLOCK is the number of queries per block, and _CHUNK is the number of database rows per chunk. Both sizes
 # were chosen by measurements with scripts/benchmark_speed.py on two CPU cores. The scores of a block must fit
-# into the cache. Chunks are useful because XLA vectorises a maximum over a chunk, but not an argmax.
+# into the cache of the CPU. Chunks are useful because XLA vectorises a maximum over a chunk, but not an
+# argmax.
 BLOCK = 128
 _CHUNK = 64
-# A maximum over a chunk is computed from runs of _RUN rows. A minimum over all boxes is computed from _PARTS
-# parts. Both computations use `_maximum`.
+# `_maximum` divides an axis into parts. The axis of a chunk is divided into parts of _RUN rows, and the axis
+# of all boxes is divided into _PARTS parts.
 _RUN, _PARTS = 8, 16
-# Patches are compact in the first _COORDINATES coordinates of the points. The `variations` of patches have
-# nearly converged after _POWER_ITERATIONS power iterations.
+# `make_patches` divides points along their first _COORDINATES coordinates. It computes `Patches.variations`
+# by _POWER_ITERATIONS power iterations, after which the variations have nearly converged.
 _COORDINATES, _POWER_ITERATIONS = 6, 4
-# One step of the search compares a block of queries with _GROUP patches, by one matrix product.
+# One step of the search in patches compares a block of queries with _GROUP patches, by one matrix product.
 _GROUP = 4
 
 
@@ -41,17 +42,17 @@ def nearest_neighbor(
     *,
     database_mask: Bool[Array, " n"] | None = None,
 ) -> Int32[Array, " m"]:
-    """Returns the index of the database row that is nearest to each query in Euclidean distance.
+    """Returns, for each query, the index of the database row that is nearest in Euclidean distance.
 
-    The search is exhaustive and exact. If several rows are equally near, the result is the lowest index. The
-    queries are processed in blocks, so no array of size m x n is stored.
+    The search compares every query with every row, and it is exact up to rounding errors. If several rows are
+    equal, the result is the lowest index. The queries are processed in blocks, so no array of size m x n is
+    stored.
 
     The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the nearest row. The
     search first finds the best score in every chunk of database rows. Then it finds the best row in each of
-    the two best chunks. Finally, the distances from the query decide between these two rows. The search takes
-    little longer than the matrix product that computes the scores. Scores lose digits if `|b|` is large
-    compared to the distance. In float32 the comparison of two rows makes the result agree with an exact
-    search.
+    the two best chunks. Finally, the distances from the query decide between these two rows. If `|b|` is
+    large compared to the distance, scores have large rounding errors, so the last comparison is necessary.
+    The search takes little longer than the matrix product that computes the scores.
 
     **Arguments:**
 
@@ -60,6 +61,9 @@ def nearest_neighbor(
       all entries are False, the result is meaningless.
 
     **Returns:** One index from 0 to n - 1 per query, an int32 array (m,).
+
+    **Raises:** `TypeError` if queries and database have different dimensions d. `ValueError` if the database
+    is empty, an array does not have two dimensions, or `database_mask` does not have shape (n,).
     """
     n = database.shape[0]
     chunks = -(-n // _CHUNK)
@@ -91,8 +95,8 @@ def in_blocks(
 ) -> Shaped[Array, "m ..."]:
     """Returns the results of `search` for all queries, one row per query (m, ...).
 
-    The function `search` is called for one block (size, d) of queries after another. The last block is padded
-    with rows of zeros.
+    The function `search` is called once for each block (size, d) of queries. The last block is padded with
+    rows of zeros.
     """
     m, d = queries.shape
     blocks = -(-m // size)
@@ -105,7 +109,7 @@ def _maximum(values: Array, axis: int, parts: int) -> Array:
     """Returns the maximum along an axis.
 
     The axis is first divided into parts, which may overlap. The elementwise maximum of the parts is then
-    reduced to one number. This order of operations reduces the time of a search on CPUs by about 10 %.
+    reduced to one number. On CPUs, this order of operations reduces the time of a search by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -142,17 +146,17 @@ def _nearest(
 class Patches(eqx.Module):
     """Groups of nearby points. All groups have the same size.
 
-    In the spectral embedding of a surface, a patch of neighbouring vertices varies mainly along a few
-    directions. The reason is that eigenfunctions are smooth, and that the patch is small compared to their
-    wavelengths.
+    Patches make searches in the spectral embedding of a surface faster. In this embedding, the points of a
+    patch differ mainly along a few directions, because eigenfunctions are smooth and patches are small
+    compared to their wavelengths.
 
     **Attributes:**
 
     - `rows`: (p, s), the indices of the s points of each of the p patches, in ascending order, with padding
       at the end.
     - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), the coefficients of r linear combinations of the points of each patch. These
-      combinations are the r directions in which the patch varies most.
+    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch. These
+      combinations give the r directions along which the points of the patch differ most.
     """
 
     rows: Int32[Array, "p s"]
@@ -163,13 +167,13 @@ class Patches(eqx.Module):
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
     """Divides points into patches of equal size by repeatedly halving all groups of points.
 
-    Each group is divided along its coordinate of largest variance. Only the first 6 coordinates of the points
-    are used.
+    Each group is divided along its coordinate of largest variance. For this division, only the first 6
+    coordinates of the points are used.
 
     **Arguments:**
 
-    - `points`: the points (n, d). For a surface, they are the rows of its eigenvectors, whose first columns
-      are coordinates along the body.
+    - `points`: the points (n, d). For a surface, they are the rows of the matrix of eigenvectors. The first
+      eigenvectors vary slowly over the surface, so neighbouring vertices have similar coordinates.
     - `mask`: a Boolean array (n,), False for points that are ignored.
     - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times the desired
       number.
@@ -186,8 +190,8 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
         jnp.pad(points[:, :_COORDINATES], ((0, total - n), (0, 0))), jnp.pad(mask, (0, total - n)), levels
     )
     valid = jnp.pad(mask, (0, total - n))[rows]
-    # The rows of a patch are sorted, so the first of several equally near candidates has the lowest index.
-    # Padding comes last.
+    # The rows of a patch are sorted, so that the first of several equally near candidates has the lowest
+    # index. Padding is at the end.
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     if rank == 0:
@@ -218,7 +222,7 @@ def _halved(
         _, _, ordered = lax.sort([group, jnp.where(valid, along, jnp.inf), rows], num_keys=2)
         return ordered
 
-    # A `fori_loop` compiles only one sort, whatever the number of levels.
+    # With a `fori_loop`, JAX compiles the sort once instead of once per level.
     return lax.fori_loop(0, levels, halve, jnp.arange(total, dtype=jnp.int32))
 
 
@@ -263,19 +267,20 @@ def nearest_neighbor_in_patches(
     """Returns the same indices as `nearest_neighbor`, but skips patches that are too far away.
 
     Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
-    has a radius: the largest distance of the patch's points from the space that the axes span. The box gives
-    a lower bound on the distance from a query to all points of the patch, at the cost of r + 1 scalar
-    products. For each query, the patch with the nearest box gives a first candidate. The search then skips a
-    patch if it cannot contain a nearer point for any query in a patch of queries. The bounds allow for
-    rounding, so the search is exact. If the points are spread evenly in all dimensions, the search skips no
-    patch, and `nearest_neighbor` is faster.
+    has a radius: the largest distance from a point of the patch to the space that the axes span. The box
+    gives a lower bound on the distances from a query to the points of the patch. The computation of this
+    bound needs only r + 1 scalar products. For each query, the patch with the nearest box gives a first
+    candidate. The queries are also divided into patches. For all queries of such a patch together, the search
+    skips every database patch that cannot contain a nearer point for any of these queries. The bounds allow
+    for rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions,
+    the search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
     - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points of
-      which these points are a linear function. Masked points of the database are never chosen. The results
-      for masked queries are meaningless.
+    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points that
+      a linear map takes to these points. Masked points of the database are never chosen. The results for
+      masked queries are meaningless.
 
     **Returns:** One index from 0 to n - 1 per query, (m,).
     """
@@ -310,7 +315,8 @@ def search_in_patches(
         return _nearest(block, points, vertices[rows], masked, database.shape[0]), number
 
     found, numbers = lax.map(search, (query_patches.rows, query_patches.mask))
-    # Rows of padding and masked queries are set out of range, so the scatter drops them.
+    # The indices of padding and of masked queries are set out of range, so the scatter operation ignores
+    # them.
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
     kept = jnp.where(query_patches.mask, query_patches.rows, queries.shape[0])
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
@@ -325,8 +331,8 @@ def nearest_vertices(
     """Returns the index of the database row that is nearest to each query, (m,).
 
     `patches` contains the patches of the queries and the patches of the database, as returned by
-    `make_patches`. If `patches` is None, the search is exhaustive. An exhaustive search never chooses rows
-    for which `database_mask` (n,) is False.
+    `make_patches`. If `patches` is None, the search is exhaustive. It then never chooses rows for which
+    `database_mask` (n,) is False. A search in patches ignores `database_mask`, because patches contain masks.
     """
     if patches is None:
         return nearest_neighbor(queries, database, database_mask=database_mask)
@@ -388,8 +394,8 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
     center_norms = jnp.sum(boxes.center**2, axis=1)
     low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # The computation of a bound contains sums of d products and about 12 further operations. Each operation
-    # rounds its result.
+    # `precision` limits the relative rounding error of a bound, whose computation contains sums of d products
+    # and about 12 further operations.
     precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
     return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
 
@@ -397,12 +403,12 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
 def _bounds(
     tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Returns squared distances to boxes, lower bounds on distances, and coordinates of queries.
+    """Returns squared distances to boxes, lower bounds on distances to points, and coordinates of queries.
 
     **Returns:** Three values for all patches and all queries of a block. The first value is an array of the
-    squared distances from the queries to the boxes without their radii. The second value is an array of lower
-    bounds on the distances from the queries to the points of the patches. The third value is a list of the
-    coordinates of the queries along each axis.
+    squared distances from the queries to the boxes, as if all radii were zero. The second value is an array
+    of lower bounds on the distances from the queries to the points of the patches. The third value is a list
+    of the coordinates of the queries along each axis.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
@@ -426,7 +432,8 @@ def _distance_to_promising_patch(
 ) -> Float[Array, " block"]:
     """Returns the distance from each query to one point of the patch with the nearest box.
 
-    Among the points of this patch, the chosen point has the nearest coordinates along the axes of the box.
+    Among the points of this patch, the function chooses the point that is nearest in the coordinates along
+    the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
     # Finding the smallest value first and its position second takes a third of the time that argmin takes.
@@ -441,10 +448,10 @@ def _distance_to_promising_patch(
 
 
 class _Found(NamedTuple):
-    """The two best candidates found so far for each query, which are in different patches.
+    """The two best candidates found so far for each query.
 
-    `rows` contains the indices of the candidates in the flattened points of all patches. `scores` contains
-    their scores.
+    The two candidates are in different patches. `rows` contains the indices of the candidates in the
+    flattened points of all patches. `scores` contains their scores.
     """
 
     step: Int32[Array, ""]
@@ -457,7 +464,7 @@ def _two_best_rows(
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
     """Searches the needed patches for the two best candidates of each query, in different patches.
 
-    Each step of the search compares the queries with a few patches.
+    Each step of the search compares the queries with _GROUP patches.
 
     **Returns:** The indices of the candidates in the flattened points of all patches, and a Boolean array
     that is True for masked or missing candidates.

@@ -2,7 +2,7 @@
 
 A `Recovery` computes a soft map from two point sets. `Softmax` computes the shares of a query from its
 distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` also
-ensures that every database point receives as much area as it has.
+makes the total area that each database point receives equal to the point's own area.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import as_parameter, check_between
+from jaxsmw.core.checks import as_parameter, check_between, check_kind
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
-# Queries are processed in blocks of this size. The distances from one block to all database rows are in
-# memory at the same time.
+# Queries are processed in blocks of this size. At any time, memory contains the distances from one block to
+# all database rows.
 _BLOCK = 128
 
 
 class SoftMap(eqx.Module):
     """A soft map from m query points to n database points, in the form of a transport plan.
 
-    The plan P (m, n) contains the part of each query's area that is sent to each database row. For query i
-    and database row j, `P_ij = a_i w_ij / sum_k w_ik` with `w_ij = b_j exp(g_j - |q_i - y_j|² /
-    temperature)`. The share of row j in query i is `w_ij / sum_k w_ik`. The matrix P is never stored as a
-    whole. The rows of P sum to the areas of the queries exactly. The columns of P sum to the areas of the
-    database rows up to the `residual`.
+    Entry `P_ij` of the plan P (m, n) is the part of the area of query i that is sent to database row j. The
+    plan is `P_ij = a_i w_ij / sum_k w_ik` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. The share
+    that query i gives to row j is `w_ij / sum_k w_ik`. The matrix P is never stored as a whole. Row i of P
+    sums to the area a_i. If `sinkhorn` computed the map, column j of P sums to the area b_j up to the
+    `residual`.
 
     `refine_softly`, `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps. For maps between shapes, the
     queries are the vertices of X, and the database rows are the vertices of Y.
@@ -42,14 +42,16 @@ class SoftMap(eqx.Module):
 
     - `queries`, `database`: the points q (m, d) and y (n, d). Both point sets are shifted by the same vector.
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. The area is zero for
-      ignored points. A query of zero area still gets the shares that its position implies.
-    - `potentials`: g (n,), without unit. A higher potential increases the share of a row. The potentials are
-      zero for rows of zero area, and for all rows of a map from `Softmax`.
+      ignored points. The shares of a query of zero area are computed from its position, like those of all
+      other queries.
+    - `potentials`: g (n,), without unit. A higher potential increases the share of a row. The potential is
+      zero for rows of zero area, and for all rows of a map that `Softmax` computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
     - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
-      areas. It is NaN for a map from `Softmax`, which does not compute the residual.
-    - `converged`: whether the residual is at most the tolerance of `sinkhorn`; False if the residual is NaN.
-    - `iterations`: the number of iterations that `sinkhorn` ran; 0 for a map from `Softmax`.
+      areas. It is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
+    - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
+      residual is NaN.
+    - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
     """
 
     queries: Float[Array, "m d"]
@@ -64,7 +66,9 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y, such as colours, weighted with the shares of each query.
+        """Transfers functions on Y, such as colours, to the queries.
+
+        Each query receives the mean of the values at the database rows, weighted with its shares.
 
         **Arguments:**
 
@@ -90,10 +94,9 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the database row with the largest share per area for each query, (m,).
+        """Returns, for each query, the index of the database row with the largest share per area, (m,).
 
-        The share of a row is divided by the area of the row. Otherwise the result would favour the larger of
-        two neighbouring vertices.
+        The shares are divided by the areas of the rows, because shares alone would favour rows of large area.
         """
         everywhere = jnp.where(self.database_areas > 0, self.potentials, -jnp.inf)
 
@@ -107,7 +110,7 @@ class SoftMap(eqx.Module):
 class SparseSoftMap(eqx.Module):
     """A soft map from m query points to n database points, with t database rows per query.
 
-    All other database rows have share zero. `NearestFew` returns such maps.
+    All other database rows have share zero. `NearestFew` computes such maps.
 
     **Attributes:**
 
@@ -119,7 +122,9 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Returns the mean of functions on Y, such as colours, weighted with the shares of each query.
+        """Transfers functions on Y, such as colours, to the queries.
+
+        Each query receives the mean of the values at the database rows, weighted with its shares.
 
         **Arguments:**
 
@@ -141,20 +146,19 @@ class SparseSoftMap(eqx.Module):
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the nearest database row of each query, (m,)."""
+        """Returns the index of the nearest database row of each query, (m,)."""
         return self.rows[:, 0]
 
 
 PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
-"""A map T: X -> Y: either one vertex of Y per vertex of X, an integer array (m,), or a soft map."""
+"""A map T: X -> Y: an integer array (m,) with one vertex of Y per vertex of X, or a soft map."""
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Returns functions on Y as functions on X, by a pointwise map or a soft map from X to Y.
+    """Transfers functions on Y to X along a pointwise map or a soft map from X to Y.
 
-    A pointwise map assigns to each vertex of X the value at its match. A soft map assigns the mean of the
-    values, weighted with the shares of the vertex. In matrix form the result is `P f`, but the matrix P (m,
-    n) is not stored.
+    With a pointwise map, each vertex of X receives the value at its match. With a soft map, it receives the
+    mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is stored.
 
     **Arguments:**
 
@@ -174,8 +178,10 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
 class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
-    This class is the abstract base class of recoveries, which `refine_softly` uses to compute soft maps from
-    functional maps. Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
+    This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
+    `refine_softly` or `WaveletPreservationLayer`. The queries are then the m vertices of X in the spectral
+    embedding, and the database rows are the n vertices of Y. Ready subclasses are `Softmax`, `NearestFew` and
+    `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
     The arguments are query points (m, d), database points (n, d), and the areas of both, (m,) and (n,). The
@@ -190,7 +196,7 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """Returns the soft map from the queries to the database. Database rows of zero area get no share.
+        """Returns the soft map from the queries to the database. Database rows of zero area have share zero.
 
         **Arguments:**
 
@@ -201,16 +207,21 @@ class Recovery(eqx.Module):
 
 
 class Softmax(Recovery):
-    """A recovery in which all database rows get shares, and nearer rows get larger shares.
+    """A recovery that gives shares to all database rows, and larger shares to nearer rows.
 
-    The share of a database row is proportional to its area times `exp(-distance² / temperature)`. Here
-    `distance` is the distance between the query and the row. The soft map is a `SoftMap`.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
+    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+
+    The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
+    `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
+    transfers functions (n, p) on Y to X (m, p).
 
     **Arguments:**
 
-    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
-      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
-      sharper maps.
+    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
+      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
+      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      maps.
 
     **Raises:** `ValueError` if the temperature is not a single positive, finite number.
     """
@@ -235,22 +246,28 @@ class Softmax(Recovery):
 
 
 class NearestFew(Recovery):
-    """A recovery like `Softmax`, in which only the nearest database rows of each query get shares.
+    """A recovery that gives shares only to the nearest database rows of each query.
 
-    The share of each of these rows is proportional to its area times `exp(-distance² / temperature)`. The
-    shares are differentiable, but derivatives treat the choice of the rows as constant. The soft map is a
-    `SparseSoftMap`. `NearestFew` is fast in float32. In float64, sorting takes most of the time on CPUs.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
+    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+
+    The share of each of these rows is proportional to its area times `exp(-distance² / temperature)`, where
+    `distance` is the distance between the query and the row. The shares are differentiable, but derivatives
+    treat the choice of the rows as constant. The result is a `SparseSoftMap`, whose attributes `rows` and
+    `shares` have shape (m, t), where t is the smaller of `number` and n. On CPUs, `NearestFew` is slow in
+    float64, because sorting then takes most of the time.
 
     **Arguments:**
 
     - `number`: the number of database rows per query, an integer of at least 1. If fewer rows have positive
-      area, the other shares are zero.
-    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
-      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
-      sharper maps.
+      area, the remaining shares are zero.
+    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
+      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
+      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      maps.
 
-    **Raises:** `ValueError` if the number is below 1, or if the temperature is not a single positive, finite
-    number.
+    **Raises:** `TypeError` if `number` is not an integer; `ValueError` if `number` is below 1, or if the
+    temperature is not a single positive, finite number.
     """
 
     number: int = eqx.field(static=True, default=10)
@@ -258,6 +275,7 @@ class NearestFew(Recovery):
 
     def __check_init__(self) -> None:
         check_between(self, "temperature", self.temperature)
+        check_kind("number", self.number, int, np.integer)
         if self.number < 1:
             raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
 
@@ -287,22 +305,28 @@ class NearestFew(Recovery):
 
 
 class Sinkhorn(Recovery):
-    """A recovery by entropy-regularised optimal transport, in which every row receives its own area.
+    """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
-    The function `sinkhorn` computes the shares. Together, the queries send to each database row as much area
-    as the row has, up to the tolerance. The soft map is a `SoftMap`.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
+    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+
+    The function `sinkhorn` computes the shares. The area that all queries together send to a database row
+    equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
+    functions (n, p) on Y to X (m, p). If the iterations end before they reach the tolerance, the result is
+    the map of the last iteration. No error is raised then, and `SoftMap.converged` is False.
 
     **Arguments:**
 
-    - `temperature`: a positive, finite number. An array is accepted if it has shape (). The unit is the mean
-      squared distance from queries to their nearest database rows; see `sinkhorn`. Lower temperatures give
-      sharper maps and need more iterations.
+    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
+      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
+      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      maps and need more iterations.
     - `iterations`: the largest number of iterations of `sinkhorn`, an integer of at least 1.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
 
-    **Raises:** `ValueError` if the temperature is not a single positive, finite number, `iterations` is below
-    1, or `tolerance` is not positive.
+    **Raises:** `TypeError` if `iterations` is not an integer; `ValueError` if the temperature is not a single
+    positive, finite number, `iterations` is below 1, or `tolerance` is not positive.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -311,6 +335,7 @@ class Sinkhorn(Recovery):
 
     def __check_init__(self) -> None:
         check_between(self, "temperature", self.temperature)
+        check_kind("iterations", self.iterations, int, np.integer)
         if self.iterations < 1 or not self.tolerance > 0:
             raise ValueError(
                 f"Sinkhorn needs at least 1 iteration and a positive tolerance, not {self.iterations} and "
@@ -346,36 +371,37 @@ def sinkhorn(
     iterations: int = 200,
     tolerance: float | Float[Array, ""] = 0.01,
 ) -> SoftMap:
-    """Returns the entropy-regularised optimal transport between two point sets, by Sinkhorn's iterations.
+    """Returns the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
 
-    Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS 2013. A transport plan
-    distributes the areas of the queries over the areas of the database rows. The returned plan minimises the
-    mean squared distance minus `temperature` times the entropy. Nearest-neighbour maps send many queries to
-    some rows and no query to other rows, but this plan gives every row as much area as it has.
+    The method is that of Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS
+    2013. A transport plan distributes the areas of the queries over the areas of the database rows. The
+    returned plan minimises the mean squared distance minus `temperature` times the entropy of the plan. A
+    nearest-neighbour map can send many queries to one row and no query to another row. The returned plan
+    instead sends to every row an area equal to the row's own area.
 
     The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
     distances in blocks of queries, so no array of size m x n is stored. Derivatives are computed through all
-    iterations, also without such an array.
+    iterations, and this computation stores no such array either.
 
     **Arguments:**
 
     - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
     - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. The areas of each
-      point set are scaled to sum 1. Points of zero area neither give nor receive area, and do not affect
+      point set are scaled to sum 1. Points of zero area send no area, receive no area, and do not affect
       other points.
     - `temperature`: a positive number, or a positive array of shape (). Its unit is the area-weighted mean
       squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
       area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
-      temperatures give sharper maps and need more iterations. A temperature below the rounding error of
-      squared distances, eps times the variance, is raised to this error and has derivative zero. A
-      temperature that is not positive makes the result NaN.
+      temperatures give sharper maps and need more iterations. The rounding error of squared distances is eps
+      times the variance. A temperature below this error is raised to this error, and derivatives with respect
+      to the temperature are then zero. If the temperature is not positive, the result is NaN.
     - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
-      are skipped. Under `vmap` they run but change nothing.
+      are skipped. Under `jax.vmap`, they run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
 
-    **Returns:** A `SoftMap` from the queries to the database. Results that are not finite and missing
-    convergence raise no error, so check the attribute `converged` of the map.
+    **Returns:** A `SoftMap` from the queries to the database. If the iterations do not converge, or if the
+    result is not finite, no error is raised, but the attribute `converged` of the map is False.
 
     **Raises:** `ValueError` if `iterations` is below 1.
     """
@@ -420,8 +446,8 @@ def _sinkhorn_potentials(
             return arrived + product(jax.nn.softmax(log_shares, axis=0), block[1]), None
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
-        # The area that arrives at a row can underflow to zero. With this lower limit, the potential of the
-        # row then rises over several iterations.
+        # The area that arrives at a row can underflow to zero. This lower limit keeps the correction finite,
+        # so the potential of the row rises over several iterations.
         least = jnp.finfo(dtype).tiny
         correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2
@@ -450,7 +476,7 @@ def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Returns `-distance² / temperature`, apart from a constant for each query.
+    """Returns `-distance² / temperature` up to an additive constant for each query.
 
     The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
     at once. This layout halves the time.
@@ -459,9 +485,9 @@ def _log_kernel(
 
 
 class _Transport(NamedTuple):
-    """Two point sets with areas, and a temperature, in the form that all recoveries use.
+    """Two point sets with areas, and a temperature, scaled for all recoveries.
 
-    The origin of the points is near their centre. The areas of each point set sum to 1. The temperature is in
+    The origin is the centre of the database. The areas of each point set sum to 1. The temperature is in
     squared units of the points.
     """
 
@@ -493,8 +519,8 @@ def _normalized(
     """Returns the `_Transport` between two point sets, from a temperature in the unit of `sinkhorn`.
 
     The centre of the database becomes the origin, because rounding would falsify distances between points far
-    from the origin. A training step can produce a temperature that is not positive. Such a temperature
-    becomes NaN and makes the result NaN. A temperature below the rounding error of squared distances is
+    from the origin. A training step can produce a temperature that is not positive. Such a temperature is
+    replaced by NaN, so all results are NaN. A temperature below the rounding error of squared distances is
     raised to this error. A lower temperature would give exponents that consist of rounding errors, and
     derivatives that overflow.
     """

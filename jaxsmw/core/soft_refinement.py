@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""One iteration: a function from a functional map to the next functional map and a member of `RESULTS`."""
+"""A function that takes a functional map to the functional map of the next iteration and a status code."""
 
 
 class SoftRefinement(eqx.Module):
@@ -30,11 +30,15 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: the final functional map C (k_out, k_in). C is a pullback (k_X, k_Y) or a pushforward
-      (k_Y, k_X), depending on the refiner.
-    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C.
-    - `result`: a member of `RESULTS`. Compare it with `RESULTS.successful`; `RESULTS[result]` explains it in
-      words.
+    - `functional_map`: the final functional map C (k_out, k_in). C is a pullback (k_X, k_Y), which takes
+      functions on Y to functions on X, unless the refiner's `convention` is `"pushforward"`. A pushforward
+      (k_Y, k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless
+      numbers.
+    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C. Its
+      `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()` returns an integer
+      array (m,).
+    - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
+      `RESULTS[result]` is a sentence that explains the status.
     - `iterations`: the number of functional maps that were computed after the first functional map.
     - `change`: the Frobenius norm of the change of C in the last iteration, divided by the Frobenius norm of
       C. The change is 0 at a fixed point.
@@ -63,8 +67,9 @@ def refine_softly(
     """Refines a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
 
     The outcome is differentiable with respect to the spectra, the parameters of the filter bank, the weights
-    and descriptors of the solution, and the temperature. If the initial map is a soft map, the outcome is
-    also differentiable with respect to this map. No array of size m x n is stored, not even for derivatives.
+    and descriptors of the solution, and the temperature of the recovery. If the initial map is a soft map,
+    the outcome is also differentiable with respect to this map. No array of size m x n is stored, not even
+    for derivatives.
 
     **Arguments:**
 
@@ -74,25 +79,26 @@ def refine_softly(
     - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. Its attribute
       `search` has no effect.
     - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
-      `Sinkhorn()`. With lower temperatures, the results are closer to the results of `jaxsmw.refine`. The
-      derivatives are then larger and less informative.
+      `Sinkhorn()`. At lower temperatures, the results are closer to the results of `jaxsmw.refine`, but the
+      derivatives are larger and less informative.
     - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
       With `"implicit"`, this is the largest number of these maps.
     - `differentiation`: how derivatives are computed.
         - `"unrolled"`: automatic differentiation through all iterations.
         - `"checkpointed"` (the default): the same derivatives with less memory. The backward pass computes
-          the intermediate values of each iteration again.
+          the intermediate values of each iteration again instead of storing them.
         - `"implicit"`: the iterations run up to a fixed point C = F(C, θ), where F is one iteration and θ are
           its parameters. The derivatives follow from the implicit function theorem: `dC = (I - dF/dC)^-1
-          dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the linear system with
-          derivatives of one iteration. The memory does not grow with the number of iterations. The outcome
-          has no derivative with respect to the initial map.
-    - `tolerance`: a positive number, which only `"implicit"` uses. It is the tolerance of the fixed point,
-      relative to the largest entry of the first C, and also the tolerance of GMRES.
+          dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the linear system of this
+          formula, which contains only derivatives of one iteration. The memory does not grow with the number
+          of iterations. The outcome has no derivative with respect to the initial map.
+    - `tolerance`: a positive number, which only `"implicit"` uses. It limits the error of the fixed point
+      relative to the largest entry of the first functional map, and it is also the tolerance of GMRES.
 
-    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in) and `soft_map`.
-    Numerical failures raise no error, so compare its attribute `result` with `RESULTS.successful`. If
-    `"implicit"` has too few `iterations`, `result` is `RESULTS.fixed_point_not_reached`.
+    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map` (a
+    soft map from X to Y) and `result`. Numerical failures raise no error, so compare `result` with
+    `RESULTS.successful`. If `"implicit"` has too few `iterations`, `result` is
+    `RESULTS.fixed_point_not_reached`.
 
     **Raises:** `ValueError` if `iterations` is below 1, `tolerance` is not positive, `differentiation` is
     unknown, the initial map has the wrong size, or the spectra have different float types. `TypeError` if an
@@ -161,26 +167,35 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
 class WaveletPreservationLayer(eqx.Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
-    The layer computes a soft map from the distances between the features. Then it refines this soft map by
-    `refine_softly`. Call the layer with features (m, d) and (n, d) and with two spectra. The layer returns a
-    `SoftRefinement`, which contains a functional map and a soft map.
+    `layer(features_x, features_y, spectrum_x, spectrum_y)` computes a soft map from the distances between the
+    features of X (m, d) and the features of Y (n, d). It refines this soft map by `refine_softly` and returns
+    a `SoftRefinement`. The attribute `soft_map` of the result is a soft map from X to Y. The attribute
+    `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions on X, unless the
+    refiner's `convention` is `"pushforward"`.
 
-    As in any equinox module, the parameters of the layer are the leaves of its modules. Train all parameters,
-    or freeze some of them with `equinox.partition`. The layer is a pure function of arrays, so flax and haiku
-    models can use it as well.
+    The layer is an equinox module. Its trainable parameters are its array leaves, such as the parameters of
+    the filter bank and the temperatures of both recoveries. Train all parameters, or freeze some of them with
+    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can also use it.
 
     **Arguments:**
 
     - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps.
     - `recovery_of_features`: the `Recovery` that computes the initial soft map from the features:
-      `Softmax()`, `NearestFew()` or `Sinkhorn()`.
-    - `recovery`: the `Recovery` that computes soft maps from functional maps. It accepts the same classes.
+      `Softmax()`, `NearestFew()` or `Sinkhorn()`. The default is `Softmax()`, with temperature 0.1.
+    - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
+      `Sinkhorn()`. The default is `Softmax()`, with temperature 0.1.
     - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
       With `"implicit"`, this is the largest number of these maps.
-    - `differentiation`: how derivatives are computed, `"unrolled"`, `"checkpointed"` or `"implicit"`; see
-      `refine_softly`.
-    - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES with `"implicit"`. The
-      other ways to compute derivatives do not use it.
+    - `differentiation`: how derivatives are computed. `"unrolled"` differentiates through all iterations.
+      `"checkpointed"` (the default) gives the same derivatives with less memory. `"implicit"` iterates up to
+      a fixed point and uses the implicit function theorem.
+    - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES. Only `"implicit"` uses
+      it.
+
+    **Raises:** The constructor raises `TypeError` if `recovery_of_features` is not a `Recovery`. A call raises
+    `ValueError` if the features have wrong shapes, `iterations` is below 1, `tolerance` is not positive or
+    `differentiation` is unknown. A call raises `TypeError` if `refiner` is not a `WaveletPreservation` or
+    `recovery` is not a `Recovery`.
     """
 
     refiner: WaveletPreservation = WaveletPreservation()
@@ -189,6 +204,9 @@ class WaveletPreservationLayer(eqx.Module):
     iterations: int = eqx.field(static=True, default=2)
     differentiation: Differentiation = eqx.field(static=True, default="checkpointed")
     tolerance: float = eqx.field(static=True, default=1e-4)
+
+    def __check_init__(self) -> None:
+        check_kind("recovery of features", self.recovery_of_features, Recovery)
 
     def __call__(
         self,
@@ -205,7 +223,8 @@ class WaveletPreservationLayer(eqx.Module):
           Corresponding vertices should be close to each other in feature space.
         - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
 
-        **Returns:** The `SoftRefinement` that `refine_softly` returns.
+        **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map`
+        (a soft map from X to Y) and `result`.
 
         **Raises:** `ValueError` if the features do not have one row per vertex, or if X and Y have different
         numbers of features. The layer also raises the errors of `refine_softly`.
@@ -234,7 +253,7 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
 
 
 class _Loop(NamedTuple):
-    """The final functional map, its change in the last iteration, the result, and the iteration count."""
+    """The final functional map, its last change, the status code, and the number of iterations."""
 
     functional_map: Float[Array, "k_out k_in"]
     last_change: Float[Array, "k_out k_in"]
@@ -258,7 +277,7 @@ def _through_iterations(
 
 
 class _State(NamedTuple):
-    """The previous and the current functional map, and the first failure so far."""
+    """The previous and the current functional map, and the status code of the first failure, if any."""
 
     previous: Float[Array, "k_out k_in"]
     functional_map: Float[Array, "k_out k_in"]
@@ -268,10 +287,10 @@ class _State(NamedTuple):
 def _to_the_fixed_point(
     step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
 ) -> _Loop:
-    """Iterates up to the fixed point. Derivatives follow from the implicit function theorem."""
+    """Iterates up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # The solver of the fixed point reports neither the result of an update nor the last change of the
-    # functional map. One more iteration gives this result and this change.
+    # The solver of the fixed point returns neither the status code of an update nor the last change of the
+    # functional map. One more iteration gives both.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)

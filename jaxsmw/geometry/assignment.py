@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.errors import InputError
 
-# The largest allowed number of distances, which take 3 GiB. A problem of this size takes 15 minutes.
+# The largest allowed number of distances. They take 3 GiB of memory, and the computation takes 15 minutes.
 _LARGEST = 20_000**2
 
 
@@ -20,20 +20,20 @@ def one_to_one_map(
 ) -> Int64[np.ndarray, " m"]:
     """Compute the one-to-one map X -> Y with the least sum of squared distances between matched points.
 
-    Each vertex of X gets a different vertex of Y. SciPy computes the exact optimum by shortest augmenting
-    paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). All distances between points
-    of X and of Y are stored in float64. For two real bodies of 5000 vertices, the computation takes 15
-    seconds and 0.7 GiB. The time grows with the third power of the number of vertices.
+    Each vertex of X is matched to a different vertex of Y. SciPy computes the exact optimum by shortest
+    augmenting paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). All distances
+    between points of X and of Y are stored in float64. For two real bodies of 5000 vertices, the computation
+    takes 15 seconds and 0.7 GiB. The time grows with the third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
-    triangulation. On other shapes, the areas of corresponding vertices differ, and a vertex whose best match
-    is already taken gets a distant match. On pairs of the remeshed FAUST data set, the restriction to
-    one-to-one maps increases the mean geodesic error from 0.022 to 0.062.
+    triangulation. On other shapes, the best match of a vertex is often already taken, and the vertex is
+    assigned a distant match instead. On pairs of the remeshed FAUST data set, the restriction to one-to-one
+    maps increases the mean geodesic error from 0.022 to 0.062.
 
     **Arguments:**
 
     - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex of X and of Y, in
-      the same unit. Points of matching vertices should be close to each other.
+      the same unit. The points of a vertex and of its match should be close to each other.
     - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. None, the
       default, matches all vertices.
 
@@ -85,11 +85,11 @@ def check_one_to_one(vertices_x: int, vertices_y: int) -> None:
     if vertices_x > vertices_y:
         raise InputError(
             f"the {vertices_x} vertices of the source cannot be matched one to one to the {vertices_y} of "
-            "the target: swap the meshes."
+            "the target, because the target has fewer vertices: swap the meshes."
         )
     if vertices_x * vertices_y > _LARGEST:
         raise InputError(
             f"a one-to-one map from {vertices_x} to {vertices_y} vertices would take "
-            f"{vertices_x * vertices_y * 8 >> 30} GiB of memory and hours: decimate the meshes to 20000 "
-            "vertices."
+            f"{vertices_x * vertices_y * 8 >> 30} GiB of memory and hours of computation: "
+            "decimate the meshes to 20000 vertices."
         )

@@ -45,10 +45,10 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     The method follows Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and
     fourth order elliptic problems", Computing 1996.
 
-    In contrast to that method, a single coarsening step suffices for cells of any size. The indicator
-    functions are smoothed by a Chebyshev polynomial, whose degree is 1.5 times the radius of the cells in
-    edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of the
-    eigenvalues are ten times as large.)
+    Unlike the method of that paper, this function needs only a single coarsening step for cells of any size.
+    The indicator functions are smoothed by a Chebyshev polynomial, whose degree is 1.5 times the radius of
+    the cells in edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of
+    the eigenvalues are ten times as large.)
 
     **Arguments:**
 
@@ -60,8 +60,8 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     **Returns:** The projected eigenproblem as a `Coarsening`.
 
     **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbours that
-    the smoothed indicator functions would overlap everywhere, or if large cells cover more than 10 % of the
-    area.
+    the smoothed indicator functions would overlap everywhere, or if cells with more than four times the mean
+    area of a cell cover more than 10 % of the surface.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:

@@ -2,8 +2,8 @@
 
 A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. The surface is exactly
 mirror symmetric in the rest pose. Marching cubes, decimation and relaxation on the surface give well-shaped
-triangles. The joints move each point by a smooth function of the point's position in the rest pose. So two
-triangulations of one creature in two poses are samples of two smooth surfaces. Points of these surfaces
+triangles. The joints move each point by a smooth function of the point's position in the rest pose. Therefore
+the triangulations of one creature in two poses approximate two smooth surfaces. Two points of these surfaces
 correspond if they have the same position in the rest pose.
 """
 
@@ -34,15 +34,16 @@ _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class CreaturePair:
-    """Two meshes of one creature in two poses, with the ground truth. The triangulations are independent.
+    """Two meshes of one synthetic creature in two poses, with the exact ground truth.
 
-    `creature_pair` makes such pairs.
+    The two meshes are triangulated independently. `creature_pair` makes a `CreaturePair`.
 
     **Attributes:**
 
     - `source`: the source, a `Mesh` with m vertices.
     - `target`: the target, a `Mesh` with n vertices.
     - `truth`: the ground truth as m `SurfacePoints` on the target, one for each source vertex.
+    - `true_map`: the ground truth as a pointwise map (m,), int64, 0-based target vertices.
     """
 
     source: Mesh
@@ -53,8 +54,8 @@ class CreaturePair:
     def true_map(self) -> Int64[np.ndarray, " m"]:
         """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
 
-        The match of a source vertex is a corner of the triangle that contains the true point. The corner
-        nearest to the true point is chosen.
+        The match of a source vertex is the corner nearest to the true point, among the corners of the
+        triangle that contains the true point.
         """
         return self.truth.nearest_corners(self.target)
 
@@ -112,15 +113,14 @@ class _Body:
 
     The x axis points to the body's left, the y axis up and the z axis forward. Parts away from the plane
     x = 0 are added on both sides, and their joints are called left_… and right_…. A smooth random function of
-    position warps all proportions. Because the function is smooth, eyes stay in the head and toes stay on the
-    feet.
+    position warps all proportions.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
         self.joints: dict[str, int] = {}
         self.parents: list[int] = []
         self._pivots: list[np.ndarray] = []
-        self._guides: list[tuple[int, np.ndarray]] = []  # joints, each with two balls whose hull it moves
+        self._guides: list[tuple[int, np.ndarray]] = []  # each joint with the two balls whose hull it moves
         self._tubes: list[_Tube] = []
         self._scale = np.exp(0.05 * random.normal(size=4))
         self._frequencies = 1.5 * random.normal(size=(3, 4))
@@ -149,10 +149,10 @@ class _Body:
         thickness: float = 0.0,
         joint: str = "",
     ) -> None:
-        """Add a tube or a plate through the balls to the body, or carve it out of the body.
+        """Add a tube or a plate to the body, or carve a tube out of the body.
 
-        `joint` is the name of the joint that moves the tube. The name of the joint is needed only for a tube
-        that projects far from the body.
+        `balls` lists the balls of the tube's chain. `joint` is the name of the joint that moves the tube. The
+        name is needed only for a tube that projects far from the body.
         """
         chain = self._individual(balls)
         if joint:
@@ -226,10 +226,10 @@ class _Body:
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
         """Return the rotation vectors (j, 3) of the joints in radians, with small random changes.
 
-        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. For
-        the joint of the head, positive angles turn the nose down, turn the nose to the left, and raise the
-        left side. If the name of a joint lacks `left_` or `right_`, the rotation applies to the joints on
-        both sides and is mirrored on the right side.
+        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. At
+        the joint of the head, a positive x angle turns the nose down, a positive y angle turns the nose to
+        the left, and a positive z angle raises the left side. If the name of a joint lacks `left_` or
+        `right_`, the rotation applies to the joints on both sides and is mirrored on the right side.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -536,7 +536,7 @@ def _dragon(body: _Body) -> None:
     limb("wrist", "elbow", ".22 .075 .17 .065, .22 .065 .26 .06", blend=0.05)
     limb("hip knee", "hips", ".15 .52 -.36 .155, .24 .32 -.26 .115, .22 .09 -.42 .065", blend=0.06)
     limb("foot", "knee", ".22 .075 -.4 .065, .22 .065 -.29 .065", blend=0.05)
-    for z in (0.26, -0.3):  # claws, of which the inner claw turns inward, and a spur on the outer side
+    for z in (0.26, -0.3):  # claws, and a spur on the outer side of the foot; the inner claw turns inward
         add(f".17 .06 {z - 0.05} .04, .12 .035 {z - 0.01} .026", blend=0.02)
         add(f".2 .055 {z} .042, .187 .03 {z + 0.085} .026", blend=0.02)
         add(f".265 .055 {z} .042, .29 .03 {z + 0.07} .026", blend=0.02)
@@ -584,7 +584,7 @@ _KINDS: dict[str, tuple[Callable[[_Body], None], dict[str, str]]] = {
 }
 
 CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_, poses) in _KINDS.items()}
-"""The kinds of creatures, each with the names of its poses."""
+"""A dictionary from each kind of creature to the names of its poses."""
 
 
 # ------------------------------------------------------------------------------------------ public functions
@@ -609,7 +609,7 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
     creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
-    whose body intersects itself. Such seeds are rare, and none of the seeds below 250 is such a seed.
+    whose body intersects itself. Such seeds are rare, and no seed below 250 is among them.
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:

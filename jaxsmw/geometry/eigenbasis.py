@@ -27,8 +27,8 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The shift for ARPACK, for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is between
 # 1 and 30.
 _SHIFT = -1e-2
-# In an accurate eigenbasis, the residuals relative to the largest eigenvalue and the entries of
-# |Phi^T A Phi - I| do not exceed these tolerances.
+# An eigenbasis is accurate if its residuals, relative to the largest eigenvalue, and the entries of |Phi^T A
+# Phi - I| do not exceed these tolerances.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
@@ -53,10 +53,10 @@ def compute_spectrum(
     orthonormality are checked. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
-    (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal up to rounding. The time
-    is nearly proportional to the number of vertices. The approximate solver requires triangles of similar
-    size and shape. If the triangles are too different, the function warns and uses the exact solver. Results
-    are cached on disk (`jaxsmw.runtime.cache`).
+    (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal, up to rounding errors.
+    The time of the approximate solver is nearly proportional to the number of vertices. The approximate
+    solver requires triangles of similar size and shape. If the triangles differ too much, the function issues
+    a `RuntimeWarning` and uses the exact solver. Results are cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -93,8 +93,7 @@ def as_spectrum(
 ) -> Spectrum:
     """Return the `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type.
 
-    The function adds positions, relative to the centroid and in units in which the area is 1, and outward
-    normals.
+    The function adds outward normals, and positions relative to the centroid in units in which the area is 1.
 
     **Arguments:**
 
@@ -154,7 +153,8 @@ def eigenpairs(
             local = stiffness[referenced][:, referenced], areas[referenced]
         with one_blas_thread():
             values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
-        # Signs are changed in place, because a further copy could fill the memory for a large mesh.
+        # Signs are changed in place, because another copy of the eigenvectors of a large mesh may not fit
+        # into memory.
         for column in vectors.T:
             column *= np.sign(column[np.argmax(np.abs(column))])
         if not all_referenced:
@@ -169,9 +169,10 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """Choose the eigensolver that the setting `"auto"` means for meshes whose spectra will be compared.
+    """Choose the eigensolver for the setting `"auto"`, for meshes whose spectra will be compared.
 
-    All meshes get the same eigensolver, which depends on the mesh with the most vertices.
+    The same eigensolver is used for all meshes. The choice depends on the mesh with the most referenced
+    vertices.
 
     **Returns:** `"approximate"` if a mesh has 50 000 referenced vertices or more, else `"exact"`.
     """
@@ -182,7 +183,7 @@ def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
 def _solve(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k smallest eigenpairs of all connected components together."""
+    """Return the k smallest eigenpairs of a mesh that may have several connected components."""
     number_of_components, component = connected_components(stiffness, directed=False)
     if number_of_components == 1:
         return _solve_component(stiffness, areas, k, eigensolver, name)
@@ -210,9 +211,9 @@ def _solve_component(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the k smallest eigenpairs of one connected component, after checks of their accuracy."""
     n = len(areas)
-    # Renumbering stores neighbouring vertices close to each other, which suits the processor's cache. Without
-    # renumbering, the ordering that keeps factors sparse would be several times worse for some meshes, such
-    # as subdivided meshes.
+    # Renumbering stores neighbouring vertices close to each other, which suits the processor's cache. For
+    # some meshes, such as subdivided meshes, the fill-reducing ordering of the factorization would be several
+    # times worse without renumbering.
     order = reverse_cuthill_mckee(stiffness, symmetric_mode=True)
     stiffness, areas = stiffness[order][:, order], areas[order]
     mass = sp.diags(areas).tocsc()
@@ -276,8 +277,8 @@ def _number_below(factors: SuperLU) -> int:
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
     """Return a shift in the middle of the first k eigenvalues, and the factors of W - shift A.
 
-    The first shift comes from Weyl's law, by which k/2 eigenvalues should be smaller than the shift. If this
-    prediction is wrong, as on a thin tube, the true number of smaller eigenvalues leads to a better shift.
+    By Weyl's law, about k/2 eigenvalues are below the first trial shift. If this prediction is wrong, as on a
+    thin tube, the next trial shift is computed from the true number of eigenvalues below the previous shift.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -291,7 +292,7 @@ def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) ->
 
 
 def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.ndarray) -> bool:
-    """Return whether eigenvalues are missing that are smaller than the largest given eigenvalue.
+    """Return whether the given eigenvalues lack an eigenvalue below the largest given eigenvalue.
 
     Missing copies of the largest given eigenvalue are not detected.
     """
@@ -310,9 +311,10 @@ def _lanczos(
     spectrum of the inverse. Therefore two products with the inverse per eigenpair suffice. Keeping every
     vector A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
 
-    Blocks of b vectors find at most b copies of a multiple eigenvalue. Therefore the eigenvalues are counted.
-    If some eigenvalues are missing, the method is repeated with larger blocks. An eigenpair has converged
-    when its residual for the inverse, relative to the inverse's eigenvalue, is at most the tolerance.
+    Blocks of b vectors find at most b copies of a multiple eigenvalue. Therefore the number of eigenvalues is
+    checked. If some eigenvalues are missing, the method is repeated with larger blocks. An eigenpair has
+    converged when its residual for the inverse, relative to the inverse's eigenvalue, is at most the
+    tolerance.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """
@@ -350,8 +352,9 @@ def _converged(
     vectors = np.empty((2 * k + 100 + size, n))
     # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
-    # The initial block is smoothed, because eigenvectors are smooth combinations of the vectors. Rounding
-    # errors in the weights of rough vectors would affect the derivatives of the eigenvectors.
+    # The initial block is smoothed, because the eigenvectors are computed as linear combinations of the block
+    # vectors. With rough vectors, rounding errors in the weights would affect the derivatives of the
+    # eigenvectors.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -432,9 +435,9 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     few more than k eigenvectors are computed, because the last eigenvectors of a subspace are the least
     accurate.
 
-    **Raises:** `RuntimeError` if the subspace is too small, or if one more smoothing step would lower
-    eigenvalues considerably. (Missing eigenvalues are not detected, because a count of eigenvalues requires
-    the factors of W - shift A.)
+    **Raises:** `RuntimeError` if the subspace is too small, or if one more smoothing step would lower an
+    eigenvalue by more than 1.5 %. (Missing eigenvalues are not detected, because a count of eigenvalues
+    requires the factors of W - shift A.)
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -475,7 +478,7 @@ _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Return slices of at most 32 columns. A copy of more columns at a time may not fit into the memory."""
+    """Return slices of at most 32 columns. Copies of more columns may not fit into memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
@@ -496,6 +499,5 @@ def _check(
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
         # Unlike `max`, `np.maximum` returns NaN if one of the numbers is NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # The divisor is at least 1, because zero may be the only eigenvalue. A value of 1 suits a surface of
-    # area 1.
+    # The divisor is at least 1, because zero may be the only eigenvalue.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

@@ -1,14 +1,14 @@
 """Geodesic distances on piecewise flat surfaces, accurate even for short distances.
 
-Evaluation measures the distance between a match and the true point, which is short for good matches. For
-short distances the heat method has errors of several percent. Exact window propagation takes about 100 times
-as long as the method of this module.
+Evaluation measures the distance between each match and the true point, which is short if the match is good.
+For short distances, the heat method has errors of several percent. Exact window propagation takes about 100
+times as long as the method of this module.
 
-The method is Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of triangles around each
-vertex are unfolded into the plane. If a straight line within a strip leads from one vertex to another, the
-graph connects these vertices by an edge with the exact length of the line. Paths in this graph are paths on
-the surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03 to
-0.07 % on average.
+This module runs Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of triangles around
+each vertex are unfolded into the plane. If a straight line within a strip leads from one vertex to another,
+the graph connects these vertices by an edge with the exact length of the line. Paths in this graph are paths
+on the surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03
+to 0.07 % on average.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ _DEPTH = 10
 # together. With these numbers, the arrays fit into the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
-# The search for partners covers these radii one after the other, and finally the whole surface. The radii are
-# in units of the square root of the area. Each search takes a small fraction of the time of the next search.
+# `geodesic_distances_between` searches within these radii one after the other, and finally on the whole
+# surface. The radii are in units of the square root of the area. Each search takes a small fraction of the
+# time of the next search.
 _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
@@ -49,15 +50,16 @@ _EXACT_HEIGHT = 1e-6
 class SurfacePoints:
     """Points on the faces of a mesh, given by barycentric weights.
 
-    For an array `rows` of integers, `points[rows]` contains only the points with these numbers, and
-    `len(points)` is the number p of points. The class itself checks nothing. Functions that receive surface
-    points check the points.
+    `len(points)` is the number p of points. For an integer array `rows`, `points[rows]` contains only the
+    points with these 0-based numbers. The method `positions(mesh)` returns the positions (p, 3) of the
+    points, and `nearest_corners(mesh)` returns vertices (p,). The constructor checks nothing. Functions that
+    receive `SurfacePoints` check them.
 
     **Attributes:**
 
-    - `faces`: the face of each point, as indices (p,) into `Mesh.faces`.
-    - `weights`: the barycentric weights (p, 3) of the three corners of the face, in the order of the corners.
-      Weights are not negative, and each row sums to 1.
+    - `faces`: the face of each point, as 0-based indices (p,) into `Mesh.faces`, int64.
+    - `weights`: the barycentric weights (p, 3) of the three corners of the face, in the order of the corners,
+      float64. Weights are not negative, and each row sums to 1.
     """
 
     faces: Int64[np.ndarray, " p"]
@@ -84,9 +86,9 @@ class _Sides(NamedTuple):
     """The 6 f sides of all triangles and of their mirror images.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. When a line crosses from one face into
-    another face, the side by which the line leaves has the opposite direction of the side by which it enters.
-    This rule holds for any orientation of the faces, and for any number of faces at an edge.
+    images: the faces 0 … f - 1 with reversed order of corners. When a line crosses from one face into another
+    face, the side by which the line leaves has the opposite direction to the side by which it enters. This
+    rule holds for any orientation of the faces, and for any number of faces at an edge.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -156,7 +158,7 @@ def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Return for each beam whether one of its lines reaches a position in the triangle that it enters."""
+    """Return for each beam whether one of its lines reaches a position in the triangle just entered."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -222,7 +224,7 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """Return the lengths of lines as a square matrix.
+    """Return a square sparse matrix with the length of the line between each pair of connected nodes.
 
     If several lines connect the same nodes, the matrix contains the length of the shortest line.
     """
@@ -293,8 +295,8 @@ def geodesic_distances(
         times n numbers, so divide very many sources into several calls. For distances between given pairs of
         points, use `geodesic_distances_between`.
     - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
-        lines across faces. On bodies, distances by `"strips"` are too long by 0.03 to 0.07 % on average.
-        `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl).
+        lines across faces. On bodies, distances computed with `"strips"` are too long by 0.03 to 0.07 % on
+        average. `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl).
         `"exact"` works only between vertices of manifold meshes, and takes about 100 times as long as
         `"strips"`.
     - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
@@ -333,11 +335,12 @@ def geodesic_distances_between(
     *,
     method: GeodesicMethod = "strips",
 ) -> Float64[np.ndarray, " p"]:
-    """Compute the geodesic distance between each point and its partner.
+    """Compute the geodesic distance between the two points of each of p pairs.
 
-    The search starts from `points` or from `partners`, whichever has fewer distinct points. The radius of the
-    search grows in steps. If each point is close to its partner, as a good match is close to the true point,
-    the search takes a fraction of the time of all distances. The search never stores p times n numbers.
+    The partner of `points[i]` is `partners[i]`. The search starts from `points` or from `partners`, whichever
+    has fewer distinct points. The radius of the search grows in steps. If the two points of each pair are
+    close together, the function is much faster than a computation of all distances. The function never stores
+    p times n numbers.
 
     **Arguments:**
 
@@ -402,7 +405,7 @@ def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray
 def _straight_distances(
     mesh: Mesh, points: SurfacePoints, partners: SurfacePoints
 ) -> Float64[np.ndarray, " p"]:
-    """Return the length of the straight line from each point to its partner, or inf without such a line."""
+    """Return the length of the straight line from each point to its partner; inf where none exists."""
     lengths = np.linalg.norm(points.positions(mesh) - partners.positions(mesh), axis=1)
     lengths[points.faces != partners.faces] = np.inf
     sides = _sides(mesh)
@@ -461,8 +464,8 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
     """Return a function that computes exact distances from a source vertex to target vertices.
 
     **Raises:** `InputError` for meshes that libigl cannot handle. libigl crashes at edges with three faces,
-    and stops early at vertices that join several fans of faces. On slivers, libigl does not terminate.
-    (libigl also does not terminate on meshes in very small units, so the mesh is scaled to area 1 first.)
+    stops early at vertices that join several fans of faces, and does not terminate on slivers. (libigl also
+    does not terminate on meshes in very small units, so the mesh is scaled to area 1 first.)
     """
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)

@@ -16,7 +16,7 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
-    """Choose the Laplacian that the setting `"auto"` means for a mesh.
+    """Choose the Laplacian of a mesh for the setting `"auto"`.
 
     **Returns:** `"robust"` if a triangle is degenerate or an edge has more than two faces, else
     `"cotangent"`.

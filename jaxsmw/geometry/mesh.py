@@ -21,18 +21,18 @@ from jaxsmw.errors import InputError
 # because the other libraries are not imported.
 MeshLike: TypeAlias = Any
 
-# A triangle whose height is at most this fraction of its longest edge is degenerate. The fraction is far
-# above the rounding errors of a mesh whose distance from the origin is a few times its extent. The fraction
-# is far below the relative height of any intended triangle.
+# A triangle whose height is at most this fraction of its longest edge is degenerate. This fraction is far
+# above the rounding errors of a mesh near the origin, and far below the relative height of any intended
+# triangle.
 DEGENERATE_HEIGHT = 1e-10
 
 # The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit.
 # Within the limits, squares of areas, which occur in descriptors, neither overflow nor underflow.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
-# The limits for distances of vertices, in units of the median edge length. At `LARGEST_COORDINATE` from the
-# origin, float64 rounds positions by 1e-4 edge lengths. At `LARGEST_DISTANCE` from the middle of a mesh,
-# float32 rounds positions by 0.1 edge lengths. Maps are refined in float32. (The meshes of the data sets
-# extend to 1e4 edge lengths.)
+# The limits for the distances of vertices from the origin and from the middle of the mesh, in units of the
+# median edge length. At `LARGEST_COORDINATE` from the origin, float64 rounds positions by 1e-4 edge lengths.
+# At `LARGEST_DISTANCE` from the middle of a mesh, float32 rounds positions by 0.1 edge lengths. Maps are
+# refined in float32. (The meshes of the data sets extend up to 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
@@ -43,15 +43,17 @@ class Mesh:
     Vertex i of the mesh is always vertex i of the file, because cleaning drops only faces. A vertex without
     faces keeps its position and its number, and its entry in `referenced_vertices` is False.
 
-    Use `read_mesh` or `make_mesh` to get a `Mesh`. These functions check and clean their input; the
-    constructor of the class does not.
+    Use `read_mesh` or `make_mesh` to make a `Mesh`. These functions check and clean their input; the
+    constructor of the class does not. Properties such as `area`, `vertex_areas` (n,), `vertex_normals` (n, 3)
+    and `edges` (e, 2) are computed when they are first used.
 
     **Attributes:**
 
     - `vertices`: positions (n, 3), float64, in the unit of the file.
     - `faces`: vertex indices (f, 3), int64, 0-based.
     - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
-    - `notes`: sentences that report the changes by cleaning and the peculiarities of the mesh.
+    - `notes`: a tuple of sentences about changes by cleaning, and about peculiarities of the mesh such as
+      unreferenced vertices.
     - `dropped_faces`: the 0-based numbers (d,), ascending, of the faces in the file that cleaning dropped.
       Other files that refer to faces by number count the dropped faces too.
     """
@@ -107,7 +109,7 @@ class Mesh:
 
     @cached_property
     def is_inside_out(self) -> bool:
-        """Whether the normals point inward, so the faces enclose a negative volume with the centroid."""
+        """Whether the normals point inward, which makes the enclosed signed volume negative."""
         corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
@@ -159,8 +161,8 @@ class Mesh:
     def _edge_table(self) -> _EdgeTable:
         """The edges, the number of faces at each edge, and the balance of each edge.
 
-        The balance is the sum of 1 or -1 for each face, depending on the direction in which the face
-        traverses the edge.
+        The balance of an edge is the sum of 1 or -1 for each of its faces, depending on the direction in
+        which the face traverses the edge.
         """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
@@ -181,10 +183,10 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The numbers of all unusual elements of a mesh, such as boundary edges.
+    """The result of `diagnose`: the numbers of all unusual elements of a mesh, such as boundary edges.
 
-    An unusual element is not an error. `str` of a `Diagnosis` explains the numbers in sentences, one per
-    line.
+    An unusual element is not necessarily an error. `str` of a `Diagnosis` explains the numbers in sentences,
+    one per line.
 
     **Attributes:**
 
@@ -197,7 +199,7 @@ class Diagnosis:
     - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
     - `misoriented_edges`: the number of edges whose two faces have opposite orientations. A consistently
       oriented mesh has no such edges.
-    - `degenerate_faces`: the number of triangles without area.
+    - `degenerate_faces`: the number of triangles whose height is at most 1e-10 of their longest edge.
     """
 
     vertices: int
@@ -212,7 +214,7 @@ class Diagnosis:
     degenerate_faces: int
 
     def sentences(self) -> tuple[str, ...]:
-        """Return one sentence about the size of the mesh, then one sentence for each unusual count."""
+        """Return a sentence about the size of the mesh, and one for each kind of unusual element."""
         shape = "open" if self.boundary_edges else "closed"
         found = [
             f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
@@ -335,7 +337,7 @@ def make_mesh(
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
     The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
-    Vertices are never dropped or renumbered. `read_mesh` also calls `make_mesh`.
+    Vertices are never dropped or renumbered.
 
     **Arguments:**
 
@@ -347,14 +349,15 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
         array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, all vertices at exactly the same position count as one vertex, and faces use the
+    - `weld`: if True, all vertices at exactly the same position are treated as one vertex, and faces use the
         lowest-numbered of these vertices. The other vertices at this position remain, but are unreferenced.
         Welding closes seams along which some programs duplicate vertices.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
 
-    A `Mesh`, whose `notes` report how many faces were dropped or changed by welding. They also report how
+    A `Mesh` with the attributes `vertices` (n, 3), float64, and `faces` (f, 3), int64. The `notes` of the
+    mesh report how many faces were dropped, and how many faces welding changed. The notes also report how
     many vertices appear to be duplicated along a seam, and how many vertices are unreferenced.
 
     **Raises:**
@@ -464,8 +467,8 @@ def _check_resolution(mesh: Mesh) -> None:
         if distances.max() > limit:
             raise InputError(
                 f"{mesh.name}: vertex {vertices[distances.argmax()]} (counted from 0) lies "
-                f"{distances.max():.0e} median edge lengths from the {place}, where numbers are "
-                "rounded too much for its triangles: repair the position, or move the mesh to the origin."
+                f"{distances.max():.0e} median edge lengths from the {place}, where rounding "
+                "errors are too large for its triangles: repair the position, or move the mesh to the origin."
             )
 
 
@@ -513,7 +516,7 @@ def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
 
 
 def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
-    """Return the faces as valid indices of n vertices."""
+    """Check that faces are valid indices of n vertices, and return them as int64."""
     # The comparison precedes the cast, which would wrap numbers too large for int64.
     outside = ~((faces >= 0) & (faces < n))
     if outside.any():

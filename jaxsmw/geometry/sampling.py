@@ -66,15 +66,16 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
 
     This is Poisson-disk sampling. No two samples are closer to each other in space than a minimum distance,
     and no further candidate has this distance from all samples. The minimum distance follows from the area
-    and the number of samples. The candidates are one vertex per box of a grid, whose boxes are a third of the
-    minimum distance wide. Two sheets of surface that are closer to each other than the minimum distance share
-    their samples. For many samples, the function is much faster than `farthest_point_samples`.
+    and the number of samples. Each box of a grid contributes at most one vertex to the candidates. The boxes
+    are a third of the minimum distance wide. Two sheets of surface that are closer to each other than the
+    minimum distance share their samples. For many samples, the function is much faster than
+    `farthest_point_samples`.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices. Unreferenced vertices are never chosen.
-    - `number_of_samples`: the approximate number of samples. Where the mesh is coarser than the samples,
-      there are fewer samples.
+    - `number_of_samples`: the approximate number of samples. If the mesh is too coarse for this number, there
+      are fewer samples.
 
     **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
@@ -103,7 +104,7 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     to which these samples are nearest.
 
     **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
-    are given as vertices of the mesh.
+    are given as vertex indices of the mesh.
     """
     n = len(mesh.vertices)
     if n <= _DENSE:
@@ -134,7 +135,7 @@ def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarr
     n = graph.shape[0]
     rank = np.random.default_rng(0).permutation(n)
     undecided, chosen = np.ones(n, bool), np.zeros(n, bool)
-    # Because of the stored diagonal, every vertex counts as its own neighbour.
+    # Because of the stored diagonal, every vertex is its own neighbour.
     around, start = graph.indices, graph.indptr[:-1]
     while undecided.any():
         highest = np.where(undecided, rank, -1)

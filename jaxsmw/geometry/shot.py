@@ -41,9 +41,9 @@ def shot_descriptors(
     length.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
-    left from right. Renumbering the vertices only renumbers the descriptors. If the enclosed volume is
-    negative, all normals are reversed first, so an inside-out mesh has the same descriptors. Results are
-    cached on disk (`jaxsmw.runtime.cache`).
+    left from right. A renumbering of the vertices only permutes the rows of the result. If the enclosed
+    volume is negative, all normals are reversed first, so an inside-out mesh has the same descriptors.
+    Results are cached on disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -51,13 +51,14 @@ def shot_descriptors(
     - `radius`: the radius of the neighbourhoods, positive, in units of the square root of the area. The
       default is the radius 0.06 of the MWP paper.
     - `samples`: the s samples of the mesh as `SurfaceSamples` (`jaxsmw.geometry.sampling`), or None. If
-      given, only samples count as neighbours and get descriptors. The normal of a sample is the mean normal
-      of the vertices nearest to it. Without samples, the time grows with the square of the number of
-      vertices.
+      given, descriptors are computed only at the samples, and only samples are neighbours. The normal of a
+      sample is the mean normal of the vertices nearest to it. Without samples, the time grows with the square
+      of the number of vertices.
 
     **Returns:** Descriptors (n, 352) with one row per vertex or, with samples, (s, 352) with one row per
     sample, float32, without unit. The row is zero for unreferenced vertices and for vertices with fewer than
-    3 neighbours. The function warns if more than 1 % of the vertices have fewer than 3 neighbours.
+    3 neighbours. The function issues a `UserWarning` if more than 1 % of the vertices have fewer than 3
+    neighbours.
 
     **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbours.
     """
@@ -84,7 +85,7 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        # Single precision, with seven digits, suffices for the accuracy of descriptors.
+        # Single precision suffices for the accuracy of descriptors.
         descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):

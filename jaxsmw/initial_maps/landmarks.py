@@ -1,4 +1,4 @@
-"""Features for initial maps from landmarks, which are SHOT and geodesic distances to the landmarks."""
+"""Features for initial maps from landmarks: SHOT descriptors, and geodesic distances to the landmarks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
 # The weight of distances to landmarks relative to SHOT descriptors, which are unit vectors. With this weight,
-# a distance of half the square root of the area counts as much as the length of a SHOT descriptor. On pairs
-# of real bodies, weights from 1 to 3 give nearly the same maps.
+# a difference of half the square root of the area in one distance is as large as the norm of a SHOT
+# descriptor. On pairs of real bodies, weights from 1 to 3 give nearly the same maps.
 _WEIGHT = 2.0
 # This finite value replaces the infinite distance between two connected components. The value is larger than
 # any distance within a component.
@@ -25,14 +25,14 @@ def landmark_features(
 
     **Arguments:**
 
-    - `sampled`: the pair with its compared vertices.
+    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
     - `landmarks`: integers (l, 2), with a vertex of X and its match on Y in each row.
 
     **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex. The first 352
     columns are SHOT, and the other l columns are distances.
 
     **Raises:** `InputError` if `landmarks` has another shape, gives two matches to one vertex of X, or
-    contains a number that is not a referenced vertex; or if a mesh is too coarse for SHOT.
+    contains a number that is not a referenced vertex. Also `InputError` if a mesh is too coarse for SHOT.
     """
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
@@ -63,13 +63,14 @@ def landmark_features(
 def distance_features(
     side: SampledShape, vertices: Int64[np.ndarray, " l"], unit: float
 ) -> Float[np.ndarray, "n l"]:
-    """Compute weighted geodesic distances to some vertices, as features that are appended to SHOT.
+    """Compute weighted geodesic distances to given vertices, as features that are appended to SHOT.
 
     **Arguments:**
 
-    - `side`: the shape with its compared vertices.
+    - `side`: the shape and its compared vertices, at which descriptors are compared.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
-    - `unit`: the length that counts as 1, in the unit of the mesh; see `Pair.units_of_length`.
+    - `unit`: the unit of the returned distances, as a length in the unit of the mesh; see
+      `Pair.units_of_length`.
 
     **Returns:** The distances (n, l), multiplied by their weight relative to SHOT, with one row per compared
     vertex.

@@ -19,7 +19,7 @@ SIGNATURES: dict[str, Callable[[Spectrum], Array]] = {
     "hks": heat_kernel_signature,
     "wavelet": wavelet_signature,
 }
-"""The functions that compute the signatures, by the names of their initial maps."""
+"""A dictionary from the name of each initial map to the function that computes its signature."""
 
 
 def signature_features(
@@ -29,7 +29,7 @@ def signature_features(
 
     **Arguments:**
 
-    - `sampled`: the pair with its compared vertices.
+    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
     - `name`: a key of `SIGNATURES`: `"wks"`, `"hks"` or `"wavelet"`.
 
     **Returns:** The signatures of X (m, d) and of Y (n, d), with one row per compared vertex.

@@ -78,7 +78,8 @@ def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mappin
 
     **Arguments:**
 
-    - `variables`: the variables of a file, which also count as the fields of a struct with an empty name.
+    - `variables`: a dictionary from the names of a file's variables to their values. The dictionary itself is
+      treated as a struct with an empty name.
     - `fields`: the names of the required fields.
 
     **Returns:** A dictionary that maps the full names of the structs, such as `S.surface`, to the structs.
@@ -113,7 +114,8 @@ def read_matrix(
     **Returns:** The matrix (rows, columns), float64.
 
     **Raises:** `InputError` if the file cannot be read, if it contains no suitable matrix, or if it contains
-    several suitable matrices without the given name. The message names the file and the variables.
+    several suitable matrices and none of them has the given name. The message names the file and the
+    variables.
     """
     variables = read_variables(path)
     matrices = {key: value for key, value in variables.items() if is_real(value)}

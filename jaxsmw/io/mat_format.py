@@ -26,10 +26,10 @@ _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18:
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# SciPy takes at least 10 microseconds per array, in which it can read a few KiB of numbers. Therefore every
-# array counts as at least this number of bytes.
+# SciPy takes at least 10 microseconds per array. In this time, SciPy can read a few KiB of numbers. Therefore
+# the size of every array is counted as at least this number of bytes.
 _LEAST_BYTES_OF_ARRAY = 4096
-# The largest accepted size of the list of a struct's field names, which is 64 bytes for each of 1000 fields.
+# The largest accepted size in bytes of the list of a struct's field names: 64 bytes for each of 1000 fields.
 # The structs of shapes have about ten fields.
 _LONGEST_NAMES = 64 * 1000
 

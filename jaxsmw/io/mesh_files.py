@@ -38,13 +38,13 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
     - `path`: the file. The suffix, in upper or lower case, determines the format:
         - `.off`: a text file, optionally with colours or normals (COFF, NOFF).
-        - `.obj`: a text file, of which only the `v` and `f` lines are read.
+        - `.obj`: a text file. Only the `v` and `f` lines are read.
         - `.ply`: a text file, or a binary file in either byte order.
         - `.stl`: a text file or a binary file.
         - `.mat`: a file with a struct that has the coordinates X, Y and Z (or a matrix VERT) and the 1-based
           faces TRIV, such as `surface` in the TOSCA data set. The struct may be a field of another struct, as
           in the files of `write_spectrum`.
-    - `weld`: if True, all vertices at exactly the same position count as one vertex, and faces use the
+    - `weld`: if True, all vertices at exactly the same position are treated as one vertex, and faces use the
         lowest-numbered of these vertices. Welding has no effect on an STL file, whose corners are always
         merged.
 
@@ -266,7 +266,7 @@ class _Property(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """All numbers of one property in one array, and how many of these numbers each row has."""
+    """The numbers of one property in all rows, as one array, and the count of numbers in each row."""
 
     values: np.ndarray
     sizes: np.ndarray
@@ -325,7 +325,7 @@ def _parse_ply(data: bytes) -> _Polygons:
 
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
-    """Return the encoding, and a dictionary from element names to numbers of rows and properties."""
+    """Return the encoding, and a dictionary from element names to row counts and properties."""
     formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
     if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
         raise InputError(
@@ -409,7 +409,7 @@ def _ply_table(
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
     """Return where the values of a row are stored, and the offset of the row's end.
 
-    For each property of the row, the first result contains the offset and the number of the values.
+    For each property of the row, the first result contains the offset and the number of its values.
 
     **Raises:** `EOFError` if the body ends within the row.
     """

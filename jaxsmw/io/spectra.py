@@ -60,18 +60,20 @@ def make_spectrum(
 
     - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If
         `eigenvectors` and `vertex_areas` are None, `eigenvalues` is instead a shape of another library. The
-        shape is a `TriMesh` of pyFM after `process` (any object with `eigenvalues`, `eigenvectors` and
-        `vertex_areas`), or a shape of geomfum with its `basis`.
+        shape can be a `TriMesh` of pyFM after a call of its method `process`, any other object with the
+        attributes `eigenvalues`, `eigenvectors` and `vertex_areas`, or a shape of geomfum with an eigenbasis.
     - `eigenvectors`: the eigenvectors (n, k), orthonormal with respect to the vertex areas.
     - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
         sparse. Vertices of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
 
-    **Returns:** A `Spectrum` with n vertices and k eigenvectors, for total area 1, without descriptors,
-    positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
+    (n,), for total area 1, without descriptors, positions and normals. Its float type is JAX's default
+    (float32 unless `jax_enable_x64` is set).
 
-    **Raises:** `InputError` if the arrays do not fit each other, are not finite real numbers, or are not an
-    eigenbasis.
+    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. Also
+    `InputError` if the eigenvalues are negative or not ascending, a vertex area is negative, the eigenvectors
+    are not orthonormal, or an object of another library has no eigenbasis.
     """
     if eigenvectors is None and vertex_areas is None:
         eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
@@ -171,8 +173,9 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
           `evals` (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given
           by `A`, the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
 
-    **Returns:** A `Spectrum` with n vertices and k eigenvectors, for total area 1, without descriptors,
-    positions and normals. Its float type is JAX's default (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
+    (n,), for total area 1, without descriptors, positions and normals. Its float type is JAX's default
+    (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
     does not contain exactly one eigenbasis. The message names the file and the fault.
@@ -297,8 +300,8 @@ def read_functional_map(
 
     - `path`: the file. The file contains either a single matrix, or a matrix `C21` among other variables. The
         name `C21` means that X is shape 1 and Y is shape 2.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. The functional map may use only
-        the first eigenvectors of each spectrum.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. The functional map may have fewer
+        rows and columns than the spectra have eigenvectors.
 
     **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. k_X and k_Y are at
     most the numbers of eigenvectors of the spectra.

@@ -17,6 +17,6 @@ def is_number(word: str, *, finite: bool = True) -> bool:
     **Arguments:**
 
     - `word`: a word without spaces.
-    - `finite`: if False, `nan` and `inf` are also accepted. A later check must then report such values.
+    - `finite`: if False, `nan` and `inf` are also accepted. The caller must then check for such values.
     """
     return bool(_NUMBER.fullmatch(word)) or (not finite and bool(_NOT_FINITE.fullmatch(word)))

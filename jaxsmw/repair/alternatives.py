@@ -50,10 +50,10 @@ def alternative_initial_maps(
     `RepairSettings.alternatives` lists the radii of SHOT and the weights.
 
     For two full shapes with descriptors (`describe`), further maps come from pairings of the extremities of X
-    with those of Y. The pairings are selected by the distances between extremities. Each pairing gives a map
-    by nearest-neighbour search in SHOT and in distances to the extremities, which is refined by a coarse
-    feature regression. Among the refined maps that differ from each other, the maps with the best scores are
-    yielded.
+    with the extremities of Y. The pairings are selected by the distances between extremities. For each
+    pairing, a nearest-neighbour search in SHOT and in distances to the extremities gives a map. A feature
+    regression with few eigenvectors refines this map. Among the refined maps that differ from each other, the
+    maps with the best scores are yielded.
 
     **Arguments:**
 
@@ -179,7 +179,7 @@ class _CoarseRefinement:
         )
 
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
-        """Return the outcome of the feature regression, which may have failed, without its distortion."""
+        """Return the outcome of the feature regression, which may have failed, with distortion None."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
         padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
         first = jax.device_put(padded.astype(np.int32))

@@ -22,13 +22,14 @@ def expected_error(
     """Estimate the geodesic error of every match without ground truth.
 
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
-    first quantity is the detour: T takes a vertex to its match, the reverse map takes the match back to X,
-    and the detour is the distance between the original vertex and the resulting vertex. The second quantity
-    is the mean change in length of the edges at a vertex.
+    first quantity is the detour of a vertex, which is the distance between the vertex and the vertex to which
+    the reverse map takes its match. The second quantity is the mean change in length of the edges at a
+    vertex.
 
     Where limbs look swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows
-    with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices. If a
-    map is wrong but consistent everywhere, the expected error does not reveal the fault.
+    with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices by
+    their true errors. If a map is wrong but consistent everywhere, the expected error does not reveal the
+    fault.
 
     **Arguments:**
 

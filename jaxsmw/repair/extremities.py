@@ -44,10 +44,9 @@ def extremities(
 ) -> Extremities:
     """Find the extremities of a body, such as the ends of its limbs.
 
-    Extremities are the local maxima of the mean squared distance to the whole surface. The mean squared
-    distance is a function on the surface from Hilaga et al. 2001, "Topology matching for fully automatic
-    similarity estimation of 3D shapes". Distances are measured along edges, so all distances are a few per
-    cent too long.
+    Extremities are the local maxima of the mean squared distance to the whole surface (Hilaga et al. 2001,
+    "Topology matching for fully automatic similarity estimation of 3D shapes"). Distances are measured along
+    edges, so all distances are a few percent too long.
 
     **Arguments:**
 
@@ -82,10 +81,10 @@ def extremities(
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
     """Return pairings of the extremities of two bodies, the most plausible pairing first.
 
-    A pairing gives every extremity of one body a different partner on the other body. If the bodies have
-    different numbers of extremities, some extremities of one body have no partner. A pairing is plausible if
-    the distances between extremities, and the remoteness of extremities, are similar on both bodies. The cost
-    of a pairing is the sum of the squared differences of distances and of remoteness. The cost does not
+    A pairing assigns a different extremity of the other body to each extremity of the body with fewer
+    extremities. The remaining extremities of the other body are unpaired. A pairing is plausible if the
+    distances between extremities, and the remoteness of extremities, are similar on both bodies. The cost of
+    a pairing is the sum of the squared differences of distances and of remoteness. The cost does not
     distinguish left from right.
 
     **Arguments:**
@@ -94,7 +93,8 @@ def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int6
     - `number`: the largest number of pairings to return.
 
     **Returns:** A list of arrays (l, 2), where l is the number of extremities of the body with fewer
-    extremities. Each row gives the index of an extremity of X and the index of its partner on Y.
+    extremities. Each row contains the index of an extremity of X and the index of the extremity of Y that is
+    paired with it.
     """
     fewer, more = (x, y) if len(x.vertices) <= len(y.vertices) else (y, x)
     partners = np.array(list(permutations(range(len(more.vertices)), len(fewer.vertices))))

@@ -49,11 +49,12 @@ def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncerta
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
     The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty comes from the
-    last stage whose refiner computes an uncertainty. Without such a refiner, the uncertainty counts as zero.
+    last stage whose refiner computes an uncertainty. If there is no such stage, the uncertainty is taken to
+    be zero.
 
     **Arguments:**
 
-    - `outcome`: the outcome. If its distortion was not computed, the distortion counts as 1.
+    - `outcome`: the outcome. If its distortion was not computed, a distortion of 1 is used.
     - `uncertainty_weight`: the weight of the uncertainty; see `RepairSettings`.
 
     **Returns:** The score, without unit. The score is infinite if a stage failed.
@@ -73,7 +74,7 @@ class Judge:
 
     - `pair`: the source X (m vertices) and the target Y.
     - `spectrum_x`: the spectrum of X with the largest available number of eigenvectors, because more
-      eigenvectors show faults better. The spectrum may be padded.
+      eigenvectors make faults easier to detect. The spectrum may be padded.
     - `settings`: the thresholds and weights of the repair.
     """
 
@@ -82,9 +83,9 @@ class Judge:
     settings: RepairSettings
 
     def judged(self, outcome: Outcome) -> Outcome:
-        """Return the outcome with its distortion and its flag `suspicious`.
+        """Return the outcome with computed values of `distortion` and `suspicious`.
 
-        An outcome with a failed stage gets an infinite distortion and is suspicious.
+        If a stage failed, the distortion is infinite and the outcome is suspicious.
         """
         if not outcome.successful:
             return outcome._replace(distortion=np.inf, suspicious=True)
@@ -112,10 +113,10 @@ class Judge:
         return [fault for fault in both if low < areas[fault].sum() < high]
 
     def looks_right(self, outcome: Outcome) -> bool:
-        """Return whether a judged outcome needs no further repair.
+        """Return whether the map of a judged outcome looks right, so it needs no further repair.
 
-        An outcome needs no further repair if it is not suspicious. A suspicious outcome needs no further
-        repair if its distortion is below `doubtful` in the settings and it has no faults.
+        A map looks right if its outcome is not suspicious. The map of a suspicious outcome also looks right
+        if its distortion is below `doubtful` in the settings and it has no faults.
         """
         assert outcome.distortion is not None
         slightly_distorted = outcome.distortion < self.settings.doubtful

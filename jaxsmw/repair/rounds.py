@@ -33,23 +33,25 @@ def refine_in_stages(
 ) -> Outcome:
     """Refine the initial map of a pair by the given stages in order, and repair a map that looks wrong.
 
-    If the initial map exchanges symmetric limbs, refinement does not correct this error. The reason is that
-    both limbs have the same shape and differ only in their orientation and their connection to the body. With
-    `repair`, the outcome is checked for orientation reversal and discontinuities (`jaxsmw.repair.scores`). If
-    the outcome looks wrong, repair takes the following three steps. The stage at position `repair.stage` is
-    called the repaired stage.
+    If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
+    have the same shape. With `repair`, the outcome is checked for orientation reversal and discontinuities
+    (`jaxsmw.repair.scores`). If the outcome looks wrong, repair takes the following three steps. The stage at
+    position `repair.stage` is called the repeated stage.
 
-    1. Rounds: the repaired stage and all later stages run again. In the repaired stage, vertices with a fault
-       in the previous round have no weight. If there are both kinds of faults, rounds without the vertices of
-       orientation reversal alternate with rounds without discontinuous parts.
-    2. Fallback: the repaired stage, with `fallback_levels`, and all later stages run from the best outcome.
-       The map of the fallback is kept if it looks correct and its score is worse by less than
-       `score_tolerance`, or if its score is better. Otherwise the previous map is kept.
-    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to the repaired
-       stage, which then runs again in rough rounds. The best of these outcomes are refined by all stages and
-       repaired. Among the outcomes that look correct, the outcome with the best score is returned. If no
-       outcome looks correct, but at least `agreeing` initial maps lead to the same map, this map is returned.
-       If fewer initial maps agree, the outcome with the best score is returned.
+    1. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
+       with a fault in the previous map have no weight. If there are both kinds of faults, rounds that leave
+       out the vertices with orientation reversal alternate with rounds that leave out the discontinuous
+       parts.
+    2. Fallback: the repeated stage, with the numbers of eigenvectors in `fallback_levels`, and all later
+       stages run once more, from the best outcome of the rounds. The map of the fallback is kept if its score
+       is better. The map is also kept if it looks right and its score is worse by less than
+       `score_tolerance`. Otherwise the previous map is kept.
+    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to the repeated
+       stage, which then runs again in up to `rough_rounds` rounds. Up to `finalists` of these outcomes, those
+       with the best scores, are refined by all stages and repaired. Among the outcomes that look right, the
+       outcome with the best score is returned. If no outcome looks right, but at least `agreeing` initial
+       maps lead to the same map, this map is returned. If fewer initial maps agree, the outcome with the best
+       score is returned.
 
     **Arguments:**
 
@@ -100,7 +102,7 @@ _View = tuple[Spectrum, Spectrum]
 
 @dataclass(frozen=True)
 class _Runner:
-    """A runner of stages on one pair. Each item of `steps` is a stage with its view of the spectra."""
+    """A runner of stages on one pair. `steps` contains each stage with the two spectra on which it runs."""
 
     prepared: PreparedPair
     steps: list[tuple[_View, Stage]]
@@ -131,18 +133,20 @@ class _Runner:
 
 @dataclass(frozen=True)
 class _Repairer:
-    """A repairer of outcomes. It repeats the stage at position `settings.stage` and all later stages."""
+    """A repairer of outcomes. The repairer repeats the stage at position `settings.stage` and all later
+    stages.
+    """
 
     runner: _Runner
     judge: Judge
     settings: RepairSettings
 
     def begun(self, first: Int[Array, " m"]) -> Outcome:
-        """Run all stages up to and including the repaired stage. The returned outcome is not yet judged."""
+        """Run all stages up to and including the repeated stage. The returned outcome is not yet judged."""
         return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
 
     def finished(self, outcome: Outcome) -> Outcome:
-        """Run all stages after the repaired stage and return the judged outcome."""
+        """Run all stages after the repeated stage and return the judged outcome."""
         return self.judge.judged(self.runner.run(self.settings.stage + 1, outcome))
 
     def repaired(self, outcome: Outcome) -> Outcome:
@@ -154,7 +158,7 @@ class _Repairer:
         )
         last = self.finished(self._repeated(outcome, spectrum_x, fallback))
         # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
-        # fallback is preferred if it looks correct and its score is not much worse. The tolerance excludes
+        # fallback is preferred if it looks right and its score is not much worse. The tolerance excludes
         # upside-down maps, whose scores are much worse.
         score = self.judge.score
         preferred = (
@@ -164,9 +168,9 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Return the best of a suspicious outcome and the outcomes from alternative initial maps."""
+        """Return the best outcome among a suspicious outcome and those from alternative initial maps."""
         rough = self._rough_outcomes(alternatives)
-        # The search does not stop at the first map that looks correct, because a later map may be better.
+        # The search does not stop at the first map that looks right, because a later map may be better.
         finished, tried = [best], [best, *rough]
         for outcome in islice(distinct(rough, self.judge.same), self.settings.finalists):
             finished.append(self.repaired(self.finished(outcome)))
@@ -186,7 +190,7 @@ class _Repairer:
         return best
 
     def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
-        """Refine alternative initial maps up to the repaired stage, and repair them in rough rounds.
+        """Refine alternative initial maps up to the repeated stage, and repair them in a few rounds.
 
         **Returns:** The successful outcomes, with the best score first.
         """
@@ -201,8 +205,8 @@ class _Repairer:
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
         """Run rounds of repair and return the best outcome.
 
-        In each round, the vertices of one fault of the previous round have no weight. If `finish` is True,
-        each round also runs all stages after the repaired stage.
+        In each round, the vertices with one kind of fault in the previous map have no weight. If `finish` is
+        True, each round also runs all stages after the repeated stage.
         """
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)
@@ -218,7 +222,7 @@ class _Repairer:
         return best
 
     def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
-        """Run `stage` instead of the repaired stage, starting from the final map of an outcome.
+        """Run `stage` instead of the repeated stage, starting from the final map of an outcome.
 
         The returned outcome is not yet judged.
         """

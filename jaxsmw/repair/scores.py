@@ -27,15 +27,15 @@ def dirichlet_energy_ratio(
     """Return the Dirichlet energy of the matched positions, divided by the energy of X's own positions.
 
     Both energies are computed in the span of X's eigenvectors. The restriction to this span removes the
-    scatter of single matches, which grows with the density of the mesh. The ratio of the true map is about 1
-    between poses of one body, for any triangulations. The ratio of the true map is up to 1.1 between
-    non-isometric shapes. Discontinuous maps have larger ratios.
+    scatter of single matches, which grows with the density of the mesh. Between poses of one body, the ratio
+    of the true map is about 1, even if the triangulations differ. Between non-isometric shapes, the ratio of
+    the true map is up to 1.1. Discontinuous maps have larger ratios.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors, which may be padded.
+    - `spectrum_x`: the spectrum of X with a few hundred eigenvectors. The spectrum may be padded.
     - `settings`: the settings of the scores.
 
     **Returns:** The ratio, without unit, for positions in `Pair.units_of_length`.
@@ -49,7 +49,7 @@ def dirichlet_energy_ratio(
     eigenvalues, eigenvectors = eigenvalues[:resolved], eigenvectors[:, :resolved]
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
-        # A constant offset has no energy but would cause rounding errors.
+        # A constant offset of the positions has no energy but would cause rounding errors.
         centered = positions - np.average(positions, axis=0, weights=pair.mesh_x.vertex_areas)
         # The product uses the type of the eigenvectors, because a converted copy of the eigenvectors of a
         # large mesh takes too much memory.
@@ -71,8 +71,8 @@ def distortion(
 
     The distortion is the `dirichlet_energy_ratio` times `1 + orientation_weight * share`, where `share` is
     the share of X's area with `orientation_reversal`. Without this factor, a map that mirrors the body would
-    have a smaller distortion than a map with swapped legs. If the energy ratio is below 1, its inverse is
-    used instead, except for a partial pair. The reason for the exception is that large parts of the full
+    have a smaller distortion than a map with swapped legs. For two full shapes, an energy ratio below 1 is
+    replaced by its inverse. The ratio of a partial pair is not inverted, because large parts of the full
     shape have no match.
 
     Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
@@ -82,7 +82,7 @@ def distortion(
 
     - `pair`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X, with a few hundred eigenvectors, which may be padded.
+    - `spectrum_x`: the spectrum of X with a few hundred eigenvectors. The spectrum may be padded.
     - `settings`: the settings of the scores.
 
     **Returns:** The distortion, without unit.
@@ -100,10 +100,10 @@ def discontinuous_parts(
 ) -> Bool[np.ndarray, " m"]:
     """Find the vertices of X that discontinuities of the map separate from the largest part of X.
 
-    An edge is discontinuous if its ends have matches that are far apart (`ScoreSettings` has the thresholds).
-    After the removal of discontinuous edges, X consists of one or more connected components. All components
-    except the component of largest area are discontinuous parts. An example of a discontinuous part is a
-    swapped limb.
+    An edge is discontinuous if its ends have matches that are far apart (`ScoreSettings` contains the
+    thresholds). After the removal of discontinuous edges, X consists of one or more connected components. All
+    components except the component of largest area are discontinuous parts. An example of a discontinuous
+    part is a swapped limb.
 
     **Arguments:**
 
@@ -130,15 +130,15 @@ def orientation_reversal(
 ) -> Bool[np.ndarray, " m"]:
     """Find the vertices of X around which the map exchanges left and right, as on swapped limbs.
 
-    The matches of the three corners of a triangle of X form a triangle on Y. The area of the triangle on Y
-    counts as negative if its orientation is opposite to the orientation of Y's surface. The density of this
+    The matches of the three corners of a triangle of X form a triangle on Y. The area of the triangle on Y is
+    taken as negative if its orientation is opposite to the orientation of Y's surface. The density of this
     signed area on X is smoothed in the span of X's first eigenvectors and compared with a threshold.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`, which may be padded.
+    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`. The spectrum may be padded.
     - `settings`: the settings of the scores.
 
     **Returns:** A mask (m,), True for vertices around which the orientation is reversed.
@@ -170,8 +170,8 @@ def same_map(
 ) -> bool:
     """Return whether two maps agree on nearly all of X.
 
-    The matches of a vertex differ if their Euclidean distance exceeds `settings.same_map_distance`. Two maps
-    agree if the vertices whose matches differ have less than the share `settings.same_map_area` of X's area.
+    The two matches of a vertex differ if their Euclidean distance exceeds `settings.same_map_distance`. Two
+    maps agree if the matches differ on less than the share `settings.same_map_area` of X's area.
 
     **Arguments:**
 

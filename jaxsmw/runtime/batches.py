@@ -23,7 +23,7 @@ from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
 
-# Larger batches were not faster on any device that scripts/benchmark_batches.py measured.
+# Larger batches saved no time on any device on which scripts/benchmark_batches.py was run.
 _LARGEST_BATCH = 64
 # The assumed memory, in bytes, of a device that does not report its memory.
 _USUAL_MEMORY = 8 * 2**30
@@ -45,8 +45,8 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
     **Returns:** The stacked spectrum. For s shapes and n vertices in the largest shape, `eigenvectors` has
     shape (s, n, k).
 
-    **Raises:** `ValueError` if there are no shapes, or if the shapes differ in the number of eigenvectors or
-    in which optional arrays they have.
+    **Raises:** `ValueError` if there are no shapes, if the shapes have different numbers of eigenvectors, or
+    if only some of them have an optional array.
     """
     if not spectra:
         raise ValueError("there are no shapes to stack: give at least one spectrum")
@@ -79,11 +79,11 @@ def refine_pairs(
     Shapes are padded to a few common sizes (`jaxsmw.runtime.padding.padded_size`). One compiled program
     serves all pairs with the same combination of sizes. Each batch is divided among all devices. With several
     processes (`jax.distributed`), call this function with the same arguments in each process. The function
-    uses the devices of all processes, and every process gets all results.
+    uses the devices of all processes, and every process receives all results.
 
-    For each pair, the result agrees with the result of `refine` up to rounding errors in sums over padded
-    arrays and in batched products. Functional maps agree to the precision of the float type. A match can
-    differ only if the distances to two vertices of Y are equal to that precision.
+    For each pair, the refinement agrees with the result of `refine` up to rounding errors, because sums over
+    padded arrays and batched products are rounded differently. Functional maps agree to the precision of the
+    float type. A match can differ only if two vertices of Y are equally far away to this precision.
 
     **Arguments:**
 
@@ -98,7 +98,8 @@ def refine_pairs(
       number s must be the same for all shapes. With None, all iterations use all vertices.
     - `partial`: whether one shape of each pair is a part of the other. If True, both shapes must have the
       same unit of length.
-    - `stop_when_unchanged`: whether to skip the remaining iterations of a pair once no match changes.
+    - `stop_when_unchanged`: whether to skip the remaining iterations of a pair once none of its matches
+      changes.
     - `history`: whether to record a `History` of each pair.
     - `batch_size`: the number of pairs that each device refines at the same time. The default on CPUs is 1,
       because larger batches save no time there and need more memory. The default on other devices is as many
@@ -111,9 +112,10 @@ def refine_pairs(
     of this pair. Pairs of equal size follow each other. Numerical failures raise no error, so compare the
     `result` of each refinement with `RESULTS.successful`.
 
-    **Raises:** `ValueError` if the numbers of pairs, initial maps and samples do not fit together, a pair
-    refers to a shape that does not exist, an initial map is not one integer per vertex of X, a shape is not a
-    `Spectrum`, or `batch_size` is below 1.
+    **Raises:** `ValueError` if there is not one initial map per pair, there are not samples for every shape,
+    a pair refers to a shape that does not exist, an initial map does not contain one integer per vertex of X,
+    a shape is not a `Spectrum`, or `batch_size` is below 1. The errors of `refine` are raised while the
+    iterator runs.
     """
     _check_pairs(spectra, pairs, pointwise_maps, samples)
     if batch_size is not None and batch_size < 1:
@@ -136,7 +138,7 @@ def refine_pairs(
             for begin in range(0, len(positions), per_call):
                 chosen = positions[begin : begin + per_call]
                 # The last batch is filled with copies of its last pair, because a smaller batch would need
-                # another program.
+                # another compiled program.
                 filled = chosen + chosen[-1:] * (per_call - len(chosen))
                 maps = np.stack([pad_rows(np.asarray(pointwise_maps[p]), sizes.m) for p in filled])
                 batch = _Batch(
@@ -158,7 +160,7 @@ def _check_pairs(
 ) -> None:
     """Checks the arguments of `refine_pairs`.
 
-    **Raises:** `ValueError` if shapes, pairs, initial maps and samples do not fit together.
+    **Raises:** `ValueError` in the cases that the docstring of `refine_pairs` lists, except for `batch_size`.
     """
     if len(pairs) != len(pointwise_maps):
         raise ValueError(
@@ -230,7 +232,7 @@ def _positions_by_size(
 _DIVIDED, _EVERYWHERE = PartitionSpec("pairs"), PartitionSpec()
 
 Side = tuple[Spectrum, Int[Array, "batch s"] | None]
-"""The sources or the targets of a batch of pairs: spectra with a leading axis, and samples or None."""
+"""All sources or all targets of a batch of pairs: stacked spectra, and the samples (or None)."""
 
 
 class _Batch(NamedTuple):
@@ -242,7 +244,7 @@ class _Batch(NamedTuple):
 
 
 class _Stack:
-    """The sources or the targets of several pairs, padded to one size and copied to all devices."""
+    """All sources or all targets of several pairs, padded to one size and copied to all devices."""
 
     def __init__(
         self,
@@ -262,7 +264,7 @@ class _Stack:
         self._side: Side = jax.device_put(side, NamedSharding(mesh, _EVERYWHERE))
 
     def rows(self, shapes: Sequence[int]) -> Side:
-        """Returns the given shapes, which may repeat, divided among the devices."""
+        """Returns the given shapes, divided among the devices. A shape may occur several times."""
         places = jnp.asarray([self._place[shape] for shape in shapes])
         return _take(self._side, places, self._mesh)
 
@@ -295,9 +297,9 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 
 
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
-    """Returns the default number of pairs per device: 1 on CPUs, and at most 64 on other devices.
+    """Returns the default number of pairs that a device refines at the same time.
 
-    On other devices, it is the number of pairs that fit into the memory.
+    The number is 1 on CPUs. On other devices, it is the number of pairs that fit into the memory, at most 64.
     """
     if _one_at_a_time(device):
         return 1
@@ -310,7 +312,7 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 def _one_at_a_time(device: jax.Device) -> bool:
     """Returns whether to refine pairs one after another, as on CPUs.
 
-    On CPUs, a batch of pairs takes a third more time than the same pairs one after another.
+    On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
     """
     return device.platform == "cpu"
 
@@ -318,7 +320,7 @@ def _one_at_a_time(device: jax.Device) -> bool:
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
     """Returns the approximate memory that `refine` uses on a device for one pair, in bytes.
 
-    The memory includes the arrays of the pair. It grows linearly with m and n.
+    This memory includes the spectra of the pair. It grows linearly with m and n.
 
     **Arguments:**
 

@@ -1,9 +1,9 @@
 """A cache on disk for expensive results, such as spectra, SHOT descriptors and geodesic graphs.
 
-The name of an entry contains a hash of everything on which the result depends, so an entry never becomes
+The name of an entry contains a hash of all values on which the result depends, so an entry never becomes
 outdated. Entries are written atomically, so any number of processes can share the directory without locks.
-Checksums are verified when an entry is read. The directory can be deleted at any time, because the cache
-computes missing results again.
+Checksums are verified when an entry is read. The directory can be deleted at any time, because missing
+results are computed again.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import platformdirs
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
-# Every key contains this number. Increment the number when a change of the code changes results for the same
-# inputs.
+# Every key is a hash that includes this number. Increment the number when a change of the code changes
+# results for the same inputs.
 _FORMAT = 4
 
 # This pattern matches the names of entries, and the names of temporary files that a killed process left
@@ -43,16 +43,16 @@ def cached(
     The environment variable `JAXSMW_CACHE` names the directory of the cache. The default is the user's cache
     directory. An empty name or `off` disables the cache. The environment variable `JAXSMW_CACHE_LIMIT` limits
     the size of the cache in GiB, by default to 4. Above this limit, the least recently used entries are
-    removed. A damaged entry is computed again. If an entry cannot be written, the function warns and returns
-    the result.
+    removed. If an entry is damaged, its result is computed again. If an entry cannot be written, the function
+    warns and returns the result.
 
     **Arguments:**
 
     - `kind`: the first part of the entry's name, in lower-case words joined by hyphens.
     - `inputs`: all values on which the result depends, in a fixed order.
-    - `compute`: a function without arguments, which computes the arrays and returns them by name.
+    - `compute`: a function without arguments, which returns the result as a dictionary from names to arrays.
 
-    **Returns:** The arrays by name, bit for bit as computed.
+    **Returns:** The dictionary that `compute` returned, in this call or in an earlier call, bit for bit.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -102,9 +102,9 @@ def cache_compiled_programs() -> None:
     """Make JAX store compiled programs on disk for later processes.
 
     The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
-    environment variables of JAX, unless the user has set one of these variables. It must run before JAX is
-    imported. Each type of processor has its own directory, because JAX does not distinguish processors, and
-    machines with different processors may share the disk.
+    environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
+    variables, the function changes none of them. Each type of processor has its own directory, because JAX
+    does not distinguish processors, and machines with different processors may share the disk.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -167,7 +167,7 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
 
 def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
     """Return the arrays of an entry, or None if the entry is missing, damaged, or does not match its name."""
-    # Damaged bytes can raise any exception, and the remedy is always to compute again.
+    # Reading a damaged file can raise any exception. The result is then computed again.
     with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
         # A zip file has checksums for its members, but not for the list of members.

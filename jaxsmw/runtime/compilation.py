@@ -19,26 +19,28 @@ _OPTIONS: dict[str, str | bool] = {
     "xla_cpu_experimental_ynn_fusion_type": "",
     "xla_disable_hlo_passes": "tree_reduction_rewriter",
 }
-# Compiled programs are released when the process uses more than this share of its memory maps. The programs
-# for a pair of new sizes take up to 3 % of the memory maps, and 250 MB of memory.
+# Linux limits the number of memory maps of a process. Compiled programs are released when the process uses
+# more than this share of the limit. The programs for a pair of new sizes use up to 3 % of the limit, and
+# 250 MB of memory.
 _LARGEST_SHARE = 0.25
 
 
 def compiler_options() -> dict[str, str | bool]:
     """Returns options of `jax.jit` that make nearest-neighbour searches fast on CPUs.
 
-    Pass the result to `jax.jit` as `compiler_options`. By default XLA delegates products and sums on CPUs to
-    the library YNNPACK. Waking the threads of this library takes longer than a small operation. Without the
-    library, a search in patches takes 63 to 72 % of the time. XLA also splits each long sum into several
-    loops to reduce rounding errors. With one loop per sum, compilation takes 30 % less time (docs/speed.md).
-    Sums of a million numbers are still accurate to within 5e-6.
+    Pass the result to `jax.jit` as `compiler_options`. By default, XLA uses the library YNNPACK for products
+    and sums on CPUs. Waking the threads of this library takes longer than a small operation. The options
+    disable YNNPACK, which reduces the time of a search in patches by 28 to 37 %. By default, XLA also splits
+    each long sum into several loops to reduce rounding errors. The options disable this splitting, so
+    compilation takes 30 % less time (docs/speed.md). Sums of a million numbers are still accurate to within
+    5e-6.
 
     JAX accepts these options only in the outermost `jax.jit`. Other compiled functions may call
     `jaxsmw.refine`, so `jaxsmw.refine` does not set the options itself. The options depend on the default
     backend of JAX, not on `jax.default_device`.
 
-    **Returns:** A dictionary from the names of the options to their values. It does not contain options that
-    the installed XLA does not support. It is empty if the default backend is not the CPU.
+    **Returns:** A dictionary from the names of the options to their values. Options that the installed XLA
+    does not support are left out. The dictionary is empty if the default backend is not the CPU.
     """
     return dict(_options_for(jax.default_backend()))
 
@@ -60,8 +62,8 @@ def _known(option: str, value: str | bool) -> bool:
 def compiled(function: Function) -> Function:
     """Returns the function compiled with `compiler_options`, for calls from Python.
 
-    Do not call the result inside another compiled function. Repeated calls with the same function return the
-    same compiled function.
+    Do not call the compiled function inside another compiled function. If `compiled` is called again with the
+    same function, it returns the same compiled function.
     """
     return _compiled(function, jax.default_backend())
 
@@ -87,10 +89,10 @@ def compile_ahead(
     - `function`: the function to compile.
     - `arguments`: a function without arguments that returns arrays of the given sizes. Its result is a tuple
       of positional arguments and a mapping of named arguments. JAX only traces this function.
-    - `settings`: the other arguments of the function, by name.
+    - `settings`: the remaining keyword arguments of the function.
 
-    **Returns:** A future that is done when the program is compiled. Errors in the arguments stay in this
-    future. The call of `compiled(function)` raises them.
+    **Returns:** A future that is done when the program is compiled. If the arguments contain an error, the
+    exception is stored in this future, and a later call of `compiled(function)` raises it again.
     """
     program: Any = compiled(function)  # the annotations of Equinox do not declare `lower`
     x64 = jax.config.read("jax_enable_x64")
@@ -111,13 +113,13 @@ def compile_ahead(
 
 
 def release_programs() -> None:
-    """Releases all compiled programs of the process if it uses a large share of its memory maps.
+    """Releases all compiled programs if the process uses a large share of its allowed memory maps.
 
     Commands call this function between pairs. Library functions must not call it, because `jax.clear_caches`
     also clears the programs of the caller. On Linux, the programs for a few dozen pairs of different sizes
     would use up all memory maps of the process, and LLVM would then end the process. Released programs are
-    compiled again when they are needed. If programs are stored on disk, they are loaded from the disk
-    instead. On other systems the function does nothing.
+    compiled again when they are needed, or are loaded from the disk if JAX has stored them there. On other
+    systems the function does nothing.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

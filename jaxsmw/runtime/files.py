@@ -1,4 +1,4 @@
-"""Reading and atomic writing of files. Every failure is reported in one sentence."""
+"""Reading and atomic writing of files. Every failure raises an `InputError` with a one-sentence message."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from jaxsmw.errors import InputError
 LARGEST_FILE = 2**30
 """The size of the largest file that is read as a whole, in bytes (1 GiB).
 
-Parsing a text file needs up to fifteen times the size of the file in memory. A text file of 1 GiB describes a
-mesh of ten million vertices.
+A text file of 1 GiB describes a mesh of ten million vertices. Parsing it needs up to 15 GiB of memory.
 """
 
 
 def largest_contents(size_of_file: int) -> int:
     """Return the largest plausible size of the unpacked contents of a compressed file, in bytes.
 
-    A malicious file can unpack to a thousand times its size, so a limit is necessary. Contents of up to 1 GiB
-    are always plausible, because a mesh of ten million vertices has this size. Larger contents are
-    eigenvectors, which compress little. For them, four times the size of the compressed file is a generous
-    limit.
+    A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to
+    1 GiB are always plausible, because a mesh of ten million vertices has this size. Larger contents can only
+    be eigenvectors. Compression hardly reduces their size, so contents of up to four times the size of the
+    compressed file are plausible.
 
     **Arguments:**
 
@@ -98,8 +97,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     **Raises:**
 
-    `InputError` before the block starts, if the directory or the name makes writing impossible. `InputError`
-    also if the block raises an `OSError`, for example because the disk is full.
+    `InputError` is raised before the block starts if the directory or the name makes writing impossible.
+    `InputError` is also raised if the block raises an `OSError`, for example because the disk is full.
     """
     target = _target(path)
     temporary = _temporary(target)
@@ -126,7 +125,7 @@ _unfinished: set[Path] = set()
 def remove_unfinished() -> None:
     """Remove the temporary files of all open blocks of `atomic_write`.
 
-    A process calls this function before it ends while such a block is open.
+    A signal handler that ends the process calls this function, because `finally` clauses do not run then.
     """
     for temporary in _unfinished.copy():
         with suppress(OSError):
@@ -154,7 +153,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """Return the file to which a path leads, with symbolic links resolved."""
+    """Return a path with all symbolic links resolved."""
     try:
         return Path(os.path.realpath(path))
     except ValueError as error:  # a null character in the name
@@ -174,7 +173,7 @@ def _check_target(path: str | os.PathLike[str], target: Path) -> None:
     if not target.parent.is_dir():
         raise InputError(
             f"{path}: cannot be written because {target.parent} is not a directory: "
-            "create the directory first, or choose another one."
+            "create the directory first, or choose another directory."
         )
     try:
         status = os.stat(target)
@@ -214,7 +213,7 @@ def check_directory(path: str | os.PathLike[str]) -> None:
         make_directory(path)
     finally:
         for place in missing:
-            with suppress(OSError, ValueError):  # never created, or already used by another process
+            with suppress(OSError, ValueError):  # the directory may not exist, or may be in use
                 place.rmdir()
 
 

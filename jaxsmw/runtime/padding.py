@@ -7,9 +7,10 @@ from jaxtyping import Shaped
 
 from jaxsmw.core.search import BLOCK
 
-# A padded size is a multiple of an eighth of the largest power of two below it. It is also a multiple of the
-# block size of the search. For padded sizes of at least 1024, at most an eighth of the vertices are padding.
-# All shapes from 4000 to 16 000 vertices share 17 padded sizes.
+# A padded size is a multiple of `power / _SUBDIVISION`, where `power` is the largest power of two below the
+# number of vertices. It is also a multiple of the block size of the search. For padded sizes of at least
+# 1024, at most 1/8 of the vertices are padding. All shapes with 4000 to 16 000 vertices together have only 17
+# different padded sizes.
 _SUBDIVISION = 8
 
 
@@ -24,9 +25,8 @@ def padded_size(number_of_vertices: int) -> int:
 
 
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
-    """Returns an array (n, ...) with rows of zeros appended, up to a given number of rows.
+    """Returns an array (n, ...) extended by rows of zeros to a given number of rows.
 
-    The rows of a NumPy array then correspond to the rows of a padded `Spectrum`. `number_of_rows` must be at
-    least n.
+    The rows of the result correspond to the rows of a padded `Spectrum`. `number_of_rows` must be at least n.
     """
     return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))

@@ -17,7 +17,7 @@ _LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
-    """Return the version of Python, and of each package on which results depend, by name."""
+    """Return a dictionary from names to versions, of Python and of the packages on which results depend."""
     return {
         **{package: metadata.version(package) for package in _PACKAGES},
         "python": platform.python_version(),
@@ -25,7 +25,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> str:
-    """Return the operating system, the processor and the number of cores in one phrase."""
+    """Return the operating system, the processor and the number of cores as one string."""
     processor = platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():  # on Linux `platform` gives only the architecture
@@ -36,7 +36,7 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """Return the git commit of the library's checkout, with `-dirty` if files have changed.
+    """Return the git commit of the library's checkout, followed by `-dirty` if files have changed since.
 
     If the library is not in a git checkout, or if git is missing, return the installed version.
     """
@@ -48,7 +48,7 @@ def commit() -> str:
 
 
 def made_with() -> str:
-    """Return the commit, the machine and the versions in one line."""
+    """Return the commit, the machine and the versions as one line of text."""
     return f"Commit {commit()}, {machine()}, " + ", ".join(f"{k} {v}" for k, v in versions().items()) + "."
 
 
@@ -64,7 +64,8 @@ def measured_code() -> list[Path]:
 def code_digest(paths: Iterable[Path]) -> str:
     """Return a hash of the code in Python files, as 16 hexadecimal digits.
 
-    Comments, docstrings and layout do not affect the hash. The names and the order of the files affect it.
+    Comments, docstrings and layout do not affect the hash. The names and the order of the files affect the
+    hash.
     """
     digest = hashlib.sha256()
     for path in paths:

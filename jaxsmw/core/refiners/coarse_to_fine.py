@@ -21,7 +21,7 @@ def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
     try:
         return tuple(operator.index(level) for level in levels)
     except TypeError:
-        raise TypeError(f"the levels are {levels!r}, but a tuple of whole numbers is needed") from None
+        raise TypeError(f"the levels are {levels!r}, but they must be integers") from None
 
 
 class CoarseToFineState(State):
@@ -36,21 +36,24 @@ class CoarseToFineState(State):
 
 
 class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
-    """The abstract base class of refiners that use more eigenvectors in every iteration.
+    """The abstract base class of refiners that use more eigenvectors in later iterations.
 
-    ZoomOut (Melzi et al. 2019) also increases the number of eigenvectors in this way. Ready subclasses are
+    The number of eigenvectors increases as in ZoomOut (Melzi et al. 2019). Ready subclasses are
     `FeatureRegression` and `Registration`. A subclass defines the abstract methods of `Refiner`, and its
     states are subclasses of `CoarseToFineState`.
 
     **Arguments:**
 
-    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
-      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
-      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
-      so do all iterations if the tuple is empty (the default).
-    - `search`: how the matches of all vertices are found, `"exhaustive"`, `"patches"` or `"auto"`.
+    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
+      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
+      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
+      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
+      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
+    - `search`: how the matches of all vertices are found. `"exhaustive"` compares all vertices of X with all
+      vertices of Y, `"patches"` skips patches of Y that are too far away, and `"auto"` chooses between the
+      two.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
     """
 
@@ -65,7 +68,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Returns which eigenvectors of X and of Y an iteration uses, as Boolean arrays (k_x,) and (k_y,).
+        """Returns two Boolean arrays, True for the eigenvectors of X (k_x,) and of Y (k_y,) in an iteration.
 
         **Arguments:**
 
@@ -107,12 +110,12 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Returns weights that are small for vertices of the full shape that the partial shape lacks.
+    """Returns the weights of both shapes, reduced at vertices that only the full shape has.
 
     The shape with the larger mean residual is treated as the full shape. The weight w of each of its vertices
-    becomes `w / (1 + (r / mean)²)`. Here r is the residual of the vertex, and `mean` is the mean residual of
-    the other shape. Then the weights of the full shape are scaled to sum 1. The weights of the other shape
-    stay the same.
+    becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean` is the
+    weighted mean of the residuals of the other shape. Then the weights of the full shape are scaled to sum 1.
+    The weights of the other shape stay the same.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Refinement by regression: the features of matched vertices predict each other linearly."""
+"""Refinement by linear regression between the features of matched vertices."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
-# _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is the smallest residual variance. Both are
-# relative to features with a variance of about 1. If either number is divided or multiplied by a factor of up
-# to 3, the results hardly change.
+# _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is added to the variances of the residuals.
+# Features have a variance of about 1. If either number is divided or multiplied by a factor of up to 3, the
+# results hardly change.
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
@@ -32,39 +32,42 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """A refiner that finds matches by linear regression between the features of both shapes.
 
     The features of a vertex are the values of the eigenvectors and, if the spectra have descriptors, the
-    descriptors (`Spectrum.descriptors`). Each iteration regresses the features of X on the features of Y,
-    along the matches of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which
-    gives the functional map by least squares (Ovsjanikov et al. 2012). Descriptors are regressed on
-    descriptors. The covariance of the residuals measures how reliable each combination of features is. The
-    next match of a vertex of X is the nearest vertex of Y in the Mahalanobis distance of this covariance. For
-    the reverse map, the features of Y are regressed on the features of X in the same way. The number of
-    eigenvectors grows with the iterations, as in ZoomOut (Melzi et al. 2019).
+    descriptors (`Spectrum.descriptors`). Each iteration regresses the features of vertices of X on the
+    features of their matches. The first iteration uses the matches of the initial map. Later iterations use
+    the matches of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which gives the
+    functional map by least squares (Ovsjanikov et al. 2012). Descriptors are regressed on descriptors. The
+    covariance of the residuals measures how reliable each combination of features is. This covariance defines
+    a Mahalanobis distance between the features of a vertex of X and the features predicted from a vertex of
+    Y. The next match of a vertex of X is the nearest vertex of Y in this distance. For the reverse map, the
+    features of Y are regressed on the features of X in the same way. The argument `levels` increases the
+    number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
     The method does not assume isometry. If the initial map is as good as a result of `WaveletPreservation`,
     the refined map is closer to the ground truth than the initial map. The measurements are in
     docs/accuracy.md.
 
-    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape whose matches fit badly get
-    smaller weights (`partial_matching_weights`).
+    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape whose matches fit badly
+    receive smaller weights (`partial_matching_weights`).
 
     **Arguments:**
 
-    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
-      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
-      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
-      so do all iterations if the tuple is empty (the default).
+    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
+      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
+      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
+      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
+      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
     - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
-      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` compares
-      eigenvectors only, without descriptors, and skips patches of Y that are too far away. `"auto"` chooses
-      `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least 15 000, and
-      `"exhaustive"` otherwise.
+      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` skips patches of
+      Y that are too far away. It compares only eigenvectors and ignores descriptors, so the matches can
+      differ from those of `"exhaustive"`. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the
+      numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
-        """Collects the features of the vertices to be matched, and of all vertices.
+        """Collects the features of all vertices and, if there are samples, of the samples.
 
         **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
         """
@@ -81,7 +84,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Returns the regressions along the matches, and `RESULTS.successful`.
+        """Returns the regressions along the matches as the next state, and `RESULTS.successful`.
 
         If there is a previous state, the regressions also use the matches of the reverse map.
         """
@@ -118,7 +121,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
         """Returns the vertex of X that is nearest to each vertex of Y, (n,).
 
-        The nearest vertices are those in the `embeddings`, as for `recover`.
+        Distances are computed in the `embeddings`, as for `recover`.
         """
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         embed = self.embeddings if patches is None else self._eigenvector_embeddings
@@ -136,18 +139,18 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
         """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
 
-        The distance between two points is the Mahalanobis distance between the features of the vertex of X
-        and the prediction of these features from the vertex of Y.
+        The distance between the points of a vertex of X and a vertex of Y is a Mahalanobis distance. It
+        compares the features of the vertex of X with the prediction of these features from the vertex of Y.
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Returns the coordinates of the `embeddings` that depend on eigenvectors alone.
+        """Returns the coordinates of the `embeddings` that depend only on eigenvectors.
 
-        Patches are compact in these coordinates. They are the first k_x coordinates, because the whitening is
-        triangular.
+        The search in patches uses only these coordinates, because patches are compact in them. They are the
+        first k_x coordinates, because the whitening matrix is triangular.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
@@ -155,10 +158,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The features of the vertices of one shape: their values, shares of the area, and the mask.
+    """The features of the vertices of one shape, with the vertices' shares of the area and the mask.
 
-    The values are the values of the eigenvectors, followed by the descriptors if the spectrum has
-    descriptors.
+    Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
+    vertex if the spectrum has descriptors.
     """
 
     values: Float[Array, "n d"]
@@ -195,10 +198,11 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """Two linear maps from features to points. Distances between points measure errors of prediction.
+    """A prediction of features, stored as two linear maps from features to points.
 
-    The distance between a query point and a target point is the Mahalanobis distance between the features of
-    the query vertex and their prediction from the features of the target vertex.
+    The distance between a query point and a target point measures the error of the prediction. It is the
+    Mahalanobis distance between the features of the query vertex and their prediction from the features of
+    the target vertex.
 
     **Attributes:**
 
@@ -243,18 +247,18 @@ class Regression(CoarseToFineState):
 
     @property
     def uncertainty(self) -> Float[Array, ""]:
-        """The mean logarithm of the standard deviations of the residuals, over the features of both shapes.
+        """The mean logarithm of the standard deviation of the residuals, a scalar array; lower is better.
 
-        The standard deviations are those of the principal components of the residuals. The mean therefore
-        equals half the sum of the logarithms of the determinants of both residual covariances, divided by the
-        number of features.
+        The mean is taken over the principal components of the residuals of both predictions. It is computed
+        as half the sum of the log-determinants of both residual covariances, divided by the number of
+        features of both shapes.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features
 
 
 class _Moments(NamedTuple):
-    """Weighted mean products of the features of matched vertices."""
+    """The weighted mean products of the features of matched vertices."""
 
     xx: Float[Array, "d_x d_x"]
     xy: Float[Array, "d_x d_y"]
@@ -275,7 +279,10 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """Returns the functional map, and the prediction of x from y. Both use only the active eigenvectors."""
+    """Returns the functional map, and the prediction of the features of X from the features of Y.
+
+    Both results use only the active eigenvectors.
+    """
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
     keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
@@ -293,7 +300,8 @@ def _regress(
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
     factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
     # The whitening is triangular, so each coordinate depends only on the features up to its own index.
-    # Inactive features are left out. They would add the same amount to all distances, and rounding errors.
+    # Inactive features are set to zero, because they would add only a constant and rounding errors to the
+    # distances.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

@@ -31,17 +31,17 @@ from jaxsmw.core.spectrum import Spectrum
 # divided by sqrt(1 + eigenvalue).
 _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
 # Descriptors have mean square 1. Their weight is _DESCRIPTORS / level**_FALLING. Descriptors therefore
-# outweigh positions at coarse levels and have little effect at the last level.
+# outweigh positions at low levels and have little effect at the last level.
 _DESCRIPTORS, _FALLING = 2.8, 1.5
-# Heat flow of duration _HEAT_TIME averages over a disk around each vertex, whose radius is 0.1 times the
-# square root of the area. If the spectrum has few eigenvectors, the duration is longer: the heat flow reduces
-# the last eigenvector to exp(-_DECAY) of its size or less.
+# Heat flow of duration _HEAT_TIME averages over a disk around each vertex. The radius of the disk is 0.1
+# times the square root of the area. If the spectrum has few eigenvectors, the duration is longer, because
+# heat flow must reduce the last eigenvector to at most exp(-_DECAY) times its size.
 _HEAT_TIME, _DECAY = 3e-3, 4.0
-# Least-squares fits in which some vertices have small weights use this ridge. It is relative to the mean
-# square of the eigenvectors.
+# If a least-squares fit contains vertices with small weights, it uses this ridge. The ridge is a multiple of
+# the mean square of the eigenvectors.
 _RIDGE = 1e-3
-# After this number of squarings, a matrix is nearly the projection onto the eigenvector of its largest
-# eigenvalue.
+# After this number of squarings, a matrix of trace 1 is nearly the projection onto the eigenvector of its
+# largest eigenvalue.
 _SQUARINGS = 12
 
 
@@ -49,38 +49,40 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     """A refiner that deforms X onto Y, and Y onto X, from low to high frequencies.
 
     In each iteration, the positions of the matches are projected onto the first eigenvectors. The projection
-    gives the low frequencies of the deformed surface. Every iteration uses more eigenvectors, as in smooth
-    shells (Eisenberger, Lähner, Cremers 2020). The remaining details of the surface rotate with the
-    neighbourhoods of the vertices, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best
-    rotation around each vertex is computed from averages by heat flow. If all vertices of full shapes are
-    matched, no linear system is solved. On samples and on partial shapes, eigenvectors are not orthonormal,
-    so coefficients are computed by least squares.
+    gives the low frequencies of the deformed surface. The argument `levels` increases the number of
+    eigenvectors from iteration to iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020). The
+    remaining details of the surface rotate with the neighbourhoods of the vertices, as in
+    as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best rotation around each vertex is computed
+    from averages over its neighbourhood, which heat flow provides. On samples and on partial shapes,
+    eigenvectors are not orthonormal, so coefficients are computed by least squares. Otherwise no linear
+    system is solved.
 
     The next matches are the nearest vertices in a joint space of both surfaces. The coordinates of this space
     are positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra
-    have descriptors. The weight of the descriptors decreases from level to level. If one shape is a mirror
-    image, all rotations include a reflection.
+    have descriptors. The weight of the descriptors decreases as the number of eigenvectors increases. If one
+    shape is a mirror image of the other, all rotations include a reflection.
 
-    The initial map must be nearly right. The refined map is then closer to the ground truth than the results
-    of methods that use only eigenfunctions. The measurements are in docs/accuracy.md. The spectra need
-    positions and normals, which `jaxsmw.compute_spectrum` provides and `Spectrum.with_positions` adds.
+    The initial map must be nearly correct. The refined map is then closer to the ground truth than the
+    results of methods that use only eigenfunctions. The measurements are in docs/accuracy.md. The spectra
+    need positions and normals, which `jaxsmw.compute_spectrum` provides and `Spectrum.with_positions` adds.
 
     Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are
-    instead scaled by the same factor. Vertices of the full shape whose matches fit badly then get smaller
+    instead scaled by the same factor. Vertices of the full shape whose matches fit badly then receive smaller
     weights (`partial_matching_weights`).
 
     **Arguments:**
 
-    - `levels`: a tuple of integers of at least 1, the number of eigenvectors in each iteration. If the shapes
-      have different numbers of eigenvectors, a level is the number for the shape with more eigenvectors. The
-      other shape then uses a proportional number. Iterations beyond the last level use all eigenvectors, and
-      so do all iterations if the tuple is empty (the default).
+    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
+      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
+      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
+      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
+      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
     - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
       search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` finds the same
       matches but skips patches that are too far away. `"auto"` chooses `"patches"` on CPUs if the geometric
       mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
-    **Raises:** `TypeError` if `levels` is not a tuple of integers; `ValueError` if a level is below 1 or
+    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
     """
 
@@ -111,14 +113,14 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def update(
         self, prepared: PreparedSurfaces, pointwise_map: Int[Array, " m"], previous: Registered | None
     ) -> tuple[Registered, RESULTS]:
-        """Returns the deformations of both surfaces by their matches, and `RESULTS.successful`."""
+        """Returns the deformations that follow from the matches, and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         patches = prepared.reverse_patches
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
         active_x, active_y = self.active_eigenvectors(prepared, iteration)
         level = jnp.maximum(jnp.sum(active_x), jnp.sum(active_y)).astype(x.weights.dtype)
         weight = _DESCRIPTORS / level**_FALLING
-        if previous is None:  # The first reverse map compares Y only with X deformed onto Y.
+        if previous is None:  # The first reverse map needs only the deformation of X.
             forward = Deformation.along(x, all_y, pointwise_map, active_x)
             reverse_map = nearest_vertices(y.points, forward.points(all_x), all_x.mask, patches)
         else:
@@ -163,9 +165,9 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
 
 
 class _Surface(NamedTuple):
-    """Some vertices of a shape, in units of the square root of the area.
+    """All or some vertices of a shape, with lengths in units of the square root of the area.
 
-    `points` contains positions, normals and eigenfunctions, each multiplied by its weight.
+    `points` contains the positions, normals and eigenfunctions, multiplied by their weights.
     """
 
     eigenvectors: Float[Array, "n k"]
@@ -250,7 +252,7 @@ class PreparedSurfaces(Prepared):
 
 
 class Deformation(NamedTuple):
-    """A deformation of one surface onto another, as coefficients of the first surface's eigenvectors.
+    """A deformation of one surface onto another, as coefficients in the eigenvectors of the first surface.
 
     **Attributes:**
 
@@ -330,8 +332,9 @@ def _product_space(
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-    The points of two vertices are close if each vertex, deformed onto the other surface, is close to the
-    other vertex.
+    The points of a vertex of X and a vertex of Y are close to each other under two conditions: the vertex of
+    X, deformed onto Y, is close to the vertex of Y, and the vertex of Y, deformed onto X, is close to the
+    vertex of X.
     """
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
@@ -345,7 +348,7 @@ def _without_missing_parts(
     pointwise_map: Int[Array, " s"],
     reverse_map: Int[Array, " t"],
 ) -> tuple[_Surface, _Surface]:
-    """Returns both surfaces, weighted by `partial_matching_weights`.
+    """Returns both surfaces, with the vertex weights of `partial_matching_weights`.
 
     The residuals are the squared distances between matched points of the joint space, without descriptors.
     """
@@ -360,7 +363,7 @@ def _without_missing_parts(
 
 
 def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-    """Returns the rotations that best align neighbourhoods of vertices with neighbourhoods of matches.
+    """Returns the rotations that best align the neighbourhood of each vertex with that of its match.
 
     If one surface is a mirror image of the other, all rotations include a reflection.
     """
@@ -377,7 +380,8 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
     """Returns the rotation R that maximises the trace of R S for each covariance S (Horn 1987).
 
-    R and the trace are quadratic in the unit quaternion of R, so the best quaternion is an eigenvector.
+    The trace is a quadratic form in the unit quaternion of R, so the best quaternion is an eigenvector of the
+    matrix of this form. The eigenvector belongs to the largest eigenvalue.
     """
     table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
     quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
@@ -398,7 +402,11 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 @cache
 def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
-    """Returns the matrix from products of a quaternion's components to entries of its rotation matrix."""
+    """Returns the matrix of the linear map that takes quaternion products to a rotation matrix.
+
+    The 16 inputs are the products of any two components of a quaternion. The 9 outputs are the entries of the
+    rotation matrix of this quaternion.
+    """
     signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
     units = np.arange(4)
     multiplication = np.zeros((4, 4, 4))  # the product of two quaternion units is plus or minus a unit

@@ -53,15 +53,16 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
       `NearestOrthogonal()` makes the map of another solution orthogonal.
     - `convention`: the direction of the functional map C. A `"pullback"` (k_X, k_Y) takes functions on Y to
       functions on X. A `"pushforward"` (k_Y, k_X) takes functions on X to functions on Y, as in the notation
-      of the MWP paper. It is meant for study only, because it fails on real pairs. The docstring of
-      `spectral_embeddings` gives the reason.
-    - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"`, it is the largest eigenvalue
-      of each shape, so a difference in size between the shapes has no effect. With `"common"`, it is the
-      larger of the two shapes' largest eigenvalues.
+      of the MWP paper. The pushforward is meant for study only, because it fails on real pairs. The docstring
+      of `spectral_embeddings` explains why.
+    - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"` (the default), the bank ends at
+      the largest eigenvalue of each shape, so a difference in size between the shapes has no effect. With
+      `"common"`, it ends at the larger of the two shapes' largest eigenvalues on both shapes.
     - `search`: how nearest neighbours are found. `"exhaustive"` compares all vertices of X with all vertices
-      of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. On a CPU it is
-      several times as fast, but its compilation takes some seconds longer. `"auto"` chooses `"patches"` on
-      CPUs if the geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
+      of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. On large
+      shapes and a CPU, this search is several times as fast, but its compilation takes some seconds longer.
+      `"auto"` chooses `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least
+      15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `bank` is not a `FilterBank` or `solution` is not a `Solution`; `ValueError` if
     `convention`, `lambda_max` or `search` is unknown.
@@ -81,7 +82,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Returns both shapes with the responses of the filter bank at their eigenvalues.
+        """Returns a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
 
         **Arguments:**
 
@@ -113,19 +114,16 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Returns the state with the functional map of the solution, and the outcome of the solution.
+        """Returns the state with the functional map that the solution computes, and a status code.
 
-        The outcome is a member of `RESULTS`.
+        The status code is a member of `RESULTS`.
         """
         before = None if previous is None else previous.functional_map
         found, result = self.solution.solve(prepared.wavelets, prepared.solution, pointwise_map, before)
         return State(found), result
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,).
-
-        `decode` finds the same vertices.
-        """
+        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
