@@ -23,13 +23,13 @@ APPROXIMATE_FROM = 50_000
 """The smallest number of vertices for which the eigensolver `"auto"` chooses `"approximate"`."""
 
 Search = Literal["auto", "exhaustive", "patches"]
-"""The methods of nearest-neighbour search, which give the same result. `"auto"` chooses the faster method."""
+"""The methods of nearest-neighbour search. They give the same result; `"auto"` chooses the faster one."""
 
 GeodesicMethod = Literal["strips", "exact"]
 """The methods that compute geodesic distances; see `jaxsmw.geodesic_distances`."""
 
 IndexBase = Literal[0, 1]
-"""The index of the first vertex in files with vertex indices."""
+"""The values that the index of the first vertex in a file can have."""
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
@@ -47,9 +47,9 @@ MethodName = Literal[
     "zoomout",
     "zoomout-sampled",
 ]
-"""The methods of a benchmark; see `jaxsmw.evaluation.opponents.opponents.METHODS`."""
+"""The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.opponents.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""The methods of other libraries in a benchmark, which are available if these libraries are installed."""
+"""The names of methods of other libraries. A benchmark can measure them if these libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

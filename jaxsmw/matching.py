@@ -42,26 +42,31 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correspondence:
-    """The result of `match`, which contains a match on Y for every vertex of X.
+    """The result of `match`: a map from X to Y, the spectra, and statistics of the map.
+
+    The methods `surface_points`, `one_to_one`, `soft_map` and `expected_error` compute further results.
 
     **Attributes:**
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
-    - `pointwise_map`: T: X -> Y (m,). Entry i is the match of vertex i of X, as a 0-based vertex of Y.
-    - `initial_map`: the map from which refinement started (m,), as 0-based vertices of Y.
-    - `preset`: the `Preset` with the stages of refinement and the settings of the repair. Their sizes are
-      adapted to small meshes, unless stages were given to `match`.
+    - `pointwise_map`: T: X -> Y (m,), int64. Entry i is the match of vertex i of X, as a 0-based vertex of Y.
+    - `functional_map`: the functional map of the last iteration, a property. Its shape is (k_X, k_Y) for a
+      pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
+    - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
+    - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
+      the stages of a preset differ from the stages in `PRESETS`; see `match`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the k_X and k_Y eigenvectors of the last stage.
-      Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by the same factor;
-      see `Pair.units_of_length`.
-    - `refinement`: the `Refinement` that the last stage returned, with its `History` if requested.
+      Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by the same factor,
+      which gives the larger shape area 1.
+    - `refinement`: the `Refinement` of the last stage. It contains a `History` if `match` was called with
+      `history=True`.
     - `iterations`: the total number of iterations of all stages.
-    - `distortion`: `jaxsmw.repair.scores.distortion` of the map: 1 for isometries, larger for worse maps.
-      None if the preset has no repair.
-    - `suspicious`: True if limbs still look swapped or the body looks upside down. False if the preset has no
-      repair.
-    - `seconds`: the wall time of each step in seconds, by the name of the step. The first refinement of
-      meshes of a given size includes compilation.
+    - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
+      and larger for worse maps; None if the preset has no repair.
+    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. The flag is
+      always False if the preset has no repair.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
+      meshes of a given size includes the time of compilation.
     """
 
     pair: Pair
@@ -106,11 +111,11 @@ class Correspondence:
 
         The last stage embeds X and Y in a common space. Each vertex of X is mapped to the nearest point on
         the triangles of Y in this space, whereas `pointwise_map` contains the nearest vertex; see
-        `jaxsmw.functional_maps.decode_to_triangles`. An unreferenced vertex of X gets the point of the
+        `jaxsmw.functional_maps.decode_to_triangles`. An unreferenced vertex of X receives the point of the
         nearest referenced vertex.
 
-        **Returns:** `SurfacePoints` on Y, one for each of the m vertices of X: the faces, as rows of
-        `mesh_y.faces` (m,), and barycentric weights (m, 3).
+        **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
+        0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
         with self._precision():
             faces, traced_weights = compiled(nearest_point_on_triangles)(
@@ -124,13 +129,13 @@ class Correspondence:
         """Compute a map in which no two vertices of X share a match; see `jaxsmw.geometry.one_to_one_map`.
 
         The map is intended for shapes with the same triangulation. Between different triangulations,
-        `pointwise_map` has much smaller errors. As an exception, an unreferenced vertex of X shares the match
-        of the nearest referenced vertex.
+        `pointwise_map` has much smaller errors. Unreferenced vertices of X are an exception: each shares the
+        match of the nearest referenced vertex.
 
         **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
-        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of the numbers of
-        referenced vertices is above 20 000².
+        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of X's and Y's
+        numbers of referenced vertices is above 20 000².
         """
         queries, database = (np.asarray(points) for points in self._embeddings())
         used = self.mesh_x.referenced_vertices
@@ -140,14 +145,14 @@ class Correspondence:
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
-        The soft map transfers functions smoothly from Y to X (`SoftMap.pull_back`), and its pointwise map
-        covers more of Y than `Correspondence.pointwise_map` covers. On four remeshed FAUST pairs, the
-        pointwise map of the soft map covers 76 to 82 % of Y's vertices instead of 69 to 75 %. Its errors are
-        between 4 % smaller and 2 % larger. One iteration takes 0.2 seconds for 5000 vertices, and 20
-        iterations are needed.
+        `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
+        than `Correspondence.pointwise_map`. On four remeshed FAUST pairs, the former covers 76 to 82 % of Y's
+        vertices, and the latter covers 69 to 75 %. The errors of the former are between 4 % smaller and 2 %
+        larger than those of the latter. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations
+        are needed.
 
-        An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a warning
-        if the share of misplaced area is larger than `tolerance` after the last iteration.
+        An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
+        `UserWarning` if the share of misplaced area is larger than `tolerance` after the last iteration.
 
         **Arguments:**
 
@@ -156,12 +161,14 @@ class Correspondence:
           temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A temperature of 1 gives
           a softer map.
         - `iterations`: the largest number of iterations, an integer of at least 1.
-        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. This is the share
-          of the total area that vertices of Y receive in excess of their own area. With tolerances below a
-          few hundredths, further iterations only move area across the body. This does not improve the map
-          between two different bodies.
+        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
+          the area that vertices of Y receive in excess of their own areas. A tolerance below a few hundredths
+          leads to further iterations that only move area across the body. These iterations do not improve a
+          map between two different bodies.
 
-        **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y.
+        **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y. Its method `pull_back` takes
+        p functions on Y (n, p) to functions on X (m, p), and its method `pointwise_map` returns a map X -> Y
+        (m,). Its attribute `converged` is True if the tolerance was reached.
 
         **Raises:** `InputError` if the temperature or the number of iterations is not positive.
         """
@@ -182,7 +189,7 @@ class Correspondence:
         if not found.converged:
             warnings.warn(
                 f"the soft map has not converged: after {iterations} iterations, the share of misplaced area "
-                f"is {float(found.residual):.3g}, more than the tolerance {tolerance:g}: allow more "
+                f"is {float(found.residual):.3g}, which exceeds the tolerance {tolerance:g}: allow more "
                 "iterations, a higher temperature or a larger tolerance.",
                 stacklevel=2,
             )
@@ -191,10 +198,11 @@ class Correspondence:
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """Estimate the geodesic error of every match without ground truth.
 
-        `jaxsmw.repair.expected_error` explains the estimate. An unreferenced vertex of X gets the value of
-        the nearest referenced vertex.
+        `jaxsmw.repair.expected_error` explains the estimate. An unreferenced vertex of X receives the value
+        of the nearest referenced vertex.
 
-        **Returns:** The expected error of every match (m,), divided by the square root of Y's area.
+        **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
+        the square root of Y's area.
         """
         with self._precision():
             reverse_map = compiled(_reverse_map)(*self._last_stage())
@@ -204,9 +212,10 @@ class Correspondence:
         return extend_to_unreferenced(self.mesh_x, expected)
 
     def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Return the embeddings of X and Y in the last stage, in which matches are nearest neighbours.
+        """Return the embeddings of X and Y in the last stage.
 
-        An unreferenced vertex of X has the same embedding as the nearest referenced vertex.
+        The match of a vertex of X is its nearest neighbour among the embedded vertices of Y. An unreferenced
+        vertex of X has the same embedding as the nearest referenced vertex.
         """
         with self._precision():
             queries, database = compiled(_embeddings)(*self._last_stage())
@@ -244,46 +253,55 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    The function issues a warning if the map still looks wrong after repair.
+    The function issues a `UserWarning` if the map still looks wrong after repair, or if a mesh is too coarse
+    for descriptors that a preset uses.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement, which is one of the following. Presets use fewer eigenvectors and
-      samples on small meshes. Stages are used with exactly the given sizes.
+    - `preset`: the method of refinement, which is one of the following. The first four are adapted to small
+      meshes: they use at most half as many eigenvectors as vertices, and no samples if a mesh does not have
+      more vertices than samples. Given stages are not adapted.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
-        - `"fast"`: the method of the MWP paper on samples.
+        - `"fast"`: the method of the MWP paper on 500 samples of each shape.
         - a `Preset`.
-        - a `Stage` or several stages, for example
+        - a `Stage`, or a list or tuple of stages. An example is
           `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`.
 
     - `init`: the initial map, which is one of the following.
 
         - `"shot"` (the default), `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
           the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
-          With `"shot"`, presets with repair also try alternative initial maps.
-        - `"functional"`: the initial map follows from the functional map that preserves SHOT and commutes
+          With `"shot"`, repair also tries alternative initial maps.
+        - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
           with the Laplacian (section 3.2 of the MWP paper). It is smoother than the initial map `"shot"` and
-          has smaller errors. The refined map is often worse, though (docs/results.md).
-        - an array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: the given pointwise map is used.
+          has smaller errors. However, the refined map often has larger errors (docs/results.md).
+        - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
-          0-based: vertices are compared by SHOT and by their geodesic distances to the landmarks. Give a few
-          landmarks on both sides of the body.
+          0-based. The initial map then consists of nearest neighbours in SHOT and in geodesic distances to
+          the landmarks. Give a few landmarks on both sides of the body.
 
-    - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
-    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
-      length; see `paired_spectra`.
+    - `laplacian`: the discretization of the Laplacian: `"cotangent"`; `"robust"`, which also handles
+      non-manifold and badly shaped meshes; or `"auto"` (the default), which chooses `"robust"` only for
+      meshes that need it.
+    - `eigensolver`: `"exact"`; `"approximate"`, which takes less time on large meshes; or `"auto"` (the
+      default), which chooses `"approximate"` if one mesh has at least 50 000 referenced vertices.
+    - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length; see `paired_spectra`. False, the default, for two full shapes.
     - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
 
-    **Returns:** A `Correspondence`. An unreferenced vertex of X (in no face) gets the match of the nearest
-    referenced vertex. Unreferenced vertices of Y are never matched.
+    **Returns:** A `Correspondence`. Its attributes include `pointwise_map` (m,), an int64 array of 0-based
+    vertices of Y, and `functional_map`, `spectrum_x`, `spectrum_y`, `distortion` and `suspicious`. An
+    unreferenced vertex of X (in no face) receives the match of the nearest referenced vertex. Unreferenced
+    vertices of Y are never matched.
 
-    **Raises:** `InputError` for arguments that cannot be used. `ArithmeticError` if a computation fails.
+    **Raises:** `InputError` if a mesh cannot be used or has too few vertices, if the preset or the initial
+    map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
+    computation of the initial map or the refinement fails numerically.
     """
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
     adapts = isinstance(preset, str | Preset)  # given stages keep their sizes
@@ -315,13 +333,13 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     """Compile the programs of all stages in the background.
 
     Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
-    compiled if the preset has at least as many eigenvectors as a mesh has vertices, because `prepare` then
+    compiled if the preset uses at least as many eigenvectors as a mesh has vertices, because `prepare` then
     raises an error.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []
     sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
-    # The last stages are compiled first, because their compilation takes the longest time.
+    # The last stage is compiled first, because its compilation takes the longest time.
     return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
 
 
@@ -358,7 +376,7 @@ def _correspondence(
 
 
 def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -> str:
-    """Return the text of the warning that a map looks wrong: the symptoms and possible remedies."""
+    """Return the text of the warning that a map looks wrong."""
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
     found = np.asarray(outcome.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
     areas = pair.mesh_x.vertex_areas / pair.mesh_x.area

@@ -27,8 +27,8 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-# Shapes with more vertices are not padded, because the padding costs too much memory compared with the time
-# that it saves in compilation.
+# The largest number of vertices of a mesh that is padded. For larger meshes, the memory of the padding costs
+# more than the saved compilation time is worth.
 _PADDED_UP_TO = 50_000
 
 
@@ -44,7 +44,7 @@ def program_size(mesh: Mesh) -> int:
 
 @dataclass(frozen=True, eq=False)
 class PreparedPair:
-    """The result of `prepare`: a pair with the spectra, the initial map and the samples for refinement.
+    """The result of `prepare`, which contains the data that refinement needs.
 
     **Attributes:**
 
@@ -53,9 +53,9 @@ class PreparedPair:
       contain descriptors if descriptors were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
     - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
-    - `samples`: 0-based samples of X (s,) and of Y (s,) in farthest-point order; None if no samples were
-      requested.
-    - `seconds`: the wall time of each step of the preparation in seconds, by the name of the step.
+    - `samples`: a pair of arrays, the samples of X (s,) and of Y (s,) as 0-based vertices in farthest-point
+      order; None if no samples were requested.
+    - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
     """
 
     pair: Pair
@@ -77,8 +77,8 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # Refinement returns int32 maps. Therefore the same compiled program accepts this map and refined
-        # maps.
+        # Refinement returns maps of type int32. With the same type, an initial map needs no further compiled
+        # program.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
@@ -108,18 +108,20 @@ def prepare(
       descriptors are computed.
     - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
       are computed.
-    - `init`: the initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`; a pointwise map (m,)
-      or m `SurfacePoints` on Y; or landmarks (l, 2). See `match`.
+    - `init`: the initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`; a pointwise map
+      (m,) of 0-based vertices of Y; m `SurfacePoints` on Y; or landmarks (l, 2), with a vertex of X and its
+      match on Y in each row. See `match`.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
-      function issues a warning instead, and the spectra have no descriptors.
+      function issues a `UserWarning` instead, and the spectra contain no descriptors.
 
     **Returns:** A `PreparedPair` with the attributes `pair`, `spectrum_x`, `spectrum_y`, `init`,
     `initial_map` (m,), `samples` and `seconds`.
 
-    **Raises:** `InputError` for arguments that cannot be used. `ArithmeticError` if the initial map cannot be
-    computed.
+    **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
+    zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
+    descriptors. `ArithmeticError` if the initial map cannot be computed.
     """
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):
@@ -128,8 +130,8 @@ def prepare(
         if np.asarray(spectrum.eigenvalues)[-1] == 0:
             raise InputError(
                 f"{mesh.name}: {number_of_eigenvectors} eigenvectors only distinguish connected components: "
-                "compute more eigenvectors than components, or join vertices at the same position "
-                "(weld=True, on the command line --weld)."
+                "compute more eigenvectors than the mesh has components, or join vertices at the same "
+                "position (weld=True, on the command line --weld)."
             )
     with timed("initial map", seconds):
         start = initial_map(pair, *spectra, init=init)

@@ -16,7 +16,7 @@ from jaxsmw.stage import Stage
 
 @dataclass(frozen=True)
 class Preset:
-    """A method for `jaxsmw.match`: stages of refinement, and settings for the repair of maps that look wrong.
+    """Stages of refinement and settings of the repair, for the argument `preset` of `jaxsmw.match`.
 
     `jaxsmw.PRESETS` contains three ready presets.
 
@@ -27,8 +27,10 @@ class Preset:
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if the stage that
-    repair repeats (`RepairSettings.stage`) does not exist or has a refiner without levels.
+    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if `repair.stage`, the
+    position of the stage that repair repeats, is not a position of a stage. `InputError` is also raised if
+    the refiner of this stage has no levels, or if the stage has fewer samples than the largest fallback
+    level.
     """
 
     stages: tuple[Stage, ...]
@@ -51,7 +53,7 @@ class Preset:
         self.stages[self.repair.stage].with_levels(self.repair.fallback_levels)
 
     def fitted(self, number_of_vertices: int) -> Preset:
-        """Return the preset adapted to small meshes; see `Stage.fitted`."""
+        """Return the preset with every stage adapted to a small mesh; see `Stage.fitted`."""
         return replace(self, stages=tuple(stage.fitted(number_of_vertices) for stage in self.stages))
 
     def without_descriptors(self) -> Preset:
@@ -88,12 +90,13 @@ PRESETS: dict[PresetName, Preset] = {
         RepairSettings(stage=1),
     ),
 }
-"""The presets of `jaxsmw.match` by name. Each value is a `Preset`.
+"""A dictionary from the names of the presets of `jaxsmw.match` to the presets, each a `Preset`.
 
 `"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
-iterations. `"fast"` is the fast variant of the MWP authors, which iterates on 500 samples. `"accurate"` has
-three stages and repair: the stage of `"paper"`, `FeatureRegression` with up to 35 eigenvectors, and
-`Registration` with up to 200 eigenvectors. `docs/accuracy.md` measures the accuracy of `"accurate"`.
+iterations. `"fast"` has the same stage with iterations on 500 samples of each shape, as in the fast variant
+of the MWP authors. `"accurate"` has three stages and repair: the stage of `"paper"`, `FeatureRegression` with
+up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors. `docs/accuracy.md` reports the errors
+of `"accurate"`.
 """
 
 
@@ -102,7 +105,8 @@ def choose_preset(preset: str | Preset | Stage | Sequence[Stage]) -> Preset:
 
     **Arguments:**
 
-    - `preset`: a key of `PRESETS`, a `Preset` (which is returned unchanged), a stage, or several stages.
+    - `preset`: a key of `PRESETS`, a `Preset` (which is returned unchanged), a stage, or an iterable of
+      stages.
 
     **Raises:** `InputError` if the name is unknown, or if the argument is not a preset, a stage or several
     stages.

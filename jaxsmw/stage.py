@@ -1,4 +1,4 @@
-"""A stage of refinement: a refiner and its sizes, which JAX compiles as one program."""
+"""A stage of refinement, which is a refiner with its sizes. JAX compiles each stage as one program."""
 
 from __future__ import annotations
 
@@ -33,15 +33,16 @@ class Stage:
     - `refiner`: the method, an instance of a subclass of `Refiner`: `WaveletPreservation` (the default),
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
-    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1. For a refiner with
-      levels, this number is the largest level. For other refiners, the default is 100.
-    - `iterations`: the number of iterations, at least 1. For a refiner with levels, this number is the number
-      of levels. For other refiners, the default is 3.
+    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
+      refiner with levels (`FeatureRegression` or `Registration`), leave the argument out. The attribute is
+      then the largest level.
+    - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
+      argument out. The attribute is then the number of levels.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates, at least the
-      number of eigenvectors. The last step then matches all vertices. None, the default, means that all
-      iterations use all vertices.
+      number of eigenvectors. The final nearest-neighbour search then matches all vertices. None, the default,
+      means that all iterations use all vertices.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`; if a size is not a whole number, is out of range
@@ -103,7 +104,7 @@ class Stage:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The keyword arguments of `jaxsmw.refine` that this stage determines and that are not arrays."""
+        """The refiner, the iterations and `stop_when_unchanged`, as keyword arguments of `jaxsmw.refine`."""
         return {
             "refiner": self.refiner,
             "iterations": self.iterations,
@@ -118,7 +119,7 @@ class Stage:
 
         **Arguments:**
 
-        - `levels`: the number of eigenvectors in each iteration.
+        - `levels`: the number of eigenvectors in each iteration, as a tuple of integers.
 
         **Raises:** `InputError` if the refiner has no levels, or if there are fewer samples than
         eigenvectors.
@@ -138,8 +139,8 @@ class Stage:
     def fitted(self, number_of_vertices: int) -> Stage:
         """Return the stage adapted to a small mesh.
 
-        The number of eigenvectors becomes at most half the number of vertices. If the mesh has no more
-        vertices than the number of samples, the stage uses all vertices instead of samples.
+        The number of eigenvectors is reduced to at most half the number of vertices. If the number of samples
+        is at least the number of vertices, the stage uses all vertices instead of samples.
 
         **Arguments:**
 
@@ -161,8 +162,8 @@ class Stage:
     ) -> tuple[Spectrum, Spectrum]:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        The spectra of a partial pair are then cut to a common range of eigenvalues
-        (`jaxsmw.pair.common_range`).
+        For a partial pair, eigenpairs with eigenvalues above the smaller of the two spectra's largest
+        eigenvalues are then removed (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 
@@ -194,13 +195,13 @@ class Stage:
 
         - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
         - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y.
-        - `samples`: samples of X and of Y in farthest-point order, at least `number_of_samples` of each. None
-          if the stage uses no samples.
+        - `samples`: a pair of integer arrays, the samples of X and of Y in farthest-point order. Each array
+          contains at least `number_of_samples` vertices. None if the stage uses no samples.
         - `partial`: whether one of the shapes is a partial shape.
         - `history`: whether to record a `History`; see `jaxsmw.refine`.
 
-        **Returns:** The `Refinement`. Its attribute `result` is a status code (`RESULTS`), which tells
-        whether refinement succeeded.
+        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map. Its attribute
+        `result` is `RESULTS.successful`, or another member of `RESULTS` after a failure.
         """
         arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
         settings = {**options, **self.settings, "partial": partial, "history": history}
@@ -253,7 +254,7 @@ class Stage:
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """Return the size that the refiner's levels require. Without levels, return the given or default size."""
+    """Return the size that the refiner's levels require or, without levels, the given or default size."""
     if derived is None:
         return default if given is None else given
     if given is not None and given != derived:

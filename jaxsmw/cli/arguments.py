@@ -10,7 +10,7 @@ from typing import get_args
 from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian
 from jaxsmw.errors import InputError
 
-# The largest 32-bit integer: JAX uses 32-bit integers by default.
+# The largest 32-bit integer, because JAX uses 32-bit integers by default.
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
@@ -38,7 +38,7 @@ def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int
 
 
 def path(text: str) -> str:
-    """Argument type for the name of a file or directory, which need not exist.
+    """Return the name of a file or directory, which need not exist, if it can be used as a name.
 
     **Raises:** `argparse.ArgumentTypeError` if the name is empty, or no file can have this name.
     """
@@ -72,7 +72,7 @@ def add_source_and_target(parser: argparse.ArgumentParser) -> None:
         "source",
         type=path,
         metavar="SOURCE",
-        help="source mesh; each of its vertices gets a match on the target",
+        help="source mesh; each of its vertices receives a match on the target",
     )
     parser.add_argument("target", type=path, metavar="TARGET", help="target mesh")
 
@@ -141,9 +141,9 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
     **Arguments:**
 
     - `options`: the parsed options.
-    - `needed`: the name of the other option, for the message.
-    - `is_given`: whether the other option is given.
-    - `names`: the options that have no effect without the other option, as attribute names of `options`.
+    - `needed`: the name of the option that may be missing, for the message.
+    - `is_given`: whether the option `needed` is given.
+    - `names`: the options that have no effect without `needed`, as attribute names of `options`.
 
     **Raises:** `InputError` that names the first option without effect.
     """

@@ -11,8 +11,8 @@ from jaxsmw.errors import InputError
 if TYPE_CHECKING:
     from jaxsmw.core.banks import FilterBank
 
-# The class name of each filter bank in `jaxsmw.core.banks`. The first filter bank is the bank of the MWP
-# paper.
+# A dictionary from the name of each filter bank to its class name in `jaxsmw.core.banks`. The first entry is
+# the filter bank of the MWP paper.
 BANKS = {
     "meyer": "Meyer",
     "simple-tight": "SimpleTight",
@@ -30,9 +30,9 @@ BANKS = {
     "identity": "Identity",
 }
 _PAPER_BANK = next(iter(BANKS))
-# Banks whose names have this prefix are warped by the distribution of the eigenvalues.
+# A filter bank whose name has this prefix is warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# The largest accepted number of filters. More filters than eigenvalues are useless, and eigenbases have fewer
+# The largest accepted number of filters. More filters than eigenvalues are useless, and spectra contain fewer
 # eigenvalues than this number.
 _MOST_FILTERS = 10_000
 
@@ -86,12 +86,12 @@ def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
 
     from jaxsmw.core.banks import frame_bounds
 
-    # The eigenvalues of a surface are nearly evenly spaced, so the bounds are computed for evenly spaced
-    # numbers. `filter_jit` compiles the function as one program, instead of forty small programs.
+    # The eigenvalues of a surface are nearly evenly spaced, so the bounds are computed for the eigenvalues 0,
+    # 1, ..., 100. `filter_jit` compiles the function as one program instead of forty small programs.
     lower, upper = map(float, eqx.filter_jit(frame_bounds)(bank, jnp.arange(101.0), over="interval"))
     return None if upper < _TIGHT * lower else (lower, upper)
 
 
-# A frame counts as tight if the upper bound is less than this multiple of the lower bound. The bounds of
+# A frame is treated as tight if its upper bound is less than this multiple of its lower bound. The bounds of
 # tight frames differ only by rounding errors. The bounds of all other banks differ by a third or more.
 _TIGHT = 1.01

@@ -32,10 +32,11 @@ def measure_match(
     - `truth`: the ground truth, or None.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
     - `stopwatch`: the stopwatch of the command.
-    - `others`: maps by name, which are measured in addition to the initial map and the refined map.
+    - `others`: a dictionary from names to maps. These maps are measured in addition to the initial map and
+      the refined map.
 
-    **Returns:** The errors by the names of the maps: `initial`, the names in `others`, and `refined`. The
-    dictionary is empty if there is no ground truth.
+    **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
+    `others`, and `refined`. The dictionary is empty if there is no ground truth.
     """
     if truth is None:
         return {}
@@ -57,13 +58,13 @@ def write_match_report(
     *,
     up: Any,
 ) -> None:
-    """Write the report of a match. The summary of the report lists the options as settings.
+    """Write the report of a match. The report's summary contains the options of the command.
 
     **Arguments:**
 
     - `directory`: the directory to write to.
     - `correspondence`: the result of `match`.
-    - `errors`: the errors by the names of the maps; see `measure_match`.
+    - `errors`: a dictionary from the name of each map to its errors; see `measure_match`.
     - `options`: the parsed options of the command.
     - `stopwatch`: the stopwatch of the command.
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.

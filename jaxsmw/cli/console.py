@@ -40,8 +40,8 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python flushes the buffer again at exit. Without this redirection to the null device, Python would
-        # then report the same error again.
+        # Python flushes standard output again at exit. Standard output is redirected to the null device, because
+        # Python would otherwise report the same error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise
@@ -92,12 +92,20 @@ class Stopwatch:
         self.add({name: time.perf_counter() - began})
 
     def add(self, seconds: dict[str, float]) -> None:
-        """Add the times of steps that were measured elsewhere, in seconds, by the names of the steps."""
+        """Add times that were measured elsewhere.
+
+        **Arguments:**
+
+        - `seconds`: a dictionary from the name of each step to its time in seconds.
+        """
         for name, more in seconds.items():
             self._seconds[name] = self._seconds.get(name, 0.0) + more
 
     def steps(self) -> dict[str, float]:
-        """Return the seconds of each step so far. The entry `other` is the time outside of all steps."""
+        """Return a dictionary from the name of each step to its time so far, in seconds.
+
+        The entry `other` is the time outside of all steps.
+        """
         total = time.perf_counter() - self._began
         return {**self._seconds, "other": total - sum(self._seconds.values())}
 

@@ -57,7 +57,7 @@ def read_maps(
 ) -> dict[str, Int64[np.ndarray, " m"]]:
     """Read pointwise maps X -> Y with `jaxsmw.read_pointwise_map`.
 
-    **Returns:** The maps (m,), as 0-based vertices of Y, by the names of their files.
+    **Returns:** A dictionary from the name of each file to its map (m,), as 0-based vertices of Y.
 
     **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
     """
@@ -71,7 +71,7 @@ def read_maps(
 
 
 def initial_map(text: str) -> str:
-    """Argument type for an initial map: a name, `landmarks:FILE` or `map:FILE`.
+    """Return a value of `--init` if it is the name of an initial map, `landmarks:FILE` or `map:FILE`.
 
     **Raises:** `argparse.ArgumentTypeError` for any other text.
     """
@@ -88,7 +88,7 @@ _INITIAL_MAP_FILES = ("landmarks", "map")
 
 
 def initial_map_file(init: str) -> str | None:
-    """Return the file that the value of `--init` names, or None if it names no file."""
+    """Return the file name in a value of `--init`, or None if the value contains no file name."""
     return init.partition(":")[2] or None
 
 

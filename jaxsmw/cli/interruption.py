@@ -1,7 +1,7 @@
 """Termination on Ctrl-C: the process ends immediately, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
-code returns to Python. Functions that run during garbage collection suppress the exception, and imports of
+code returns to Python. Python discards the exception if it occurs during garbage collection, and imports of
 extension modules turn it into other errors. Therefore this module raises no exception. A signal handler in
 the main thread ends the process. If the main thread is in compiled code, a second thread ends the process.
 """
@@ -61,10 +61,10 @@ def announce_consequence(consequence: str) -> None:
 def quiet_children() -> Iterator[None]:
     """Return a context manager that prevents child processes from printing messages on interruption.
 
-    The context manager applies to processes that this thread starts in the block. A terminal also sends
-    SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the processes inherit this
-    setting. Another thread of this process receives the signal. The context manager also silences the warning
-    with which Python's resource tracker reports leaked semaphores.
+    The context manager applies to processes that this thread starts in the block. On Ctrl-C, a terminal also
+    sends SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the child processes
+    inherit this setting. Another thread of this process still receives the signal. The context manager also
+    silences the warning with which Python's resource tracker reports leaked semaphores.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))

@@ -142,11 +142,11 @@ def _check(options: argparse.Namespace) -> None:
         files=[options.output, points, options.one_to_one, expected],
         directories=_directories(options),
     )
-    import jaxsmw.matching  # noqa: F401 (imported here so that the stopwatch counts it as loading)
+    import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the requested directories, each with the names of the files in it."""
+    """Return the requested directories, each with the names of the files that are written to it."""
     directories: list[tuple[str, tuple[str, ...]]] = []
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
@@ -166,7 +166,11 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Any]:
-    """Write all files except the report, and return all maps except the refined map, by name."""
+    """Write all files except the report.
+
+    **Returns:** A dictionary from the names `one-to-one` and `surface` to these maps. Maps that were not
+    requested are left out.
+    """
     from jaxsmw.io.map_files import write_pointwise_map
 
     others: dict[str, Any] = {}

@@ -23,7 +23,7 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
 
     - `parser`: the parser.
     - `required`: whether the command requires the option.
-    - `purpose`: the beginning of the help text. A list of the accepted files follows.
+    - `purpose`: the beginning of the help text, before the list of accepted files.
     """
     parser.add_argument(
         "--ground-truth",
@@ -86,11 +86,12 @@ def measure_errors(
     **Arguments:**
 
     - `mesh_y`: the target Y.
-    - `maps`: maps X -> Y by name, each as vertices of Y (m,) or m `SurfacePoints` on Y.
+    - `maps`: a dictionary from the name of each map to the map X -> Y. A map consists of 0-based vertices of Y
+      (m,) or of m `SurfacePoints` on Y.
     - `truth`: the ground truth.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
 
-    **Returns:** The geodesic errors by the names of the maps.
+    **Returns:** A dictionary from the name of each map to its geodesic errors.
     """
     from jaxsmw.evaluation.metrics import geodesic_error
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from jaxsmw.matching import Correspondence
     from jaxsmw.stage import Stage
 
-# The class name and the arguments of each solution. The first solution is the solution of the MWP paper.
+# A dictionary from the name of each solution to its class name and its arguments. The first solution is the
+# solution of the MWP paper.
 _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "filtering": ("Filtering", ()),
     "least-squares": ("LeastSquares", ()),
@@ -96,8 +97,8 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--solution",
         choices=tuple(_SOLUTIONS),
         help="computation of the functional map: filtering is meant for banks that are tight frames; "
-        "least-squares is exact for all banks; least-squares-frobenius is exact too, but gives all vertices "
-        "the same weight; regularized is least-squares with additional terms for commutativity with the "
+        "least-squares computes the exact minimiser for all banks; least-squares-frobenius is the same, but "
+        "gives all vertices equal weight; regularized is least-squares with additional terms for commutativity with the "
         f"Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
@@ -129,9 +130,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Check that options that change the MWP paper's method are not combined with another preset.
+    """Refuse options that change the MWP paper's method if another preset is given.
 
-    **Raises:** `InputError` that names the first option that changes the method.
+    **Raises:** `InputError` that names the first of these options.
     """
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
@@ -234,7 +235,7 @@ def _note_loose_frame(name: str, bounds: tuple[float, float] | None) -> None:
         lower, upper = bounds
         say(
             f"note: {name} is not a tight frame (frame bounds {lower:.2g} and {upper:.2g}), but filtering is "
-            "meant for tight frames; --solution least-squares is exact for every bank."
+            "meant for tight frames; --solution least-squares is exact for all banks."
         )
 
 

@@ -26,8 +26,8 @@ def check_outputs(
 ) -> None:
     """Check before a long computation that all outputs can be written.
 
-    An output must not replace an input or another output. Paths are compared after symbolic links are
-    resolved. Entries that are None are skipped.
+    No output may replace an input or another output. Paths are compared after symbolic links are resolved.
+    Entries that are None are skipped.
 
     **Arguments:**
 
@@ -119,15 +119,15 @@ def write_comparison_page(
 ) -> None:
     """Write an interactive page that compares maps with `jaxsmw.report.summary.write_comparison`.
 
-    The page labels each map with its file name without suffix. If two maps would have the same label, the
-    page uses the file names with suffix, or else the full paths.
+    The page labels each map with its file name without suffix. If two of these labels are equal, the page uses
+    the file names with suffix instead. If two file names are equal, the page uses the full paths.
 
     **Arguments:**
 
     - `path`: the page to write.
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-    - `maps`: maps X -> Y (m,), by the paths of their files.
-    - `errors`: the geodesic errors of the maps, by the same paths; empty if errors are unknown.
+    - `maps`: a dictionary from the path of each file to its map X -> Y (m,).
+    - `errors`: a dictionary from the same paths to the geodesic errors; empty if errors are unknown.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
     - `up`: the axis of the meshes that points up; None to guess the axis.
     """
