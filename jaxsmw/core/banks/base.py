@@ -16,9 +16,11 @@ class FilterBank(eqx.Module):
     `CubicSpline`.
 
     A subclass must define `__call__(points, eigenvalues)`, which returns the responses (filters, p) of all
-    filters at p points. A bank is an Equinox module, and therefore a pytree. Its continuous parameters are
-    arrays, which JAX can trace and differentiate. Its sizes, such as the number of filters, are static
-    fields.
+    filters at p points. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,), ascending, are those of the
+    shape, and the last eigenvalue is lambda_max.
+
+    A bank is an Equinox module, and therefore a pytree. The continuous parameters of a bank are arrays, which
+    JAX can trace and differentiate. Its sizes, such as the number of filters, are static fields.
     """
 
     @abc.abstractmethod
@@ -33,8 +35,7 @@ class FilterBank(eqx.Module):
 
         - `points`: (p,), points in [0, lambda_max], in any order.
         - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
-          last eigenvalue is lambda_max. Most banks use only lambda_max, but a bank may adapt to all
-          eigenvalues.
+          last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other eigenvalues.
 
         **Returns:** The responses (filters, p), numbers without unit. Row 0 is the scaling function.
         """
@@ -60,7 +61,7 @@ def sample_bank(
 
 
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
-    """Checks the number of filters that a bank is given.
+    """Checks the number of filters of a bank.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `least`.
     """

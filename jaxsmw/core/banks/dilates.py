@@ -1,4 +1,4 @@
-"""Filter banks that evaluate one kernel at several scales."""
+"""Filter banks that evaluate one function at several scales."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _LogSpacedDilates(FilterBank):
-    """A bank of one wavelet kernel at log-spaced scales and of a scaling function.
+    """A bank of a scaling function and of one wavelet at log-spaced scales.
 
-    The scaling function covers the eigenvalues below `lambda_max / ratio`.
+    The scaling function passes the eigenvalues below `lambda_max / ratio`.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -29,7 +29,7 @@ class _LogSpacedDilates(FilterBank):
 
     @abc.abstractmethod
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the wavelet kernel at `scaled`, the products of scales and eigenvalues."""
+        """Returns the wavelet at `scaled`, the products of scales and eigenvalues."""
 
     @abc.abstractmethod
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -53,21 +53,24 @@ class CubicSpline(_LogSpacedDilates):
 
     The wavelet is a function of y, the product of the scale and the eigenvalue lambda. It equals y² for y
     below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
-    log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function covers the eigenvalues
-    below `lambda_max / ratio`. `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k
-    eigenvalues in any unit, scaling function first.
+    log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function passes the eigenvalues
+    below `lambda_max / ratio`.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
+    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The wavelet is that of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
-    theory", 2011, also known as "abspline". It is also the general (not tight) wavelet of the MWP paper. With
-    the default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
+    theory", 2011, also known as "abspline". The MWP paper uses it as the general wavelet, which is not tight.
+    With the default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
 
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. The
-      value is a single number above 1, or an array of shape ().
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
-      units of 1 / lambda_max. The default is False.
+    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets pass the
+      eigenvalues from `lambda_max / ratio` on.
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
+      1 / lambda_max. The default is False.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `ratio` is not a single finite number above 1.
@@ -89,9 +92,11 @@ class MexicanHat(_LogSpacedDilates):
 
     Here y is the product of the scale and the eigenvalue lambda. In space, this wavelet corresponds to the
     second derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
-    `1 / lambda_max`. The scaling function covers the eigenvalues below `lambda_max / ratio`.
-    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit, scaling
-    function first.
+    `1 / lambda_max`. The scaling function passes the eigenvalues below `lambda_max / ratio`.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
+    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014. The
     scales are those of Hammond, Vandergheynst and Gribonval 2011. With the default parameters, the frame
@@ -100,10 +105,10 @@ class MexicanHat(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: lambda_max divided by the smallest eigenvalue that the wavelets cover, by default 20. The
-      value is a single number above 1, or an array of shape ().
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale. Here the scale is in
-      units of 1 / lambda_max. The default is False.
+    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets pass the
+      eigenvalues from `lambda_max / ratio` on.
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
+      1 / lambda_max. The default is False.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `ratio` is not a single finite number above 1.
@@ -119,16 +124,19 @@ class MexicanHat(_LogSpacedDilates):
 class Heat(FilterBank):
     """A filter bank of heat kernels `exp(-t lambda / lambda_max)`, with several diffusion times t.
 
-    The bank is not tight. All filters are low-pass filters. `bank(eigenvalues, eigenvalues)` returns the
-    responses (filters, k) for k eigenvalues lambda in any unit, one row per diffusion time.
+    The bank is not tight. All filters are low-pass filters.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
+    row per diffusion time. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The kernels are those of Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale
     signature based on heat diffusion", 2009.
 
     **Arguments:**
 
-    - `times`: (filters,), a list or an array of one or more positive diffusion times t, in units of
-      1 / lambda_max.
+    - `times`: (filters,), a list or an array of one or more positive diffusion times t, in units of 1 /
+      lambda_max. A single number is not accepted.
 
     **Raises:** `ValueError` if the times are not a list of one or more positive, finite numbers.
     """

@@ -13,13 +13,14 @@ from jaxsmw.core.checks import check_choice
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
-    """Returns the frame function `G(lambda) = sum_l g_l(lambda)²` of a filter bank at k eigenvalues, (k,).
+    """Returns the frame function G of a filter bank at k eigenvalues, (k,).
 
-    This is eq. (7) of the MWP paper. G is constant for a tight frame, and 1 for a Parseval frame.
+    The frame function `G(lambda) = sum_l g_l(lambda)²` is the sum of the squared filters g_l, eq. (7) of the
+    MWP paper. G is constant for a tight frame, and 1 for a Parseval frame.
 
     **Arguments:**
 
-    - `responses`: (filters, k), the responses g_l of the bank, from `bank(eigenvalues, eigenvalues)`.
+    - `responses`: (filters, k), the responses of the bank, such as `bank(eigenvalues, eigenvalues)`.
     """
     return jnp.sum(responses**2, axis=0)
 
@@ -47,7 +48,9 @@ def frame_bounds(
     over: Literal["eigenvalues", "interval"] = "eigenvalues",
     resolution: int = 10_001,
 ) -> FrameBounds:
-    """Returns the frame bounds of a filter bank: the extrema of its frame function `G = sum_l g_l²`.
+    """Returns the frame bounds of a filter bank: the minimum and the maximum of its frame function G.
+
+    The frame function `G = sum_l g_l²` is the sum of the squared filters g_l.
 
     **Arguments:**
 
@@ -55,19 +58,20 @@ def frame_bounds(
     - `eigenvalues`: (k,), the eigenvalues of a shape, ascending, in any unit. The last eigenvalue is
       lambda_max.
     - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then hold for
-      functions in the span of the corresponding eigenvectors. `"interval"` evaluates G on [0, lambda_max].
-      The bounds then hold for every shape with this lambda_max, if the bank depends on no other eigenvalue.
-    - `resolution`: the number of evenly spaced points at which `"interval"` evaluates G, at least 2. The
-      sampled lower bound is slightly too large, and the sampled upper bound is slightly too small. If h is
-      the spacing of the points, this error is at most `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G.
-      With the default resolution, the error is below 1e-5 G for the banks of this package with up to 8
-      filters.
+      functions in the span of the corresponding eigenvectors. `"interval"` evaluates G at evenly spaced
+      points of [0, lambda_max]. The bounds then hold for every shape with this lambda_max, if the bank
+      depends on no other eigenvalue.
+    - `resolution`: the number of points at which `"interval"` evaluates G, at least 2, by default 10 001.
+      `over="eigenvalues"` ignores this number. The lower bound from the points is slightly too large, and the
+      upper bound is slightly too small. If h is the spacing of the points, this error is at most
+      `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G. With the default resolution, the error is below
+      1e-5 G for the banks of this package with up to 8 filters.
 
-    **Returns:** A `FrameBounds` with `lower` and `upper`, the smallest and the largest value of G, without
-    unit.
+    **Returns:** A `FrameBounds` with the attributes `lower` and `upper`, the smallest and the largest value
+    of G, as arrays of shape () without unit.
 
-    **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2, or if the bank returns
-    responses that are not of shape (filters, points).
+    **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
+    the bank returns responses that are not of shape (filters, points).
     """
     check_choice("over", over, ("eigenvalues", "interval"))
     points = eigenvalues
@@ -91,7 +95,8 @@ class Tightened(FilterBank):
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
-        # The negated comparison counts NaN as covered, so NaN stays in the result; `>=` would hide NaN.
+        # # NaN must remain in the result. This comparison is negated, because `>=` would be False for NaN and
+        # would replace NaN by zero.
         covered = ~(largest < jnp.finfo(points.dtype).tiny)
         scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
         frame = jnp.where(covered, frame_function(scaled)[None, :], 1)
@@ -101,18 +106,19 @@ class Tightened(FilterBank):
 def tighten(bank: FilterBank) -> FilterBank:
     """Returns the canonical tight frame of a filter bank, which divides each filter g_l by `sqrt(G)`.
 
-    G is the frame function `sum_l g_l²`. Of all Parseval frames, the canonical tight frame is closest to the
-    given bank. If the given bank is a Parseval frame, its responses do not change.
+    G is the frame function `sum_l g_l²`. At every eigenvalue, the responses of the canonical tight frame are
+    the responses of a Parseval frame that differ least from g_l, in the sum of squares. If the given bank is
+    a Parseval frame, its responses do not change.
 
-    If all responses at an eigenvalue are below the smallest normal floating-point number, G counts as zero
-    there. At this eigenvalue, the new responses and their gradients are zero. The new bank is then a Parseval
-    frame only on the rest of the spectrum.
+    If all responses at an eigenvalue are below the smallest normal floating-point number, the new responses
+    and their gradients are zero at this eigenvalue. The new bank is then a Parseval frame only on the rest of
+    the spectrum.
 
     **Arguments:**
 
     - `bank`: any `FilterBank`.
 
-    **Returns:** A filter bank with the responses `g_l / sqrt(G)`, (filters, k). It has the same parameters
-    (pytree leaves) as `bank`, and its responses are differentiable with respect to them.
+    **Returns:** A `FilterBank` with the responses `g_l / sqrt(G)`, (filters, p) for p points. It has the same
+    parameters (pytree leaves) as `bank`, and its responses are differentiable with respect to them.
     """
     return Tightened(bank)

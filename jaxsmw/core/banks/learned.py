@@ -15,18 +15,21 @@ class SoftmaxFrame(FilterBank):
     """A filter bank with trainable filters that is a Parseval frame for all finite parameters.
 
     The squared filters are a softmax: `g_l(lambda)² = exp(z_l(lambda)) / sum_j exp(z_j(lambda))`. Each z_l is
-    a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. Up to
-    the resolution of the knots, every Parseval frame of positive filters has this form.
-    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+    a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. With
+    enough knots, the softmax approximates every Parseval frame of positive continuous filters.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
+    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     To learn a frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by
-    gradient descent. If the smallest eigenvalues matter most, use `Warped(SoftmaxFrame(…), Power())`. This
-    bank spaces the knots evenly in frequency, the square root of the eigenvalue.
+    gradient descent. If the smallest eigenvalues matter most, use `Warped(SoftmaxFrame(…), Power())`. The
+    knots are then evenly spaced in frequency, the square root of the eigenvalue.
 
     **Arguments:**
 
-    - `logits`: (filters, knots), the values of z_l at the knots, with at least 1 filter and 2 knots. Adding a
-      constant to a column does not change the filters.
+    - `logits`: (filters, knots), an array or nested lists of the values of z_l at the knots, with at least 1
+      filter and 2 knots. Adding a constant to a column does not change the filters.
 
     **Raises:** `ValueError` if the logits do not have this shape.
     """
@@ -44,19 +47,21 @@ class SoftmaxFrame(FilterBank):
     def like(cls, bank: FilterBank, knots: int = 32, *, floor: float = 0.01) -> SoftmaxFrame:
         """Returns a `SoftmaxFrame` that imitates a given filter bank.
 
-        At each knot, the squared filters of the frame are proportional to the squared filters of the bank. If
-        the bank adapts to the spectrum, its responses are computed for evenly spaced eigenvalues.
+        At each knot, the squared filters of the frame are proportional to the squared filters of the bank.
+        The bank is evaluated by `bank(points, points)`, with `knots` evenly spaced points from 0 to 1.
 
         **Arguments:**
 
-        - `bank`: any `FilterBank`. The signs of its filters are lost.
-        - `knots`: the number of knots, at least 2.
-        - `floor`: the smallest absolute response of the bank that is kept, at least 1e-12 and below 1.
-          Smaller responses are raised to the floor, because a filter that is zero cannot be learned.
+        - `bank`: any `FilterBank`. The frame does not keep the signs of its filters, because all filters of a
+          `SoftmaxFrame` are positive.
+        - `knots`: the number of knots, at least 2. The default is 32.
+        - `floor`: a number from 1e-12 to 1 (1 excluded), by default 0.01. Absolute responses of the bank
+          below the floor are raised to the floor, because a filter that is zero cannot be learned.
 
-        **Returns:** A frame with logits (filters, knots).
+        **Returns:** A `SoftmaxFrame` with logits (filters, knots).
 
-        **Raises:** `ValueError` if `knots` is below 2, if `floor` is below 1e-12, or if `floor` is 1 or more.
+        **Raises:** `ValueError` if `knots` is below 2, if `floor` is outside this range, or if the bank
+        returns responses that are not of shape (filters, knots).
         """
         if knots < 2 or not 1e-12 <= floor < 1:
             raise ValueError(

@@ -15,10 +15,14 @@ from jaxsmw.core.checks import as_parameter, check_between
 class ExponentialWindow(FilterBank):
     """A filter bank of one infinitely smooth low-pass filter. The bank is not tight.
 
-    The filter is 1 at zero, 1/2 at half the edge, and 0 beyond the edge. With the eigenvalue lambda as a
-    fraction of lambda_max, the filter is `e(u) / (e(u) + e(1 - u))`. Here `e(u) = exp(-slope / u)` and
-    `u = 1 - lambda / edge` (Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
-    `bank(eigenvalues, eigenvalues)` returns the responses (1, k) for k eigenvalues in any unit.
+    The filter is 1 at the eigenvalue 0, 1/2 at half the edge, and 0 beyond the edge. With the eigenvalue
+    lambda as a fraction of lambda_max, the filter is `e(u) / (e(u) + e(1 - u))`. Here
+    `e(u) = exp(-slope / u)` and `u = 1 - lambda / edge` (Perraudin et al., "GSPBOX: A toolbox for signal
+    processing on graphs", 2014).
+
+    `bank(points, eigenvalues)` returns the responses (1, p) at points (p,) of the eigenvalue axis.
+    `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is lambda_max. Points and
+    eigenvalues have the same unit, which can be any unit.
 
     **Arguments:**
 
@@ -41,18 +45,22 @@ class ExponentialWindow(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
-        # At u = 0 and u = 1 the exponents are infinite and have no gradient, so u is kept away from both.
+        # # At u = 0 and u = 1, an exponent is infinite and has no gradient. The clipping excludes both values
+        # of u.
         tiny = jnp.finfo(points.dtype).eps
         u = jnp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
         return jax.nn.sigmoid(slope / (1 - u) - slope / u)[None, :]
 
 
 class LowPass(FilterBank):
-    """A filter bank of one low-pass filter without wavelets, for control experiments. The bank is not tight.
+    """A filter bank of one low-pass filter, for experiments without wavelets. The bank is not tight.
 
     The filter is the scaling function of `Meyer` with an adjustable edge. It is 1 up to the edge, and 0
-    beyond twice the edge. `bank(eigenvalues, eigenvalues)` returns the responses (1, k) for k eigenvalues in
-    any unit.
+    beyond twice the edge. In between, it falls smoothly.
+
+    `bank(points, eigenvalues)` returns the responses (1, p) at points (p,) of the eigenvalue axis.
+    `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is lambda_max. Points and
+    eigenvalues have the same unit, which can be any unit.
 
     **Arguments:**
 
@@ -71,14 +79,16 @@ class LowPass(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
-        # Beyond twice the edge this sine is exactly zero. The equivalent form cos(pi/2) has a rounding error.
+        # # Beyond twice the edge, this sine is exactly zero. The equivalent `cos(pi / 2)` has a rounding
+        # error.
         return jnp.sin(jnp.pi / 2 * (1 - meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
 
 
 class Identity(FilterBank):
-    """A filter bank of one filter that is 1 at every eigenvalue, for control experiments without filtering.
+    """A filter bank of one filter that is 1 at every eigenvalue, for experiments without filtering.
 
-    The bank is a Parseval frame. `bank(eigenvalues, eigenvalues)` returns ones of shape (1, k).
+    The bank is a Parseval frame and has no arguments. `bank(points, eigenvalues)` returns ones of shape (1,
+    p) for points (p,); it ignores the `eigenvalues` (k,) of the shape.
     """
 
     def __call__(

@@ -16,8 +16,8 @@ from jaxsmw.core.checks import as_parameter, check_between
 class _Transitions(FilterBank):
     """A bank with the filters cos(theta_1), sin(theta_1) cos(theta_2), …, sin(theta_L).
 
-    Each theta_l is a function of the eigenvalue that rises from 0 to pi/2, the transition from one band to
-    the next. The squared filters sum to cos² + sin² = 1, because the transitions do not overlap.
+    Each theta_l is a function of the eigenvalue, which rises from 0 to pi/2 in the transition from one band
+    to the next. The squared filters sum to cos² + sin² = 1, because the transitions do not overlap.
     """
 
     @abc.abstractmethod
@@ -47,13 +47,13 @@ class _DyadicBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the transition as a function of a linear ramp. Both run from 0 to 1."""
+        """Returns `theta / (pi / 2)` of a transition as a function of a ramp. Both rise from 0 to 1."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        # The limit of 100 octaves prevents overflow of 2^octaves. The limit does not change the responses,
-        # because only the eigenvalue 0 is 100 octaves below the largest eigenvalue.
+        # # More than 100 octaves could overflow 2^octaves. The limit does not change the responses, because
+        # only the eigenvalue 0 is 100 octaves below the largest eigenvalue.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
         return self.profile(jnp.clip(ratios - 1, 0, 1))
@@ -71,15 +71,18 @@ def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 class Meyer(_DyadicBands):
     """The Meyer frame: a filter bank of octave bands that is a Parseval frame.
 
-    The scaling function is 1 up to `lambda_max / 2^L`, with the number of wavelets `L = filters - 1`. It
-    falls to 0 over the next octave, in which the first wavelet rises. The last wavelet rises from
-    `lambda_max / 2` to lambda_max. `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k
-    eigenvalues in any unit, scaling function first.
+    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. The
+    scaling function falls to 0 over the next octave, in which the first wavelet rises. The last wavelet rises
+    from `lambda_max / 2` to lambda_max.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
+    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The frame is that of Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section
     4.2 of the MWP paper uses this frame. The scaling function passes the lowest eigenvalues, which belong to
-    the *largest* spatial scale. The bank would not be tight if the scaling function belonged to the smallest
-    scale and the finest wavelet to the largest scale.
+    the *largest* spatial scale. With the opposite assignment of filters to scales, the bank would not be
+    tight.
 
     **Arguments:**
 
@@ -95,8 +98,11 @@ class Meyer(_DyadicBands):
 class SimpleTight(_DyadicBands):
     """The simple tight frame: a filter bank of octave bands that is a Parseval frame.
 
-    The bands are those of `Meyer`, but each band rises like sin² over an octave. `bank(eigenvalues,
-    eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit, scaling function first.
+    The bands are those of `Meyer`, but each band rises like sin² over an octave.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
+    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The frame is that of Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and
     application to denoising", 2018, after Coulhon, Kerkyacharian and Petrushev 2012.
@@ -115,7 +121,7 @@ class SimpleTight(_DyadicBands):
 
 
 class _TwoBands(_Transitions):
-    """A bank of a low-pass and a high-pass filter. The transition between both filters starts at an edge."""
+    """A bank of a low-pass and a high-pass filter. The transition between them starts at `edge`."""
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=1 / 3)
 
@@ -124,7 +130,7 @@ class _TwoBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Returns the transition from 0 to 1 as a function of `lambda / edge - 1`."""
+        """Returns `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
@@ -137,8 +143,11 @@ class Held(_TwoBands):
     """A Parseval frame of a low-pass and a high-pass filter, with a cubic transition over one octave.
 
     The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
-    rises. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for k eigenvalues in any unit,
-    low-pass filter first.
+    rises.
+
+    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
+    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The filters are those of Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the
     Riesz transform", 2010.
@@ -162,8 +171,11 @@ class Simoncelli(_TwoBands):
 
     The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
     rises. The filters are the cosine and the sine of an angle that is linear in the logarithm of the
-    eigenvalue. `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for
-    k eigenvalues in any unit, low-pass filter first.
+    eigenvalue.
+
+    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
+    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The filters are those of Portilla and Simoncelli, "A parametric texture model based on joint statistics of
     complex wavelet coefficients", 2000.
@@ -186,8 +198,10 @@ class Papadakis(_TwoBands):
 
     The low-pass filter falls from 1 to 0 between the edge and 5/3 times the edge, while the high-pass filter
     rises. The filters are the cosine and the sine of an angle that is linear in the eigenvalue.
-    `bank(eigenvalues, eigenvalues)` returns the responses (2, k) for k eigenvalues in any unit, low-pass
-    filter first.
+
+    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
+    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The filters are those of Romero, Alexander, Baid, Jain and Papadakis, "The geometry and the analytic
     properties of isotropic multiresolution analysis", 2009.
@@ -210,15 +224,18 @@ class Papadakis(_TwoBands):
 class Regular(_Transitions):
     """A Parseval frame of a low-pass and a high-pass filter, with a transition over the whole spectrum.
 
-    The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. The number s is obtained from
+    The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. The number s is computed from
     `2 lambda / lambda_max - 1` by applying the function `sin(pi/2 ·)` repeatedly, `degree` times (Perraudin
-    et al., "GSPBOX: A toolbox for signal processing on graphs", 2014). `bank(eigenvalues, eigenvalues)`
-    returns the responses (2, k) for k eigenvalues lambda in any unit, low-pass filter first.
+    et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
+
+    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
+    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     **Arguments:**
 
-    - `degree`: how often the sine is applied, an integer of 0 or more, by default 3. A higher degree makes
-      the transition steeper.
+    - `degree`: how many times the sine is applied, an integer of 0 or more, by default 3. A higher degree
+      makes the transition steeper.
 
     **Raises:** `ValueError` if the degree is negative.
     """

@@ -28,7 +28,7 @@ class _UniformTranslates(FilterBank):
 
     @abc.abstractmethod
     def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
-        """Returns the window at positions in (-1/2, 1/2)."""
+        """Returns the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -42,9 +42,12 @@ class _UniformTranslates(FilterBank):
 class Itersine(_UniformTranslates):
     """A filter bank of evenly spaced translates of the window `sin(pi/2 cos²(pi u))`: a Parseval frame.
 
-    u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
-    windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
-    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+    Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
+    width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
+    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
     2014. The squared window is 1/2 plus odd harmonics. The harmonics cancel in the sum over an even number of
@@ -53,8 +56,8 @@ class Itersine(_UniformTranslates):
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that cover each eigenvalue, an even number, at least 2. The default is
-      2.
+    - `overlap`: the number of windows that are positive at each eigenvalue, an even number, at least 2. The
+      default is 2.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
     if `overlap` is odd or below 2.
@@ -71,18 +74,21 @@ class Itersine(_UniformTranslates):
 class HalfCosine(_UniformTranslates):
     """A filter bank of evenly spaced translates of the Hann window `cos²(pi u)`: a Parseval frame.
 
-    u is the distance between the eigenvalue and the centre of the window, in units of the window's width. The
-    windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
-    `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues in any unit.
+    Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
+    width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
+    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
     tight graph wavelet and vertex-frequency frames", 2015. In that paper the squared filters sum to
-    `3/8 overlap`; here they are scaled to sum to one.
+    `3/8 overlap`. Here the filters are scaled so that their squares sum to one.
 
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that cover each eigenvalue, at least 3. The default is 3.
+    - `overlap`: the number of windows that are positive at each eigenvalue, at least 3. The default is 3.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
     if `overlap` is below 3.
@@ -102,9 +108,13 @@ class Gabor(FilterBank):
     """A filter bank of Gaussians with evenly spaced centres from 0 to lambda_max. The bank is not tight.
 
     The filters correspond to the windows of a short-time Fourier transform. They follow Shuman, Ricaud and
-    Vandergheynst, "Vertex-frequency analysis on graphs", 2016. In contrast to that paper, there are only
-    `filters` centres instead of a centre at every eigenvalue. `bank(eigenvalues, eigenvalues)` returns the
-    responses (filters, k) for k eigenvalues in any unit. The first Gaussian is centred at 0.
+    Vandergheynst, "Vertex-frequency analysis on graphs", 2016, but the bank has only `filters` centres,
+    instead of a centre at every eigenvalue. The first Gaussian is centred at 0 and the last at lambda_max.
+    Each Gaussian is 1 at its centre.
+
+    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
+    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     **Arguments:**
 

@@ -17,8 +17,12 @@ class Warp(eqx.Module):
 
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
     are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
-    `__call__(points, eigenvalues)`, which returns the warped points. All banks of `jaxsmw.banks` depend only
-    on ratios of eigenvalues, so a constant factor in a warp has no effect on these banks.
+    `__call__(points, eigenvalues)`, which returns the warped points (p,), ascending for ascending points.
+    `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,), ascending, are those of the shape, and the last
+    eigenvalue is lambda_max.
+
+    A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
+    on ratios of eigenvalues.
     """
 
     @abc.abstractmethod
@@ -36,17 +40,21 @@ class Warp(eqx.Module):
 class Warped(FilterBank):
     """A filter bank evaluated on a warped spectrum: the filters are `g_l(warp(lambda))`.
 
-    If `bank` is a Parseval frame, `Warped` is a Parseval frame. The call
-    `Warped(bank, warp)(eigenvalues, eigenvalues)` returns the responses (filters, k) for k eigenvalues lambda
-    in any unit. The construction is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
-    tight graph wavelet and vertex-frequency frames", 2015.
+    If `bank` is a Parseval frame, `Warped(bank, warp)` is a Parseval frame. The construction is that of
+    Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency
+    frames", 2015.
+
+    `Warped(bank, warp)(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the
+    eigenvalue axis. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
+    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     **Arguments:**
 
     - `bank`: any `FilterBank` with filters g_l.
-    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. If the bank consists of
-      uniform translates (`Itersine` or `HalfCosine`), `Logarithm` turns the translates into wavelets, and
-      `SpectralDistribution` turns them into bands with equal numbers of eigenvalues.
+    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. If the filters of the
+      bank are uniform translates (`Itersine` or `HalfCosine`), `Logarithm` widens the bands at higher
+      eigenvalues, as in a bank of wavelets. `SpectralDistribution` makes bands that contain equal numbers of
+      eigenvalues.
     """
 
     bank: FilterBank
@@ -61,7 +69,8 @@ class Warped(FilterBank):
 class Logarithm(Warp):
     """The warp `log(1 + strength lambda / lambda_max)` of the eigenvalues lambda, for `Warped`.
 
-    The warp is nearly linear below `lambda_max / strength` and nearly logarithmic above this eigenvalue.
+    The warp is nearly linear for eigenvalues below `lambda_max / strength` and nearly logarithmic for larger
+    eigenvalues.
 
     **Arguments:**
 
@@ -107,14 +116,14 @@ class SpectralDistribution(Warp):
     """The warp that maps an eigenvalue lambda to the number of smaller eigenvalues, for `Warped`.
 
     Between eigenvalues, the warp is linear. With this warp, uniform translates (`Itersine` or `HalfCosine`)
-    pass equal numbers of eigenvalues, except that the first and the last translate pass half as many. The
+    pass equal numbers of eigenvalues, except that the windows at both ends of the spectrum pass fewer. The
     warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
     vertex-frequency frames", 2015. It has no parameters.
 
-    A simple eigenvalue is mapped to its index, counted from 0. A repeated eigenvalue is mapped to the mean of
-    its indices, so a bank treats all functions of an eigenspace equally. If all eigenvalues are simple, the
-    responses at the eigenvalues depend only on their indices. By Weyl's law the eigenvalues of a surface grow
-    nearly linearly. So this warp is nearly linear, and its effect is small.
+    An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
+    the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is
+    repeated, the responses at the eigenvalues depend only on their indices. By Weyl's law the eigenvalues of
+    a surface grow nearly linearly. So this warp is nearly linear, and its effect is small.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
