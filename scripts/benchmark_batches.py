@@ -2,16 +2,16 @@
 
     python scripts/benchmark_batches.py [--vertices N] [--eigenvectors K] [--batch-sizes B ...] [--quick]
 
-The script refines the same pairs in float32, with 3 iterations per pair. The following candidates run in
-turns in one process:
+The script refines the same random pairs in float32, with 3 iterations per pair. The following candidates
+take turns in one process:
 
 - a Python loop over `refine`;
 - `jax.lax.map`;
 - `jax.vmap` with several batch sizes;
-- `jaxsmw.refine_pairs`, the function for users. Its time includes the transfer of initial maps and results.
+- `jaxsmw.refine_pairs`. The time of this candidate includes the transfer of initial maps and results.
 
-The lower bound is the time of the matrix products of all iterations, in full float32 precision. The table
-also has the temporary memory of each compiled program, which excludes the memory of the program's arguments.
+The lower bound is the time that the matrix products of all iterations take in full float32 precision. The
+table also states the temporary memory of each compiled program. This memory excludes the program's arguments.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def in_batches(batch: Pair, size: int) -> Refinement:
 
 
 def random_spectrum(generator: np.random.Generator, n: int, k: int) -> Spectrum:
-    """Return a random spectrum of n vertices and k eigenvectors that belongs to no mesh."""
+    """Return a spectrum of random numbers for n vertices and k eigenvectors."""
     orthonormal, _ = np.linalg.qr(generator.standard_normal((n, k)))
     return Spectrum(
         jnp.asarray(4 * np.pi * np.arange(k), jnp.float32),
@@ -84,8 +84,8 @@ def main() -> None:
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
     batch = x, y, jnp.stack(initial_maps)
 
-    # These are the matrix products of one iteration, in batches of pairs. Only the maximum of each column is
-    # kept.
+    # `products` computes the matrix products of one iteration for all pairs. Only the maximum of each column
+    # is kept.
     @jax.jit
     def products(a: Array, b: Array) -> Array:
         return lax.map(

@@ -15,15 +15,16 @@
   cached compiled programs.
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
-- `scale`: the time from two mesh files of up to a million vertices to the refined map. Each size runs in a
-  new process. The table has times, peak memory, errors, and the exponents with which time and memory grow.
+- `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
+  each size in a new process. The table states times, peak memory and errors. It also states the exponents of
+  power laws that are fitted to time and memory as functions of the number of vertices.
 
-The candidates of a comparison run in turns in one process, so other load on the machine affects all
-candidates. Each ratio compares two medians. The shapes are procedural creatures. To obtain the large shapes,
-the script splits edges of a creature and moves its vertices at random. With `--data`, `peers` and `scale` use
-two people of the remeshed FAUST set instead of creatures. The script writes three files to DIR: the tables to
-`speed.md`, all measurements to `speed.json`, and a plot of the times against the sizes to `speed.png`. With
-`--quick`, the script measures only the smallest sizes, which takes three minutes.
+The candidates of a comparison take turns in one process, so other load on the machine affects all candidates.
+Each ratio is computed from median times. The shapes are procedural creatures. To obtain the large shapes, the
+script splits edges of a creature and moves its vertices at random. With `--data`, the parts `peers` and
+`scale` use two people of the remeshed FAUST set instead of creatures. The script writes three files to DIR:
+the tables to `speed.md`, all measurements to `speed.json`, and a plot of the times against the sizes to
+`speed.png`. With `--quick`, the script measures only the smallest sizes, which takes three minutes.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
 LARGE = (100_000, 300_000, 1_000_000)
 XLA_DEFAULTS = ", XLA's defaults"
-# For shapes with more vertices, a stored matrix of all distances would take gigabytes.
+# For shapes with more than this number of vertices, a matrix of all distances would take gigabytes.
 STORED = 10_000
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
@@ -110,14 +111,14 @@ def medians(
     *,
     warm: bool = True,
 ) -> dict[str, float]:
-    """Run the candidates in turns, and return the median time of each candidate in seconds.
+    """Run the candidates alternately, and return the median time of each candidate in seconds.
 
     **Arguments:**
 
-    - `candidates`: the functions to time, by name.
-    - `repeats`: the number of timed turns.
+    - `candidates`: a dictionary from the name of each candidate to the function to time.
+    - `repeats`: the number of timed runs of each candidate.
     - `clock`: a function that returns the current time in seconds.
-    - `warm`: whether an additional, untimed turn runs first, in which JAX compiles the candidates.
+    - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
     """
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
@@ -130,15 +131,16 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table of the seconds of each candidate, and of their ratio to those of the candidate `of`."""
+    """Return a table of the time of each candidate, in seconds and divided by the time of the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
 
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Return functions by name that multiply the eigenvector matrices of X and Y, `ITERATIONS` times each.
+    """Return several implementations of the product of the eigenvector matrices of X and Y.
 
-    The time of the products is the lower bound for a search that compares all vertices with all vertices.
+    The keys are names. Each function computes the product `ITERATIONS` times. The time of the fastest
+    function is a lower bound for an exhaustive search.
     """
     # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
@@ -175,7 +177,7 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
 
             def once() -> Any:
-                with one_blas_thread():  # `match` has the same limit
+                with one_blas_thread():  # `match` also uses one BLAS thread
                     return jax.block_until_ready(
                         run(x, y, start, refiner=refiner, iterations=ITERATIONS, samples=sampled or None)
                     )
@@ -249,7 +251,7 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
 def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
     """For each size, yield the wall-clock times to compute the eigenbases of two shapes concurrently.
 
-    `match` uses threads. The processes start before the timed turns, so the times exclude their start.
+    The processes start before the timed runs, so the times exclude their start.
     """
     for size in options.sizes:
         pair = creature_pair(vertices=size)
@@ -425,8 +427,8 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
     """Split the longest edges of a mesh until there are `number_of_vertices`, and add noise to the positions.
 
-    The standard deviation of the noise is 10 % of the mean edge length. The given vertices keep their
-    numbers. A mesh that already has enough vertices gets no noise.
+    The standard deviation of the noise is 10 % of the mean edge length. The vertices of the given mesh keep
+    their indices. If the given mesh already has enough vertices, it is returned without noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -461,7 +463,8 @@ def split_faces(
     """
     chosen = (middles >= 0).sum(axis=1) == number
     faces, middles = faces[chosen], middles[chosen]
-    # Rotate the corners. If one edge is split, this edge comes first. If two are split, the third comes last.
+    # Rotate the corners of each face, so that a single split edge is the first and a single unsplit edge is
+    # the last.
     first = (np.argmin(middles >= 0, axis=1) + 1) % 3
     if number == 1:
         first = np.argmax(middles, axis=1)
@@ -480,7 +483,8 @@ def split_faces(
 def peak_memory() -> float:
     """Return the peak memory of this process so far, in GiB.
 
-    On Linux, `VmHWM` leaves out the memory of the parent process, which `getrusage` can include.
+    On Linux, the function reads `VmHWM`, because the peak of `getrusage` can include the memory of the parent
+    process.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -494,13 +498,13 @@ def matched_from_files(
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
     """Match two mesh files, and measure the stages.
 
-    **Returns:** A list with the name, the seconds and the peak memory in GiB of each stage, and a list with
-    the initial map and the refined map.
+    **Returns:** Two lists. The first list contains a tuple of name, seconds and peak memory in GiB for each
+    stage. The second list contains the initial map and the refined map.
     """
     stages = [("start", time.perf_counter(), 0.0)]
 
     class Watch(logging.Handler):
-        """Records the times of log messages. A message marks the end of a stage and the start of the next."""
+        """Records the times of log messages, each of which marks the start of a stage."""
 
         def emit(self, record: logging.LogRecord) -> None:
             if not record.args:  # messages with arguments report results and start no stage
@@ -594,7 +598,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         for turn in range(2 if options.quick else 4):  # JAX compiles in the first turn
             for name, run in runs.items():
                 if turn > 1 and name.startswith("geomfum"):
-                    continue  # one timed run is enough, because each run takes a minute
+                    continue  # geomfum is timed only once, because each of its runs takes a minute
                 start = time.perf_counter()
                 found, refining = run(files)
                 taken = time.perf_counter() - start
@@ -642,14 +646,14 @@ def ours_from_files(
 
 @cache
 def our_initial_map(*files: str) -> np.ndarray:
-    """Return the initial map of `match`. The cache keeps its time out of the times of other libraries."""
+    """Return the initial map of `match`, cached so that the times of other libraries exclude its time."""
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
 def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
     """Match with `pyFM.functional.FunctionalMapping`, its default descriptors, and ZoomOut.
 
-    ZoomOut takes ten steps from k = 50. Each step adds `step` eigenvectors.
+    ZoomOut starts from 50 eigenvectors and takes ten steps, each of which adds `step` eigenvectors.
     """
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
@@ -690,8 +694,8 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
 def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     """Refine our initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
 
-    Functional maps are computed with vertex areas. The default of geomfum, without areas, is slower and less
-    accurate.
+    The conversion from pointwise to functional maps uses vertex areas. The default conversion of geomfum
+    ignores areas, and is slower and less accurate.
     """
     from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
     from geomfum.laplacian import LaplacianSpectrumFinder
@@ -709,7 +713,7 @@ def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     return np.asarray(P2pFromFmConverter()(refined, y, x)), time.perf_counter() - start
 
 
-# 16 steps of 5 eigenvectors lead from 20 eigenvectors to 100.
+# With 16 steps of 5 eigenvectors, ZoomOut goes from 20 to 100 eigenvectors.
 ZOOMOUT_STEPS = 16
 
 
@@ -734,7 +738,7 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # Runs with and without our compiler options have the same colour. Runs without them are dotted.
+            # Dotted lines show runs without our compiler options, in the colour of the run with these options.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

@@ -7,14 +7,15 @@ The script draws pairs at random from each data set (see `docs/datasets.md`) and
 
 - The first table compares `Correspondence.expected_error` with the true errors of a preset's results. It
   states the rank correlation of both errors and the share of gross errors. A gross error exceeds 0.1 times
-  the square root of the area. The last column states how many of the gross errors belong to the 10 % of the
-  vertices with the largest expected errors.
+  the square root of the area. The last column states the share of the gross errors that belong to the 10 % of
+  the vertices with the largest expected errors.
 - The second table divides the vertices of all pairs into ten groups of equal size by expected error, and
   states the true errors of each group.
-- The third table states for how many pairs a score is better for the result than for a mirrored map. It needs
-  the preset `accurate`, and covers only full shapes whose mirrored ground truth consists of vertices. The
-  stages after the first compute the mirrored map from the mirrored ground truth, without repair. The
-  uncertainty of a map comes from a feature regression that has this map as its initial map.
+- The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
+  this table only for the preset `accurate`. The table covers only full shapes whose mirrored ground truth
+  consists of vertices. To compute the mirrored map, the script starts from the mirrored ground truth, and runs
+  all stages except the first without repair. To compute the uncertainty of a map, the script runs a feature
+  regression with this map as its initial map.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ class Measured(NamedTuple):
     **Attributes:**
 
     - `true`, `expected`: the true and the expected errors of the evaluated vertices (p,).
-    - `scores`: for the name of each score, its values for the result and for the mirrored map. It is empty if
-      there is no mirrored map.
+    - `scores`: a dictionary from the name of each score to its values for the result and for the mirrored
+      map. The dictionary is empty if there is no mirrored map.
     """
 
     true: Float64[np.ndarray, " p"]
@@ -84,7 +85,7 @@ def measure(
 
 
 def scores_of(found: Correspondence) -> dict[str, float]:
-    """Returns the scores of a map by name; lower is better."""
+    """Returns a dictionary from the name of each score to its value for a map. Lower values are better."""
     known = found.pair, found.pointwise_map, found.spectrum_x
     regression = match(*found.pair.meshes, init=found.pointwise_map, preset=WITHOUT_REPAIR[0])
     uncertainty = regression.refinement.state.uncertainty

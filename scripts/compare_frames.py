@@ -71,7 +71,7 @@ QUICK = Settings(
 
 
 def evenly_spread(items: Sequence, count: int) -> list:
-    """Return `count` items, evenly spread from the first to the last; all items if there are fewer."""
+    """Return `count` items that are evenly spread from first to last, or all items if there are fewer."""
     places = np.linspace(0, len(items) - 1, min(count, len(items)))
     return [items[int(place)] for place in np.round(places)]
 
@@ -151,9 +151,10 @@ class Journals:
 
 
 def run(data: Path, journals: Journals, workers: int) -> None:
-    """Measure the missing rows pair by pair in worker processes. The rows of each pair are saved immediately.
+    """Measure the missing rows pair by pair in worker processes, and save the rows after each pair.
 
-    **Raises:** `InputError` after all other pairs are measured, if some pairs could not be measured.
+    **Raises:** `InputError` if some pairs could not be measured. All other pairs are measured before this error
+    is raised.
     """
     tasks = list(journals.missing())
     if not tasks:

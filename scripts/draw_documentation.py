@@ -33,21 +33,21 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# With dithering, this number of colours is enough for smoothly coloured bodies. It reduces the size of the
-# files to a third.
+# With dithering, smoothly coloured bodies need no more colours. The files are a third as large as in full
+# colour.
 COLORS = 256
 
 
 class Case(NamedTuple):
-    """A pair whose match fails with some options.
+    """A pair of meshes that `jaxsmw.match` does not match correctly with some options.
 
     **Attributes:**
 
     - `name`: the name of the failure case and of its picture.
-    - `source`, `target`, `truth`: the pair and its ground truth.
+    - `source`, `target`, `truth`: the two meshes and their ground truth.
     - `failing`: options of `jaxsmw.match` with which the match fails.
     - `cure`: options with which the match succeeds; None if there are no such options.
-    - `up`: the vertical axis of both shapes, or None to let the drawing choose it.
+    - `up`: the vertical axis of both shapes. If it is None, the drawing function chooses the axis.
     """
 
     name: str
@@ -93,7 +93,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Returns a body with five equal hanging arms, and for each vertex a point of the unit sphere (n, 3)."""
+    """Returns a unit sphere deformed to a body with five equal arms, and the undeformed vertices (n, 3)."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -130,7 +130,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Returns the decimated target, and the vertex nearest to each true match as the new ground truth."""
+    """Returns a decimated target. Its ground truth is the vertex nearest to each true match on the old target."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
@@ -153,7 +153,7 @@ def draw_case(case: Case) -> str:
         expected = result.expected_error()
         cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
         if settings is case.failing:
-            # A vertex without ground truth gets the error of the nearest vertex with ground truth.
+            # A vertex without ground truth is drawn with the error of the nearest vertex that has ground truth.
             known = KDTree(case.source.vertices[error.source_vertices])
             errors = error.errors[known.query(case.source.vertices)[1]]
             panels = {"Error": errors, "Expected error": expected}

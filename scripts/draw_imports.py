@@ -26,7 +26,7 @@ NAMESPACES = ("__main__", "banks", "functional_maps", "learning")
 
 
 def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
-    """Return, for each module of the library, the modules of the library that it imports.
+    """Return a dictionary from each module of the library to the set of library modules that it imports.
 
     Names are dotted and relative to the library. A package has the name of its folder.
     """
@@ -46,7 +46,7 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
 
 
 def imported_layers() -> dict[str, set[str]]:
-    """Return, for each layer, the other layers that its modules import."""
+    """Return a dictionary from each layer to the set of other layers that its modules import."""
     layers: dict[str, set[str]] = {}
     for module, others in imported_modules().items():
         layer = module.split(".")[0]
@@ -94,7 +94,7 @@ def draw(axes: Axes, layers: dict[str, set[str]]) -> None:
     for layer, others in direct(layers).items():
         for other in others:
             rows = height[layer] - height[other]
-            bend = 0 if rows == 1 else min(0.15 * rows, 0.5)  # leads the arrow around the layers in between
+            bend = 0 if rows == 1 else min(0.15 * rows, 0.5)  # curves the arrow around the layers in between
             style = {
                 "arrowstyle": "-|>",
                 "color": "0.4",

@@ -12,8 +12,8 @@ of Adam (optax) uses one pair of the first five people of FAUST. The script trai
 `labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
 The script then tests both networks on pairs of the other people and of TOSCA. The preset `paper` refines each
-pair from four initial maps. Each initial map takes nearest neighbours of one kind of descriptors: SHOT, the
-untrained network, or one of the two trained networks. The script writes these files:
+pair from four initial maps. Each initial map matches nearest neighbours of descriptors. These descriptors are
+SHOT descriptors, or come from the untrained network or one of the trained networks. The script writes:
 
 - `summary.md`: the comparison;
 - `curves.png`: the losses against the training steps;
@@ -82,7 +82,7 @@ from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
-# The loss `cycles` is a sum of lengths and of other terms. This number is the weight of the other terms.
+# In the loss `cycles`, this number is the weight of the terms that are not lengths.
 WEIGHT = 0.1
 WATCHED_PAIRS = 4
 
@@ -197,7 +197,7 @@ def layer() -> WaveletPreservationLayer:
 
 
 class Shape(NamedTuple):
-    """A shape for training: the spectrum with SHOT descriptors, and the positions, at s sampled vertices."""
+    """The spectrum with SHOT descriptors, and the positions, of the s sampled vertices of a shape."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
@@ -248,7 +248,7 @@ class Matched(NamedTuple):
 
     **Attributes:**
 
-    - `by_descriptors`: the soft map between the descriptors.
+    - `by_descriptors`: the soft map that the layer recovers from the descriptors alone.
     - `by_layer`: the soft map that the layer recovers from its functional map.
     - `functional_map`: the functional map of the layer.
     - `energy`: the wavelet-preservation energy of the functional map under the soft map `by_layer`, divided
@@ -317,7 +317,7 @@ LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]]
 
 
 def save(network: DescriptorNetwork, path: Path) -> None:
-    """Write a network to a file: first a line of JSON with the sizes and the float type, then the arrays."""
+    """Write a network to a file. The first line is JSON with the sizes and the float type; arrays follow."""
     header = {"sizes": asdict(network.sizes), "dtype": str(network.leave.weight.dtype)}
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         stream.write(json.dumps(header).encode() + b"\n")
@@ -351,7 +351,7 @@ def nearest_descriptors(network: DescriptorNetwork, x: Spectrum, y: Spectrum) ->
 def descriptor_errors(
     pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
 ) -> dict[str, float]:
-    """Return the mean geodesic error of each initial map, before and after refinement, multiplied by 10³."""
+    """Return the mean geodesic error x 10³ of each initial map and of the map refined from it."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)

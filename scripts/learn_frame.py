@@ -153,7 +153,7 @@ def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
 
 
 def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """Return the loss `cycles`: the mean distance from points of X to their images under both soft maps."""
+    """Return the loss `cycles`: the mean distance from each point of X to its image under both soft maps."""
     forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
     return root_mean_square(
@@ -180,7 +180,7 @@ def load(path: Path) -> FilterBank:
 
 
 def refinement_errors(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
-    """Return the mean geodesic error of refinement with each bank from one initial map, multiplied by 10³."""
+    """Return a dictionary from the name of each bank to the mean geodesic error x 10³ after refinement."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
     spectra, initial = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map

@@ -29,7 +29,7 @@ from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, m
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10
 EVALUATED_POINTS = 500
-# These are the numbers of steps between two saves, and between two evaluations of the loss on watched pairs.
+# The numbers of steps between two saves, and between two evaluations of the loss on the watched pairs.
 _SAVED_EVERY, _WATCHED_EVERY = 10, 20
 # Shapes are padded to a multiple of this number of vertices. Shapes of similar size then share one compiled
 # program.
@@ -96,7 +96,7 @@ def root_mean_square(
     positions: Float[Array, "s 3"],
     wanted: Float[Array, "s 3"],
 ) -> Float[Array, ""]:
-    """Return the mean distance between the soft matches of points and their target positions.
+    """Return the mean distance between the soft matches of points and the target positions of these points.
 
     The distance of one point is a root mean square, weighted by the shares of the soft map.
 
@@ -160,17 +160,17 @@ def train(
     **Arguments:**
 
     - `name`: the name of the loss, for the name of the file and for the progress bar.
-    - `loss`: a function of the model and a prepared pair.
+    - `loss`: a function that takes the model and a prepared pair, and returns the loss.
     - `model`: the initial model.
     - `pairs`: the training pairs.
     - `prepare`: a function that prepares a pair for the loss.
-    - `optimizer`: the optimiser.
+    - `optimizer`: the optax optimiser.
     - `steps`: the number of steps.
-    - `seed`: the seed of the draws.
+    - `seed`: the seed of the random draws.
     - `directory`: an existing directory for the saved state.
-    - `unit`: a function of a prepared pair. Each recorded loss is divided by the value of this function,
-      because losses vary more between pairs than between models. The default None records losses without
-      division.
+    - `unit`: a function that takes a prepared pair and returns a number. Each recorded loss is divided by
+      this number, because losses vary more between pairs than between models. The default None records losses
+      without division.
     - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence
       training.
 
@@ -193,7 +193,7 @@ def train(
             state = eqx.tree_deserialise_leaves(stream, state)
 
     def watch(state: State) -> State:
-        """Record the mean loss on the watched pairs if the current step requires a record."""
+        """Record the mean loss on the watched pairs if a record is due at the current step."""
         here = np.flatnonzero(records == int(state.step))
         if not len(here):
             return state
@@ -287,14 +287,14 @@ def refined(
 def errors(
     pair: DataPair, mesh_x: Mesh, mesh_y: Mesh, maps: Mapping[str, Int[np.ndarray, " m"]], seed: int
 ) -> dict[str, float]:
-    """Return the mean geodesic error of each map at the same ground-truth points, multiplied by 10³."""
+    """Return the mean geodesic error x 10³ of each map. All maps are evaluated at the same points."""
     truth = pair.ground_truth(mesh_x, mesh_y)
     options: dict[str, Any] = {"number_of_samples": EVALUATED_POINTS, "seed": seed}
     return {name: 1e3 * geodesic_error(mesh_y, found, truth, **options).mean for name, found in maps.items()}
 
 
 Measured = dict[str, list[dict[str, float]]]
-"""A list of pairs for each data set. A pair is a dictionary of its errors by name."""
+"""A list for each data set. For each pair, the list contains a dictionary from map names to errors."""
 
 
 def measure(
@@ -313,10 +313,10 @@ def measure(
 
     **Arguments:**
 
-    - `data`: the pairs.
-    - `of_pair`: a function that returns the errors of a pair by name.
-    - `number_of_pairs`: the largest number of pairs from each data set.
-    - `seed`: the seed of the draws.
+    - `data`: the pairs for training and for evaluation.
+    - `of_pair`: a function that takes a pair, and returns a dictionary from the name of each map to its error.
+    - `number_of_pairs`: the maximum number of pairs from each data set.
+    - `seed`: the seed of the random draws.
     - `directory`: the directory of `errors.csv`.
     """
     generator, journal = np.random.default_rng(seed), Journal(directory / "errors.csv", ["source", "target"])
@@ -336,7 +336,7 @@ def measure(
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """Return a table of mean errors, with confidence intervals of paired differences from the first name."""
+    """Return a table of mean errors, and of mean paired differences from `names[0]` with their intervals."""
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}
@@ -349,7 +349,7 @@ def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
 
 
 def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps and the running means for a plot. The window is 10 % of the number of values."""
+    """Return step numbers and running means of a curve. The running window covers 10 % of the values."""
     window = max(1, len(values) // 10)
     means = np.convolve(values, np.ones(window) / window, "valid")
     return np.arange(len(means)) + window / 2, means
@@ -378,10 +378,10 @@ class Run(NamedTuple):
 
     **Attributes:**
 
-    - `data`: the pairs.
+    - `data`: the pairs for training and for evaluation.
     - `directory`: the output directory.
     - `steps`, `test_pairs`, `seed`: see the command-line options.
-    - `begun_with`: a line with commit, machine and versions at the start of the run.
+    - `begun_with`: a line of text that states commit, machine and versions at the start of the run.
     """
 
     data: Data

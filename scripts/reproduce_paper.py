@@ -11,13 +11,13 @@ experiment uses only the data sets that suit this experiment:
 - `fig6`: partial shapes, separately for cuts and holes;
 - `fig7`: shapes with topological noise;
 - `fig9`: targets with other triangulations and resolutions, and other initial maps;
-- `nonisometric`: pairs of different classes, compared with published results. The initial maps are published
-  maps if the data set contains any, and SHOT otherwise;
+- `nonisometric`: pairs of different classes, compared with published results. Refinement starts from
+  published initial maps if the data set contains such maps, and from SHOT otherwise;
 - `settings`: MWP and the other methods with settings that differ from the published settings, on the data
   sets of `table1`.
 
-For each run, the script creates a directory with the same files as `jaxsmw benchmark` in the output
-directory. It writes all tables to `README.md`. After an interruption, the same command continues from the
+In the output directory, the script creates one directory for each run, with the same files as
+`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same command continues from the
 saved results. With `--quick`, the script takes minutes on shapes with 5000 vertices.
 """
 
@@ -50,7 +50,7 @@ from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# `fig9` divides the number of pairs (`--pairs`, or else 40) by this number, and uses at least 2 pairs.
+# `fig9` divides the number of pairs (`--pairs`, by default 40) by this number, and uses at least 2 pairs.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
 # These descriptors cannot distinguish left from right. SHOT and "functional", which uses SHOT, can do so.
@@ -69,7 +69,7 @@ class Run(NamedTuple):
 
 
 def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
-    """Opens the data sets with the given names, or all data sets in a directory.
+    """Opens the data sets in a directory that have the given names, or all if there are no names.
 
     **Raises:** `InputError` if a named data set cannot be opened, or if there is no data set.
     """
@@ -176,7 +176,7 @@ def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[
 
 
 def other_settings() -> dict[str, Method]:
-    """Returns, by name, the methods with published settings and with each changed setting in `_CHANGES`."""
+    """Returns the methods with their published settings, and with each change in `_CHANGES`."""
     found = {"initial": METHODS["initial"]}
     for name, changes in _CHANGES.items():
         method = found[name] = METHODS[name]
@@ -233,8 +233,8 @@ def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# A new mesh, and for each of its vertices the old vertex at the same position, or -1 if there is no such
-# vertex.
+# The first item is the new mesh. For each new vertex, the second item states the old vertex at the same
+# position, or -1 if there is no such vertex.
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 

@@ -274,7 +274,7 @@ def test_a_vanishing_frame_function_is_reported(pair, pointwise_map, solution, c
     refined = refine(*pair, pointwise_map, refiner=refiner)
     assert refined.result == RESULTS.undetermined_functional_map
     assert (refined.pointwise_map == -1).all()
-    assert "frame function" in RESULTS[refined.result] and "Filtering()" in RESULTS[refined.result]
+    assert "filters of the bank vanish" in RESULTS[refined.result] and "Filtering()" in RESULTS[refined.result]
     filtering = WaveletPreservation(bank=Gap(), convention=convention)
     assert refine(*pair, pointwise_map, refiner=filtering).result == RESULTS.successful
 

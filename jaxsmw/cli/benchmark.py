@@ -90,8 +90,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Match and measure all pairs that have no results yet, then write and print the tables of all pairs.
 
-    **Raises:** `InputError` if an option cannot be used or a needed package is not installed. If a pair cannot
-    be measured, `InputError` is raised after the results of all other pairs are written.
+    **Raises:** `InputError` if an option cannot be used or a needed package is not installed. If a pair
+    cannot be measured, `InputError` is raised after the results of all other pairs are written.
     """
     from jaxsmw.report.figures import check_drawable
 

@@ -40,8 +40,8 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python flushes standard output again at exit. Standard output is redirected to the null device, because
-        # Python would otherwise report the same error again.
+        # Python flushes standard output again at exit. Without the redirection to the null device, Python
+        # would then report the same error again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise

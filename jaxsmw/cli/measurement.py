@@ -86,8 +86,8 @@ def measure_errors(
     **Arguments:**
 
     - `mesh_y`: the target Y.
-    - `maps`: a dictionary from the name of each map to the map X -> Y. A map consists of 0-based vertices of Y
-      (m,) or of m `SurfacePoints` on Y.
+    - `maps`: a dictionary from the name of each map X -> Y to the map, either an array (m,) of 0-based
+      vertices of Y or m `SurfacePoints` on Y.
     - `truth`: the ground truth.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
 

@@ -98,8 +98,8 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         choices=tuple(_SOLUTIONS),
         help="computation of the functional map: filtering is meant for banks that are tight frames; "
         "least-squares computes the exact minimiser for all banks; least-squares-frobenius is the same, but "
-        "gives all vertices equal weight; regularized is least-squares with additional terms for commutativity with the "
-        f"Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
+        "gives all vertices the same weight; regularized is least-squares with additional terms for "
+        f"commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
         "--iterations",

@@ -119,8 +119,8 @@ def write_comparison_page(
 ) -> None:
     """Write an interactive page that compares maps with `jaxsmw.report.summary.write_comparison`.
 
-    The page labels each map with its file name without suffix. If two of these labels are equal, the page uses
-    the file names with suffix instead. If two file names are equal, the page uses the full paths.
+    The page labels each map with its file name without suffix. If two of these labels are equal, the page
+    uses the file names with suffix instead. If two file names are equal, the page uses the full paths.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Conversions and checks of the settings of modules and functions."""
+"""Conversions and checks of arguments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Returned = TypeVar("Returned")
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
-    """Returns a continuous setting as an array of the default float type, which JAX can trace."""
+    """Returns a continuous parameter as an array of the default float type, which JAX can trace."""
     return jnp.asarray(value, dtype=float)
 
 
@@ -34,7 +34,7 @@ def all_finite(tree: PyTree) -> Bool[Array, ""]:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Checks that the value of an option is one of several words.
+    """Checks that the value of an option is one of the choices.
 
     **Raises:** `ValueError` if the value is not one of the choices.
     """

@@ -5,14 +5,14 @@ Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before
 conventions for the direction of a functional map C:
 
 - **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, and `C_0 = Phi_X^+ P Phi_Y`.
-  The program of the MWP authors uses this convention.
+  The MWP authors' program uses this convention.
 - **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
-  MWP paper prints this convention.
+  equations of the MWP paper use this convention.
 
 This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions
 every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x, and C should map a_x to
-b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which the paper uses in
-eq. (5), all vertices have the same weight. The following table defines the weights and the vectors:
+b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which eq. (5) of the MWP
+paper uses, all vertices have the same weight. The following table defines the weights and the vectors:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -26,18 +26,19 @@ the paper. The energy of eq. (5) of the paper, with the filters g_l of a bank, i
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
-Lambda contains the eigenvalues, and the rows of G are the responses of the filters at the eigenvalues. For
-every matrix M, the sum over scales equals an elementwise product:
-`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on two matrices and
-a constant. Their computation needs no loop over scales and no array of size m x n:
+The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of both shapes. The matrices G_out and
+G_in contain the responses of the filters at these eigenvalues, one row per filter. For every matrix M, the
+sum over filters equals an elementwise product (`*`):
+`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on a matrix `gram`,
+a matrix `cross` and a constant. Computing them needs no loop over filters and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
 The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
-orthonormal if `sum_x w a a^T` is the identity. Then the gram matrix is diagonal, its diagonal is the frame
-function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval frame
-this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always
+called orthonormal if `sum_x w a a^T` is the identity. Then the gram matrix is diagonal, its diagonal is the
+frame function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval
+frame this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always
 orthonormal in the pushforward convention. In the pullback convention they are orthonormal if T preserves
 area. `docs/frames.md` derives these results.
 """
@@ -79,11 +80,12 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
 
     **Arguments:**
 
-    - `spectrum`: the shape.
-    - `pseudo_inverse`: `"area"` for `Phi^T A`, the projection in the inner product of the surface, which the
-      MWP paper uses. `"least_squares"` for `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same
-      weight. The authors' program uses this form. Both are nearly equal if the vertices are spread evenly. On
-      samples, only `"least_squares"` is a pseudo-inverse.
+    - `spectrum`: the `Spectrum` of a shape with n vertices and k eigenvectors.
+    - `pseudo_inverse`: `"area"` computes `Phi^+ = Phi^T A`, where the diagonal matrix A contains the vertex
+      areas. This matrix is the projection in the inner product of the surface, which the MWP paper uses.
+      `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
+      authors' program uses this form. Both matrices are nearly equal if the vertices are spread evenly. If
+      the spectrum contains only samples, only `"least_squares"` gives a pseudo-inverse.
     """
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
@@ -101,8 +103,8 @@ def encode(
 ) -> Float[Array, "k_out k_in"]:
     """Returns the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
 
-    Phi_X and Phi_Y contain the eigenvectors as columns, `Phi^+` is a pseudo-inverse, and P (m, n) is the
-    matrix of T, with a one at (x, T(x)) in each row x.
+    Phi_X and Phi_Y contain the eigenvectors as columns, and `Phi^+` is a pseudo-inverse of Phi. P (m, n) is
+    the matrix of T, with a one at (x, T(x)) in each row x.
 
     **Arguments:**
 
@@ -112,8 +114,9 @@ def encode(
     - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
       maps functions on Y to functions on X. `"pushforward"` gives `Phi_Y^+ P^T Phi_X` (k_Y, k_X), which maps
       functions on X to functions on Y.
-    - `pseudo_inverse`: `"area"` (the default) uses `Phi^+ = Phi^T A`, with the vertex areas A.
-      `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight.
+    - `pseudo_inverse`: `"area"` (the default) uses `Phi^+ = Phi^T A`, where the diagonal matrix A contains
+      the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the
+      same weight.
 
     **Returns:** C_0, (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention.
     """
@@ -131,7 +134,7 @@ def _encode(
     """Returns the functional map of `encode` for given dual eigenvectors.
 
     In both conventions the functional map is a sum over the vertices of X. Padded vertices of X do not
-    contribute, because their rows in the array of X are zero.
+    contribute, because their eigenvectors and dual eigenvectors are zero.
     """
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
@@ -141,10 +144,11 @@ def _encode(
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the kernel K (k_out, k_in) with which filtering becomes an elementwise product.
+    """Returns the multiscale kernel K (k_out, k_in), with which filtering becomes an elementwise product.
 
     For every functional map C (k_out, k_in) and the filters g_l of a bank, the filtered map
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals `C * K`.
+    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrices
+    Lambda_out and Lambda_in contain the eigenvalues of the shapes that C maps to and maps from.
 
     **Arguments:**
 
@@ -158,8 +162,9 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Every sum of squares `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i.
-    `energy(C)` returns the energy of C (k_out, k_in), and `energy.minimizer()` returns the C of least energy.
+    Here <A, B> is the sum of the elementwise products of two matrices. Every sum of squares
+    `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
+    energy of C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy.
     `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of shape ().
 
     **Attributes:**
@@ -231,9 +236,9 @@ class QuadraticEnergy(eqx.Module):
 class WaveletProblem(eqx.Module):
     """The data from which a `Solution` computes the functional map C of a pointwise map from X to Y.
 
-    The code of a solution is the same for both conventions. It uses the methods of this class, which return
-    the quantities of both shapes in the order (out, in): first the shape that C maps to ("out"), then the
-    shape that C maps from ("in").
+    The code of a solution is the same for both conventions. The methods of this class return the quantities
+    of both shapes in the order (out, in): first the shape that C maps to ("out"), then the shape that C maps
+    from ("in").
 
     **Attributes:**
 
@@ -283,22 +288,24 @@ class WaveletProblem(eqx.Module):
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
         """Returns the wavelet-preservation energy, eq. (5) of the MWP paper, as a function of C.
 
-        For each functional map C, the energy sums over all scales and all vertices of X how far C is from
-        preserving the wavelets under the pointwise map T. The docstring of the module
-        `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
+        For each functional map C, the energy is a weighted sum of squared distances over all filters and all
+        vertices x of X. In the pullback convention, each distance is between the wavelet at x and the image
+        under C of the wavelet at the match of x. The docstring of the module `jaxsmw.core.functional_map`
+        states the formula, which holds for every filter bank.
 
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
-        also for frames that are not tight. The energy of C = 0 is the attribute `constant`. In the pullback
-        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, with the frame function G_X on
-        X. For a Parseval frame this sum is k_X.
+        also for frames that are not tight. `problem.energy(T).constant` is the energy of C = 0. In the
+        pullback convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame
+        function at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 
         - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
-        - `norm`: `"area"` (the default) to weight the vertices of X by their areas; `"frobenius"` for equal
-          weights, as in eq. (5) of the paper.
+        - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
+          vertices the same weight, as in eq. (5) of the MWP paper.
 
-        **Returns:** A `QuadraticEnergy`.
+        **Returns:** A `QuadraticEnergy` with the attributes `gram` (k_in, k_in), `cross` (k_out, k_in) and
+        `constant` ().
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses
@@ -311,7 +318,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns w_x, a_x and b_x of all vertices of X. The table at the top of this module defines them."""
+        """Returns w_x, a_x and b_x of all vertices x of X, which the docstring of this module defines."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

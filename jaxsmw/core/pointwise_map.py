@@ -20,17 +20,17 @@ def spectral_embeddings(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns two point sets in which the point of each vertex of X is close to the point of its match on Y.
+    """Returns one point for each vertex of X and Y, such that matched vertices have nearby points.
 
-    With the eigenvectors Phi_X and Phi_Y as columns, the points are the rows of two matrices. These are
-    `Phi_X` and `Phi_Y C^T` in the pullback convention, and `Phi_X C^T` and `Phi_Y` in the pushforward
-    convention.
+    The matrices Phi_X and Phi_Y contain the eigenvectors as columns. In the pullback convention, the points
+    of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
+    convention, the points of X are the rows of `Phi_X C^T`, and the points of Y are the rows of `Phi_Y`.
 
     The convention matters because a filtered C shrinks the vectors that it maps. In the pushforward
-    convention C shrinks the *queries*. The nearest points of most queries are then the few database points
-    of small norm, which become hubs. In the pullback convention C shrinks the *database*, which hardly
-    changes the order of the distances from a query. On real pairs pullback maps are good, and pushforward
-    maps fail.
+    convention C shrinks the *queries*. The nearest points of most queries are then the few database points of
+    small norm, which become hubs. In the pullback convention C shrinks the *database*, which hardly changes
+    the order of the distances from a query. With filtering, refinement succeeds on real shapes in the
+    pullback convention and fails in the pushforward convention.
 
     **Arguments:**
 
@@ -61,7 +61,7 @@ def decode(
     of Y that is nearest in spectral space. Phi_X and Phi_Y contain the eigenvectors as columns. In the
     pullback convention, the queries are the rows of `Phi_X` and the targets are the rows of `Phi_Y C^T`. In
     the pushforward convention, the queries are the rows of `Phi_X C^T` and the targets are the rows of
-    `Phi_Y`.
+    `Phi_Y`. The search is exact up to rounding errors, with and without patches.
 
     **Arguments:**
 
@@ -73,7 +73,7 @@ def decode(
     - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
       large shapes. None (the default) compares all vertices of X with all vertices of Y.
 
-    **Returns:** T, one vertex of Y per vertex of X, as an integer array (m,).
+    **Returns:** T, one vertex of Y per vertex of X, as an int32 array (m,) of indices from 0 to n - 1.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_vertices(queries, database, spectrum_y.mask, patches)
@@ -87,19 +87,19 @@ def decode_to_triangles(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Returns the map from the vertices of X to points on the triangles of Y that a functional map C implies.
+    """Converts a functional map C to a map from the vertices of X to points on the triangles of Y.
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
-    vertices of both shapes become points in spectral space. With the eigenvectors Phi_X and Phi_Y as columns,
-    these points are the rows of `Phi_X` and `Phi_Y C^T` in the pullback convention. In the pushforward
-    convention, they are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span a surface in this space.
-    Each vertex of X is mapped to the nearest point of this surface.
+    vertices of both shapes become points in spectral space. The matrices Phi_X and Phi_Y contain the
+    eigenvectors as columns. In the pullback convention, the points are the rows of `Phi_X` and `Phi_Y C^T`.
+    In the pushforward convention, they are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span a
+    surface in this space. Each vertex of X is mapped to the nearest point of this surface.
 
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
-    `decode_to_triangles` can map these vertices to different points, so textures and other functions stay
-    smooth when the map transfers them. `decode_to_triangles` takes about ten times as long as `decode`
-    without patches: one second for shapes of 5000 vertices. The time grows with the product of the numbers
-    of vertices.
+    `decode_to_triangles` can map these vertices to different points. Textures and other functions therefore
+    stay smooth when this map transfers them. `decode_to_triangles` takes about ten times as long as `decode`
+    without patches: one second for shapes of 5000 vertices. The time grows with the product of the numbers of
+    vertices.
 
     **Arguments:**
 
@@ -108,31 +108,32 @@ def decode_to_triangles(
       vertices, k_Y eigenvectors).
     - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
       `"pushforward"` if C maps functions on X to functions on Y.
-    - `faces_y`: the triangles of Y (f, 3), as vertex indices.
+    - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
 
-    **Returns:** For each vertex of X, the index of a triangle of Y (m,) and the barycentric weights of the
-    three corners of this triangle (m, 3).
+    **Returns:** A pair of arrays: for each vertex of X, the index of a triangle of Y, int32 (m,), and the
+    barycentric weights of the three corners of this triangle (m, 3). The weights are not negative and sum to
+    1.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_point_on_triangles(queries, database, faces_y)
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Returns patches of both shapes, with which `decode` is faster on large shapes.
+    """Returns patches of both shapes, for the argument `patches` of `decode`.
 
-    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. The
-    patches can be used for all functional maps between X and Y.
+    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. Patches
+    make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
+    Y.
 
     The number of vertices per patch of Y grows with the square root of Y's number of vertices. This size
-    balances the work per patch and the work per vertex. So the time of a search grows with the number of
-    vertices to the power 1.5.
+    balances the work per patch and the work per vertex. The time of a search therefore grows with the number
+    of vertices to the power 1.5.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
 
-    **Returns:** The patches of X, for the queries, and the patches of Y, for the database. Pass this pair to
-    the argument `patches` of `decode`.
+    **Returns:** A pair: the patches of X, for the queries, and the patches of Y, for the database.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
@@ -148,7 +149,7 @@ def chosen_patches(
     """Returns the `search_patches` of both shapes if the setting `search` needs them, and None otherwise.
 
     `"patches"` always uses patches, and `"exhaustive"` never uses patches. `"auto"` uses patches if the
-    default backend is a CPU and the geometric mean of both numbers of vertices is at least 15 000.
+    default backend is a CPU and the geometric mean of the two numbers of vertices is at least 15 000.
     """
     sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
     pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
@@ -157,11 +158,11 @@ def chosen_patches(
     return None
 
 
-# From this number of vertices on (the geometric mean of both shapes), patches save more time than their
-# compilation takes.
+# If the geometric mean of the two numbers of vertices is at least this number, patches save more time than
+# the additional compilation takes.
 _PATCHES_FROM = 15_000
 # These sizes were the fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices per patch of
-# X. _RANK is the rank of the patches of Y. A patch of Y has _SMALLEST_PATCH vertices if Y has
-# _VERTICES_OF_SMALLEST vertices or fewer.
+# X. _RANK is the rank of the patches of Y. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch of Y has
+# _SMALLEST_PATCH vertices.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

@@ -1,4 +1,4 @@
-"""Status codes that work under `jax.jit` and `jax.vmap`, with a sentence for each code."""
+"""Status codes that work under `jax.jit` and `jax.vmap`, with an explanation of each code."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from jaxtyping import Array, Bool
 
 
 class RESULTS(eqx.Enumeration):
-    """The status code of a refinement, as a value that compiled code can return.
+    """The status code of a refinement, which compiled code can return.
 
-    Compare a status code `result` with a member: `result == RESULTS.successful`. `RESULTS[result]` is a
-    sentence that explains the status and suggests remedies. The members are `successful`,
-    `nonfinite_spectrum`, `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`,
-    `singular_system`, `fixed_point_not_reached` and `solver_not_converged`.
+    Compare a status code `result` with a member: `result == RESULTS.successful`. `RESULTS[result]` is a text
+    that explains the status and suggests remedies. The members are `successful`, `nonfinite_spectrum`,
+    `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`, `singular_system`,
+    `fixed_point_not_reached` and `solver_not_converged`.
     """
 
     successful = "The refinement succeeded: all numbers are finite."
@@ -33,10 +33,10 @@ class RESULTS(eqx.Enumeration):
     undetermined_functional_map = (
         "A part of the functional map is undetermined to working precision. If the solution uses wavelets, "
         "all filters of the bank vanish at some eigenvalue: use a filter bank that covers the whole "
-        "spectrum. Usually the lowest band is missing, which a low-pass filter adds, or the highest band. If "
-        "the solution uses only descriptors, the descriptors do not determine the map: use descriptors of "
-        "zero mean and similar size. In both cases it may help to use fewer eigenvectors, float64, or "
-        "solution=Filtering(), which solves no linear system."
+        "spectrum. Usually the lowest or the highest band is missing; a low-pass filter adds the lowest "
+        "band. If the solution uses only descriptors, the descriptors do not determine the map: use "
+        "descriptors of zero mean and similar size. In both cases it may help to use fewer eigenvectors, "
+        "float64, or solution=Filtering(), which solves no linear system."
     )
     singular_system = (
         "The least-squares problem for the functional map is singular to working precision: the pointwise "
@@ -55,7 +55,7 @@ class RESULTS(eqx.Enumeration):
 
 
 def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
-    """Returns the status code `if_true` where the condition is True, and `if_false` where it is False.
+    """Returns the status code `if_true` if the condition is True, and `if_false` otherwise.
 
     The annotations include `str` because type checkers treat the members of an Enumeration as strings.
     """
@@ -63,5 +63,5 @@ def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: R
 
 
 def sentence(result: RESULTS) -> str:
-    """Returns the sentence that explains a status code to the user."""
+    """Returns the text that explains a status code to the user."""
     return RESULTS[result]  # type: ignore[misc]

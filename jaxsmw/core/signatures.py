@@ -1,8 +1,9 @@
-"""Spectral signatures: vertex descriptors from heat, waves and wavelets.
+"""Spectral signatures: the heat kernel signature, the wave kernel signature and a wavelet signature.
 
-All three signatures have the form `f_t(x) = sum_i w_t(lambda_i) phi_i(x)² / sum_i w_t(lambda_i)`. The
-weights w_t pass a band of eigenvalues. On a surface of area 1, the area-weighted mean of each dimension is 1.
-The signatures do not depend on the signs of the eigenvectors, and they do not tell left from right.
+All three signatures have the form `f_t(x) = sum_i w_t(lambda_i) phi_i(x)² / sum_i w_t(lambda_i)`. Dimension t
+of a signature has its own weight function w_t of the eigenvalue. On a surface of area 1, the area-weighted
+mean of each dimension is 1. The signatures do not depend on the signs of the eigenvectors, and they do not
+distinguish left from right.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from jaxsmw.core.spectrum import Spectrum
 def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
     """Returns the heat kernel signature at log-spaced diffusion times (Sun, Ovsjanikov, Guibas 2009).
 
-    The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`. Here lambda_max is the largest and
-    lambda_min the smallest positive eigenvalue of the spectrum.
+    The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`. Here lambda_max is the largest
+    eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
 
     **Arguments:**
 
     - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of times, by default 100.
+    - `dimensions`: the number of times, at least 1, by default 100.
 
     **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
     the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
@@ -41,20 +42,20 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     The signature is that of Aubry, Schlickewei, Cremers 2011. The weights are Gaussians in the logarithm of
     the eigenvalue. Their centres run in even steps from `log lambda_min + 2 width` to
     `log lambda_max - 2 width`, and their width (standard deviation) is 7 steps. Here lambda_max is the
-    largest and lambda_min the smallest positive eigenvalue of the spectrum.
+    largest eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
 
     **Arguments:**
 
     - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of energies, by default 100.
+    - `dimensions`: the number of energies, at least 1, by default 100.
 
     **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
     the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
-    # The distance from each end to the nearest centre is 2 widths, which is 14 steps. The whole range has
-    # these 28 steps and `dimensions - 1` steps between the centres.
+    # The distance from each end of the range to the nearest centre is 2 widths, which is 14 steps. Both ends
+    # together are 28 steps, and there are `dimensions - 1` steps between the centres.
     width = 7 * (high - low) / (dimensions - 1 + 28)
     energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
     positive = spectrum.eigenvalues >= smallest
@@ -64,20 +65,21 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
 
 def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Returns the squared norms of the Meyer wavelets centred at each vertex, at log-spaced scales.
+    """Returns the wavelet signature: the scaled squared norm of the Meyer wavelet at each vertex and scale.
 
     This signature is a spectral wavelet signature in the sense of Li and Ben Hamza 2013, but with the
     band-pass filter of the Meyer frame from the MWP paper. The filter of each scale passes the eigenvalues
-    from `peak / 2` to `2 peak`. The peaks run from lambda_min, the smallest positive eigenvalue, to
-    `lambda_max / 2`, half the largest eigenvalue.
+    from `peak / 2` to `2 peak`. The peaks are log-spaced from lambda_min, the smallest positive eigenvalue,
+    to `lambda_max / 2`, half the largest eigenvalue.
 
     **Arguments:**
 
     - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of scales, by default 100.
+    - `dimensions`: the number of scales, at least 1, by default 100.
 
     **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
-    the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
+    the area-weighted mean of each column is 1. A column is NaN if its filter passes no eigenvalue. All
+    entries are NaN if no eigenvalue is positive.
     """
     smallest, largest = _positive_range(spectrum)
     peaks = jnp.geomspace(smallest, largest / 2, dimensions)
@@ -93,8 +95,8 @@ def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Flo
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Returns the smallest positive and the largest eigenvalue.
 
-    Each connected component has an eigenvalue zero, which rounding can make slightly positive. Such an
-    eigenvalue does not count as positive.
+    Each connected component has an eigenvalue zero, which rounding can make slightly positive. Eigenvalues
+    below 1e-6 of the largest eigenvalue are therefore treated as zero.
     """
     largest = spectrum.eigenvalues[-1]
     positive = spectrum.eigenvalues > 1e-6 * largest

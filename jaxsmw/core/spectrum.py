@@ -1,4 +1,4 @@
-"""The spectrum of a shape, the only form in which the traced code of `jaxsmw.core` receives a shape."""
+"""The spectrum of a shape: eigenpairs of the Laplacian and further arrays of one row per vertex."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Spectrum(eqx.Module):
 
     `compute_spectrum` computes the spectrum of a mesh. The eigenpairs solve `W phi = lambda A phi`. W is the
     positive semi-definite stiffness matrix of cotangent weights (the Laplace–Beltrami operator), and the
-    diagonal matrix A contains the vertex areas. The eigenvectors are orthonormal with respect to A: `Phi^T A
-    Phi = I`.
+    diagonal matrix A contains the vertex areas. The eigenvectors Phi are orthonormal with respect to A:
+    `Phi^T A Phi = I`.
 
     A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks several shapes, which gives every
     array a leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero
@@ -29,11 +29,11 @@ class Spectrum(eqx.Module):
     - `vertex_areas`: (n,), in units of length², zero for masked vertices.
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
     - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
-      or None. Of the refiners of this package, only `FeatureRegression` and `Registration` use descriptors.
-    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None. Of the
-      refiners of this package, only `Registration` uses positions.
-    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None. Of the refiners of
-      this package, only `Registration` uses normals.
+      or None (the default). Only the refiners `FeatureRegression` and `Registration` use descriptors.
+    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None (the
+      default). Only the refiner `Registration` uses positions.
+    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None (the default). Only the
+      refiner `Registration` uses normals.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -53,7 +53,7 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Returns the shape with all areas multiplied by a factor, and all lengths by its square root.
+        """Returns the shape with all areas multiplied by a factor, and all lengths by the square root of the factor.
 
         **Arguments:**
 
@@ -80,7 +80,7 @@ class Spectrum(eqx.Module):
 
         The unit of the positions must match the vertex areas, which are in units of length².
 
-        **Raises:** `ValueError` if the arrays do not have one row of 3 numbers per vertex.
+        **Raises:** `ValueError` if an array does not have one row of 3 numbers per vertex.
         """
         self._check_rows("positions", positions, 3)
         self._check_rows("normals", normals, 3)
@@ -104,10 +104,10 @@ class Spectrum(eqx.Module):
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """Returns the shape with only some of its vertices, the samples. All samples get equal areas.
+        """Returns the shape with only some of its vertices, the samples, each with the same area.
 
-        The eigenvectors are not orthonormal on samples, so the pseudo-inverse of the eigenvectors must be
-        computed by least squares.
+        The areas of the samples sum to the area of the shape. The eigenvectors are not orthonormal on
+        samples, so the pseudo-inverse of the eigenvectors must be computed by least squares.
 
         **Arguments:**
 

@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks
 
-# The number of queries per block. The distances from the queries of a block to all triangles are in memory
-# together.
+# The number of queries per block. For all queries of a block, the distances to all triangles are in memory at
+# the same time.
 _BLOCK = 32
 
 
@@ -20,31 +20,31 @@ def nearest_point_on_triangles(
     *,
     face_mask: Bool[Array, " f"] | None = None,
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Returns, for each query, the nearest point on a set of triangles in a space of any dimension.
+    """Finds, for each query, the nearest point on a set of triangles in a space of any dimension.
 
-    The nearest point is exact, in Euclidean distance. Every query is compared with all triangles, but no
-    array of size m x f is stored. The distance to a triangle is computed from the inner products of the query
-    with the corners. If the nearest point belongs to several triangles, for example a common corner, one of
-    these triangles is returned.
+    The search is exact up to rounding errors, in Euclidean distance. Every query is compared with all
+    triangles, but no array of size m x f is stored. The distance to a triangle is computed from the inner
+    products of the query with the corners. If the nearest point belongs to several triangles, for example to
+    a common corner, the function returns one of these triangles.
 
     **Arguments:**
 
     - `queries`: (m, d), points in d dimensions, in any unit.
     - `points`: (n, d), the corners of the triangles, in the same unit.
-    - `faces`: (f, 3), three indices into `points` per triangle.
-    - `face_mask`: (f,), False for triangles to be ignored. None (the default) uses all triangles. If all
-      triangles are ignored, the result is meaningless.
+    - `faces`: (f, 3), for each triangle the indices of its corners in `points`.
+    - `face_mask`: (f,), False for triangles that the search ignores. None (the default) uses all triangles.
+      If the search ignores all triangles, the result is meaningless.
 
-    **Returns:** For each query, the index of the triangle that contains the nearest point (m,) and the
-    barycentric weights of the three corners of this triangle (m, 3). The weights are not negative and sum
-    to 1.
+    **Returns:** A pair of arrays: for each query, the index of the triangle that contains the nearest point,
+    int32 (m,), and the barycentric weights of the three corners of this triangle (m, 3). The weights are not
+    negative and sum to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
     lengths = product(edges, jnp.swapaxes(edges, 1, 2))
     grams = (lengths[:, 0, 0], lengths[:, 0, 1], lengths[:, 1, 1])
     starts = jnp.einsum("fed,fd->ef", edges, corners[:, 0], precision="highest")
-    # |q - a|² = |q|² + |a|² - 2 q·a. The term |q|² is the same for all triangles and is left out.
+    # |q - a|² = |q|² + |a|² - 2 q·a. The term |q|² is the same for all triangles, so `search` omits it.
     norms = jnp.sum(corners[:, 0] ** 2, axis=1)
     masked = jnp.zeros(len(faces), bool) if face_mask is None else ~face_mask
     columns = [value[:, None] for value in (*grams, *starts, norms)]
@@ -74,13 +74,16 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns the squared distances from points q to triangles, and the nearest points as pairs of s and t.
+    """Returns the squared distances from points q to triangles, and the numbers s and t of the nearest
+    points.
 
-    The points of a triangle are `a + s u + t v`, with a corner a and the edges u and v from this corner.
+    The points of a triangle are `a + s u + t v`, where a is a corner, and u and v are the edges from this
+    corner.
 
     **Arguments:**
 
-    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. The returned distance contains the same constant.
+    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. The returned squared distance contains the same
+      constant.
     - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`.
     - `uu`, `uv`, `vv`: the products `u·u`, `u·v` and `v·v`.
     """

@@ -14,8 +14,8 @@ from jaxsmw.geometry.mesh import Mesh
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
 
-The value is the largest error threshold that evaluations report. A match with a larger error counts as wrong.
-All maps and reports use the same scale by default, which makes their colours comparable.
+The value is the largest error threshold that evaluations report. By default, all figures and pages use this
+scale, so their colours are comparable.
 """
 
 # Björn Ottosson, "A perceptual color space for image processing", 2020. The first matrix converts OKLab to
@@ -77,7 +77,7 @@ PLAIN = np.array([0.76, 0.77, 0.79])
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts light intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
+    """Converts linear RGB intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
 
     Intensities outside of [0, 1] are clipped.
     """
@@ -86,7 +86,7 @@ def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarra
 
 
 def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts sRGB colours (…, 3) in [0, 1] to light intensities (…, 3), which can be added and averaged."""
+    """Converts sRGB colours (…, 3) in [0, 1] to linear RGB intensities (…, 3), which can be averaged."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
@@ -94,12 +94,12 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
 
     The right side of the body is green, and the left side is red. Along the height or the length of the body,
-    whichever is larger, the hue changes from yellow to blue. The third coordinate only changes the lightness,
-    because shading makes differences in lightness hard to see. Each limb of people and animals therefore has
-    its own hue, and a map that swaps left and right is obvious.
+    whichever is larger, the hue changes from yellow to blue. The smaller of height and length only changes
+    the lightness, because shading makes differences in lightness hard to see. Each limb of people and animals
+    therefore has its own hue, and swapped limbs are obvious.
 
-    Each coordinate combines the relative position in the bounding box with the relative rank among the
-    vertices. Without the rank, the trunk of a slender body would be uniformly grey.
+    Along each axis, the colour depends on the vertex's relative position in the bounding box and on its
+    relative rank among all vertices. Without the rank, the trunk of a slender body would be uniformly grey.
 
     **Arguments:**
 
@@ -110,8 +110,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Coordinates that differ only by rounding errors get the same rank. Otherwise the colours of a flat mesh
-    # would be noisy.
+    # Coordinates are rounded to this grid. Otherwise, the ranks on a flat mesh would depend on rounding errors,
+    # and its colours would be noisy.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
@@ -154,7 +154,8 @@ def signed_colors(
 
     - `values`: the values (m,) of a function or a matrix. Values outside of the scale are clipped.
     - `limit`: the end of the scale, positive, in the unit of the values.
-    - `on_dark`: True if the background is dark, so that zero has a dark colour; False if zero is white.
+    - `on_dark`: whether the background is dark. If True, the colour of zero is dark. If False, the colour of
+      zero is white.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """

@@ -63,9 +63,9 @@ def draw_correspondence(
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: arrays of errors by name. Each array (m,) contains the error of each match as a fraction of
-      sqrt(area of Y), or NaN where the error is unknown. For each array, the figure has a panel that shows
-      the errors as colours on X.
+    - `errors`: a dictionary from names to arrays of errors. Each array (m,) contains the error of each match
+      as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array, the figure contains
+      a panel that shows the errors as colours on X.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two figures are comparable if their limits are equal.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
@@ -229,11 +229,11 @@ def draw_quality_curves(
 
     **Arguments:**
 
-    - `curves`: pairs of thresholds (p,) and shares (p,), by the name of a map. The thresholds are fractions
-      of sqrt(area of Y), in ascending order. Each share in [0, 1] counts the matches with an error of at most
-      the threshold.
-    - `mean_errors`: the mean errors of maps by the same names, which the legend shows. Some or all maps may
-      have no mean error.
+    - `curves`: a dictionary from the name of each map to its curve, which is a pair of thresholds (p,) and
+      shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order. The shares are numbers
+      in [0, 1].
+    - `mean_errors`: a dictionary from the names of maps to their mean errors, which the legend shows. Maps
+      may be left out.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -298,14 +298,14 @@ def draw_functions(
     """A figure of functions on bodies, with one row per body and one column per function.
 
     Positive values are red, and negative values are blue. All bodies in a column have the same colour scale.
-    The scale ends at the absolute value that 99.5 % of the column's vertices do not exceed.
+    The scale ends at the 99.5th percentile of the absolute values in the column.
 
     **Arguments:**
 
     - `meshes`: the bodies. Their numbers of vertices n may differ.
     - `functions`: for each body, the values of all functions at its vertices (functions, n).
     - `titles`: the titles of the columns, one per function.
-    - `marked`: one 0-based vertex of each body, which the figure marks by a ring.
+    - `marked`: a 0-based vertex for each body, which the figure marks by a ring.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -362,16 +362,16 @@ def draw_forest(
     xlabel: str,
     linear_up_to: float = 1.0,
 ) -> Figure:
-    """A forest plot of one or several panels, which show estimates with intervals and a line at zero.
+    """A forest plot with one or several panels.
 
-    The scale is linear near zero and logarithmic elsewhere, which makes both small and large estimates
-    visible.
+    Each panel shows estimates with their intervals, and a vertical line at zero. The scale is linear near
+    zero and logarithmic elsewhere, which makes both small and large estimates visible.
 
     **Arguments:**
 
-    - `panels`: the series of each panel, by the title of the panel. A series is an array (rows, 3) by its
-      name. Each row of the array contains an estimate and the lower and upper end of its interval, or NaN for
-      a missing estimate. All panels have the same series.
+    - `panels`: a dictionary from the title of each panel to its series. The series are a dictionary from
+      names to arrays (rows, 3). Each row of an array contains an estimate and the lower and upper end of its
+      interval, or NaN for a missing estimate. The names of the series are the same in all panels.
     - `rows`: the names of the rows, from top to bottom.
     - `xlabel`: the name of the estimated quantity.
     - `linear_up_to`: the absolute value of an estimate above which the scale is logarithmic.
@@ -444,13 +444,13 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure of tables of positive numbers, in which each cell contains its number and is coloured by it.
+    """A figure of tables of positive numbers. Each cell shows its number, on a colour for this number.
 
     All tables have the same logarithmic colour scale.
 
     **Arguments:**
 
-    - `panels`: the tables (rows, columns) by title.
+    - `panels`: a dictionary from the title of each table to its numbers (rows, columns).
     - `rows`: the name of the parameter that varies from row to row, and its value in each row.
     - `columns`: the name of the parameter that varies from column to column, and its value in each column.
     - `label`: the name of the quantity that the numbers measure.
@@ -465,7 +465,7 @@ def draw_heat_maps(
         if np.shape(table) != shape or not (np.isfinite(table).all() and np.min(table) > 0):
             raise InputError(
                 f"{title}: the table must have shape {shape} and positive entries, but its shape is "
-                f"{np.shape(table)} and its smallest entry {np.min(table)}."
+                f"{np.shape(table)} and its smallest entry is {np.min(table)}."
             )
     size = 1.2 + (0.6 + 0.42 * shape[1]) * len(panels), max(2.6, 1.1 + 0.3 * shape[0])
     figure = _new_figure(*size, plot=True)
@@ -555,9 +555,9 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draws the bodies side by side at the same scale, with the role and the name of each body above it.
+    """Draws the bodies next to each other at the same scale. The role and the name of a body are above it.
 
-    Each pixel of the figure shows one pixel of a picture that `render` returns. `right_margin` is in pixels.
+    The pictures that `render` returns are not rescaled. `right_margin` is in pixels.
     """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]

@@ -49,10 +49,10 @@ def check_errors(
     **Arguments:**
 
     - `mesh_x`: the source, with m vertices.
-    - `errors`: arrays by name. Each array (m,) contains a non-negative error for each vertex of X, or NaN
-      where the error is unknown.
+    - `errors`: a dictionary from names to arrays. Each array (m,) contains a non-negative error for each
+      vertex of X, or NaN where the error is unknown.
 
-    **Returns:** The arrays (m,) by the same names, in float64.
+    **Returns:** A dictionary from the same names to the arrays (m,) in float64.
 
     **Raises:** `InputError` if an array does not have one non-negative number or NaN for every vertex of X.
     """

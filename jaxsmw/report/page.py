@@ -71,14 +71,15 @@ class ShownMap:
     **Attributes:**
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: arrays of errors by name. Each array (m,) contains the error of each match as a fraction of
-      sqrt(area of Y), or NaN where the error is unknown. For each array, the page has a mode that shows the
-      errors as colours.
+    - `errors`: a dictionary from names to arrays of errors. Each array (m,) contains the error of each match
+      as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array, the page has a mode
+      that shows the errors as colours.
     - `functional_map`: the functional map C, which the page shows as a picture. The shape is (k_X, k_Y) in
       the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the page shows no
       functional map.
     - `convention`: the convention of C, `"pullback"` or `"pushforward"`.
-    - `statistics`: values by label, which the page shows in the table that compares its maps.
+    - `statistics`: a dictionary from labels to values as text. The page contains a table of these values,
+      with one row per map and one column per label.
     """
 
     pointwise_map: Int[np.ndarray | Array, " m"]
@@ -112,9 +113,9 @@ def write_page(
 
     where g_l is the filter of scale l, and lambda_i and phi_i are the eigenvalues and eigenvectors of the
     shape. The page shows the wavelet on X around the vertex under the pointer, and the wavelet on Y around
-    the match of this vertex. If the map preserves wavelets, the two wavelets look similar. The page prints
-    their similarity: the wavelet on Y is transferred to X by the map, and the similarity is the cosine of the
-    angle between this function and the wavelet on X.
+    the match of this vertex. If the map preserves wavelets, the two wavelets look similar. The page also
+    prints their similarity. To compute the similarity, the map transfers the wavelet on Y to X. The
+    similarity is the cosine of the angle between the transferred wavelet and the wavelet on X.
 
     **Arguments:**
 
@@ -122,17 +123,18 @@ def write_page(
       the file. The meshes take 50 bytes per vertex, and each map takes a few bytes per vertex. The spectra
       take 133 bytes per vertex, but at most 8 MB in total.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
-    - `maps`: maps from X to Y by name. The page opens with the first map.
+    - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
-    - `spectra`: the spectra of X and Y, or None. The page contains at most
-      `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors of each shape, rounded to one byte per
-      number. This rounding changes wavelets by about one hundredth of the colour scale.
-    - `refiner`: the refiner whose wavelets are shown.
-    - `statistics`: values by label, which the page shows below the bodies.
-    - `error_meanings`: one sentence by the name of the errors, with which the page explains these errors.
+    - `spectra`: the spectra of X and Y; None (the default) for a page without wavelets. The page contains at
+      most `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors of each shape, rounded to one byte per
+      number (`jaxsmw.report.page_data.encode_rounded`).
+    - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
+    - `statistics`: a dictionary from labels to values as text, which the page shows below the bodies.
+    - `error_meanings`: a dictionary from the names in `ShownMap.errors` to sentences that explain these
+      errors on the page.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
-    - `figures`: the caption and the content of a PNG file for each figure at the end of the page.
+    - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
@@ -219,7 +221,7 @@ def _add_wavelets(
 
 
 def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
-    """The labels of the modes in which the viewer can colour the bodies, by the viewer's mode names."""
+    """A dictionary from the name of each colouring mode of the viewer to its label on the page."""
     modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
     if has_spectra:
         modes["wavelets"] = "Wavelets"
@@ -241,7 +243,7 @@ def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str
         "script": script,
         "script_hash": f"sha256-{encode_bytes(hashlib.sha256(script.encode()).digest())}",
     }
-    # All placeholders are replaced in one pass, so that inserted text is not searched for placeholders.
+    # All placeholders are replaced in one pass, because inserted text must not be searched for placeholders.
     return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / "page.html").read_text("utf-8"))
 
 
@@ -252,7 +254,10 @@ def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """The HTML of radio buttons, whose labels are given by value. The first button is selected."""
+    """The HTML of radio buttons. The first button is selected.
+
+    `choices` is a dictionary from the value of each button to its label.
+    """
     inputs = "".join(
         f'<label><input type="radio" name="{name}" autocomplete="off" value="{value}"'
         f"{'' if position else ' checked'}><span>{html.escape(text)}</span></label>"

@@ -17,9 +17,7 @@ from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map
 
 # The largest and the smallest number of eigenvectors per shape on a page, and the largest number of entries
-# of all eigenvectors of both shapes. An entry takes one byte, which base64 expands to 4/3 bytes. A page of
-# shapes with at most 60 000 vertices in total contains 100 eigenvectors, as many as the MWP paper uses. A
-# page of shapes with more than 300 000 vertices in total contains no eigenvectors.
+# of all eigenvectors of both shapes. Each entry takes one byte before it is encoded in base64.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 
 COLOR_SCALES = {
@@ -27,17 +25,17 @@ COLOR_SCALES = {
     "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
     "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
 }
-"""The colour scales by name. Each scale is an array of evenly spaced sRGB colours (n, 3) in [0, 1].
+"""A dictionary from the name of each colour scale to its sRGB colours (n, 3) in [0, 1], evenly spaced.
 
-The middle colour of a signed scale belongs to the value zero.
+The middle colour of each of the two signed scales belongs to the value zero.
 """
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
     """The number of eigenvectors of each shape that a page of two meshes contains.
 
-    The number is 100 for meshes with at most 60 000 vertices in total. Above 60 000 vertices the number
-    decreases, and above 300 000 vertices it is 0.
+    The number is 100, as in the MWP paper, for meshes with at most 60 000 vertices in total. Above 60 000
+    vertices the number decreases, and above 300 000 vertices it is 0.
     """
     room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
     return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
@@ -48,8 +46,9 @@ def spectra_on_page(
 ) -> tuple[Spectrum, Spectrum] | None:
     """The spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    If the two spectra have different numbers of eigenvectors, as for a partial pair, both spectra are also
-    cut to a common range of eigenvalues (`jaxsmw.pair.common_range`).
+    If the two spectra have different numbers of eigenvectors, as for a partial pair, eigenpairs are also
+    removed whose eigenvalues are above the smaller of the two largest eigenvalues
+    (`jaxsmw.pair.common_range`).
 
     **Arguments:**
 
@@ -74,27 +73,27 @@ def spectra_on_page(
 
 
 def encode_bytes(data: bytes) -> str:
-    """Bytes as base64 text."""
+    """Encodes bytes as base64 text."""
     return base64.b64encode(data).decode()
 
 
 def encode(array: Shaped[np.ndarray, " *shape"], dtype: str) -> str:
-    """The entries of an array as base64 text, converted to a NumPy data type such as `"<f4"`."""
+    """Converts an array to a NumPy data type such as `"<f4"`, and encodes its entries as base64 text."""
     return encode_bytes(array.astype(dtype).tobytes())
 
 
 def encode_mesh(mesh: Mesh) -> dict[str, Any]:
-    """The vertices and faces of a mesh, as float32 and uint32 in base64."""
+    """Encodes the vertices of a mesh as float32 and the faces as uint32, both in base64."""
     return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
 
 
 def encode_colors(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """Colours (n, 3) in [0, 1] as base64 text, with three bytes per colour."""
+    """Encodes colours (n, 3) in [0, 1] as base64 text, with three bytes per colour."""
     return encode(np.round(255 * colors), "u1")
 
 
 def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filters k"]) -> dict[str, Any]:
-    """The eigenvectors of a shape, and the responses of all filters at its eigenvalues (filters, k)."""
+    """Encodes the eigenvectors of a shape, and the filter responses at its eigenvalues (filters, k)."""
     return {
         "eigenvectors": encode_rounded(np.asarray(spectrum.eigenvectors).T),
         "responses": encode(np.asarray(responses), "<f4"),
@@ -102,13 +101,13 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 
 
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
-    """The rows of a matrix, rounded to one byte per number, with one unit per row.
+    """Rounds the numbers of a matrix to one byte each, and encodes them in base64.
 
-    The code c represents the number sign(c) c², in the unit of the row, so small numbers are rounded less
-    than large numbers. An eigenvector that is large on a limb is small on the rest of the body, where evenly
-    spaced levels would cause visible errors of wavelets. The rounding changes wavelets on people and animals
-    by half a hundredth of the colour scale (root mean square). Evenly spaced levels would need 10 bits per
-    number for the same accuracy.
+    Each row has its own unit. The code c represents the number sign(c) c² times this unit, so small numbers
+    have smaller rounding errors than large numbers. Small numbers matter: an eigenvector that is large on a
+    limb is small on the rest of the body, where evenly spaced levels would cause visible errors of wavelets.
+    On people and animals, the root mean square of the rounding errors of wavelets is 0.005 times the length
+    of the colour scale.
 
     **Arguments:**
 
@@ -124,7 +123,9 @@ def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
 def encode_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"] | None, convention: Convention
 ) -> dict[str, Any] | None:
-    """The functional map C (k_out, k_in), row by row as float32 in base64; None if C is None.
+    """Encodes the entries of a functional map C (k_out, k_in), row by row, as float32 in base64.
+
+    The result is None if C is None.
 
     **Raises:** `InputError` if C is not a matrix of finite numbers.
     """

@@ -11,8 +11,8 @@ from scipy.ndimage import uniform_filter
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
 
-# The preferred azimuth of the viewer in radians, measured from +z towards +x. The viewer is in front of the
-# body and a little to the side.
+# The preferred azimuth of the viewer in radians, measured from +z towards +x. At this azimuth, the viewer is
+# in front of the body and a little to the side.
 _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
 """The angle at which the viewer looks down on the body, in radians."""
@@ -32,9 +32,9 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
     """The azimuth of a view that shows all meshes well.
 
     The best direction of view is the horizontal direction in which the bodies are thin. People are then seen
-    from the front, and animals from the side. Directions close to the preferred direction r have an
-    advantage; r is a view from the front and a little to the side. The direction of view is the eigenvector
-    of M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the sum of the
+    from the front, and animals from the side. Directions close to a preferred direction r are favoured, where
+    r is a view from the front and a little from the side. The chosen direction is the eigenvector of
+    M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the sum of the
     meshes' horizontal covariance matrices, each scaled to trace 1.
 
     **Arguments:**
@@ -178,9 +178,10 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """The share of the light that reaches each sample, which is smaller near the outline of a nearer part.
+    """The share of the light that reaches each sample, between 0 and 1.
 
-    The share is computed by unsharp masking of the depth (Luft et al. 2006).
+    The share is smaller next to the outline of a part of the body that is nearer to the viewer. It is
+    computed by unsharp masking of the depth (Luft et al. 2006).
     """
     # One sample per pixel is enough, because the depth is blurred.
     image = depth[::_SUPERSAMPLING, ::_SUPERSAMPLING]

@@ -40,16 +40,15 @@ _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, because larger or smaller values carry no information. The unit is the
 # square root of the area.
 _STABILITY_RANGE = (-0.2, 0.1)
-# A point counts as touching the ground if its height above the lowest point is at most this share of the
+# A point is treated as touching the ground if its height above the lowest point is at most this share of the
 # body's height.
 _CONTACT = 0.1
 _DIRECTIONS = 32
-# The side length of the grid cells in which vertices are merged, and the length of the shortest limb that
-# counts. Both are in units of the square root of the area. A body has about 1500 cells. Shorter limbs are
-# noise.
+# The side length of the grid cells in which vertices are merged, and the length up to which limbs are ignored
+# as noise. Both are in units of the square root of the area. A body has about 1500 cells.
 _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
-# A shape counts as partial if its area is between these multiples of the area of the other shape.
+# A shape is treated as partial if its area is between these multiples of the area of the other shape.
 _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
 
 
@@ -90,10 +89,10 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
 def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
     """Both meshes turned upright and scaled for a common picture; see `stand`.
 
-    Y is scaled to area 1. X is also scaled to area 1, unless one of the shapes seems to be partial. This is
-    the case if the ratio of the smaller area to the larger area is between 1/16 and 0.6. X then keeps its
-    size relative to Y. If the ratio is larger, both meshes count as full shapes. If the ratio is smaller, the
-    meshes are assumed to have different units of length.
+    Y is scaled to area 1. The scale of X depends on the ratio of the smaller area to the larger area. If the
+    ratio is between 1/16 and 0.6, one of the shapes seems to be partial, and X keeps its size relative to Y.
+    Otherwise X is also scaled to area 1. A larger ratio suggests two full shapes, and a smaller ratio
+    suggests different units of length.
 
     **Arguments:**
 
@@ -116,17 +115,14 @@ def guess_up(mesh: Mesh) -> Axis:
     """Guesses which axis of the file points up, from the limbs on which the body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
-    axis (`_hanging_limbs`), because legs and arms hang down, and hardly anything but the head points up. The
-    second term measures how stably the body would stand (`_stability`). The usual axis is y for a body that
-    is slender along y, such as a person, and z otherwise. The usual axis is returned if no other axis has a
+    axis (`_hanging_limbs`), because usually legs and arms hang down, and only the head points up. The second
+    term measures how stably the body would stand (`_stability`). The usual axis is y for a body that is
+    slender along y, such as a person, and z otherwise. The usual axis is returned if no other axis has a
     clearly higher score.
 
     By visual inspection, the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies, 30 of 32 SMAL
-    animals, 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16 topology. TOSCA files have z up, SMAL
-    files have y down, and SHREC'19 has files with y up and files with z up. The two wrong TOSCA bodies are a
-    leaping and a crouching animal. Without the two terms, the guess is right for 70 FAUST bodies, 41 TOSCA
-    bodies, 1 SMAL animal, 16 people of SHREC'19 and 16 bodies of SHREC'16 topology. The guess can be wrong
-    for a body that lies down or is cut in half.
+    animals, 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16 topology. The guess can be wrong for a
+    body that leaps, crouches, lies down or is cut in half.
 
     **Arguments:**
 
@@ -169,9 +165,9 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
 
     A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
     lower. Its length is the persistence of its component in the sublevel sets of the height (Edelsbrunner,
-    Letscher and Zomorodian, "Topological persistence and simplification", 2002). The component with the
-    lowest point of the body does not count. Therefore three limbs of a standing quadruped count, and no limb
-    of a quadruped on its back counts.
+    Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that contains the
+    lowest point of the body is left out. Therefore the sum includes three limbs of a standing quadruped, and
+    no limb of a quadruped on its back.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 

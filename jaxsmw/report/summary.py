@@ -91,12 +91,13 @@ def write_report(
       `functional_map.png`, `filters.png` (if a stage has filters), `quality.png` (if errors are given) and
       `summary.json`.
     - `correspondence`: the result of `match`.
-    - `errors`: geodesic errors by the name of a map. The entry `initial` contains the errors of
-      `correspondence.initial_map`. The last entry contains the errors of `correspondence.pointwise_map`.
-    - `settings`: settings to include in the summary, which must be serialisable as JSON.
-    - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
-      `match`. The steps must not overlap, because the report adds its own steps and prints the sum as the
-      total time.
+    - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
+      errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
+      `correspondence.initial_map`.
+    - `settings`: a dictionary of settings to include in `summary.json`, serialisable as JSON.
+    - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
+      default `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and
+      prints the sum as the total time.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
@@ -231,10 +232,11 @@ def write_comparison(
 
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_maps`: maps T: X -> Y (m,) by name, in the order in which the page lists them; 0-based
-      vertices of Y.
-    - `errors`: geodesic errors by the same names. The page shows these errors as colours. It also contains a
-      table of the mean errors and further statistics of all maps, and the correspondence quality curves.
+    - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
+      vertices of Y. The page lists the maps in this order.
+    - `errors`: a dictionary from the same names to a `GeodesicError`. The page shows these errors as colours.
+      It also contains a table of the mean errors and further statistics of all maps, and the correspondence
+      quality curves.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
@@ -308,7 +310,7 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
-    """The statistics of a map by label, for the table of maps; empty if no errors are given."""
+    """A dictionary from the label of each statistic of a map to its value; empty if no errors are given."""
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -340,7 +342,7 @@ def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
 
     **Arguments:**
 
-    - `errors`: geodesic errors by the name of a map; at least one.
+    - `errors`: a dictionary from the name of each map to its `GeodesicError`, with at least one entry.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -362,17 +364,17 @@ def summarize(
     expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """The sizes, errors and times of a match, as printable text by label.
+    """The sizes, errors and times of a match as text.
 
     **Arguments:**
 
     - `correspondence`: the result of `match`.
-    - `errors`: geodesic errors by the name of a map.
+    - `errors`: a dictionary from the name of each map to its `GeodesicError`.
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
-    - `seconds`: the wall time of each step of the run so far, in seconds, by name; by default the steps of
-      `match`.
+    - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
+      default `correspondence.seconds`.
 
-    **Returns:** Text values by label, in the order in which they are printed.
+    **Returns:** A dictionary from the label of each value to the value as text, in the order of display.
     """
     facts = {
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
@@ -394,17 +396,17 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """The versions of packages, the machine and the device, on which results depend."""
+    """A dictionary of the package versions, the machine and the device on which results depend."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
 def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """The errors of the m source vertices, by the name that the page shows; empty if no errors are given."""
+    """A dictionary with the errors of the m source vertices, named as on the page; empty without errors."""
     return {} if error is None else {"Error": _per_vertex(error, m)}
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """One error for each of the m source vertices: NaN without an error, and the mean of several errors."""
+    """The mean of the errors of each of the m source vertices; NaN for a vertex without errors."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

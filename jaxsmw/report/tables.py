@@ -19,7 +19,7 @@ from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
 
 REFERENCE = "mwp"
-"""The name of the reference method. Tables compare the errors of other methods with those of this method."""
+"""The name of the reference method, with which tables compare all other methods."""
 
 
 class MethodSummary(NamedTuple):
@@ -29,14 +29,16 @@ class MethodSummary(NamedTuple):
 
     - `mean`, `median`: the mean and the median of the errors of all pairs. The error of a pair is its mean
       geodesic error, in thousandths of the square root of the target's area.
-    - `difference`: the difference between the errors of this method and of `REFERENCE` on the same pair: the
-      mean over all pairs and its confidence interval, in the same unit; NaN for `REFERENCE` itself.
+    - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. On each pair, the error of
+      `REFERENCE` is subtracted from the error of this method. `difference` is the mean of these differences
+      over all pairs, with its confidence interval, in the same unit. It is NaN for `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
     - `area_under_curve`: the area under the correspondence quality curve, at most 1; the mean over all pairs.
     - `coverage`: the coverage of the target, in [0, 1]; the mean over all pairs.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
-    - `pipeline_seconds`: the median time in seconds, including the precomputation of both shapes.
+    - `pipeline_seconds`: the median time in seconds from the meshes to the result, which includes the
+      precomputation of both shapes.
     - `failures`: the number of pairs on which the method failed.
     - `curve`: the mean correspondence quality curve (t,) at the thresholds
       `jaxsmw.evaluation.measurement.CURVE`.
@@ -62,8 +64,8 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
     - `results`: the result of `jaxsmw.evaluation.benchmark.run_benchmark`.
     - `seed`: the seed of the bootstrap intervals.
 
-    **Returns:** A summary for each method, by name. Means and medians are NaN if the method failed on all
-    pairs.
+    **Returns:** A dictionary from the name of each method to its summary. Means and medians are NaN if the
+    method failed on all pairs.
     """
     found = {}
     reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
@@ -94,7 +96,10 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Returns the mean errors of the successful rows by pair, in the unit of `MethodSummary.mean`."""
+    """Returns a dictionary from each pair (source, target) to its mean error; failures are left out.
+
+    The errors are in the unit of `MethodSummary.mean`.
+    """
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -142,7 +147,10 @@ _COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
 
 
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a Markdown table of summaries by method, with one row for each method."""
+    """Returns a Markdown table with one row for each method.
+
+    `summaries` is a dictionary from the name of each method to its summary.
+    """
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
     return markdown([header, *rows])
@@ -159,9 +167,10 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a LaTeX table of summaries by method, with one row for each method.
+    """Returns a LaTeX table with one row for each method.
 
-    The horizontal lines of the table need the LaTeX package booktabs. The smallest mean error is in bold.
+    `summaries` is a dictionary from the name of each method to its summary. The horizontal lines of the table
+    need the LaTeX package booktabs. The smallest mean error is in bold.
     """
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
@@ -185,9 +194,9 @@ def write_tables(
     - `data_set`: the data set on which the methods were measured.
     - `results`: the results of the benchmark.
     - `settings`: the settings of the benchmark.
-    - `methods`: the methods by name. Every method in `results` must be included.
+    - `methods`: a dictionary from names to methods. It must contain every method in `results`.
 
-    **Returns:** The summaries of the methods, by name.
+    **Returns:** A dictionary from the name of each method to its summary.
 
     **Raises:** `InputError` if a file cannot be written, or if matplotlib is missing.
     """
@@ -215,12 +224,13 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
     sentences = [
-        f"{pairs} of {len(data_set.pairs)} pairs ({data_set.layout}); all methods start from the same "
-        f"initial map ({Path(settings.init).name}).",
+        f"{pairs} of {len(data_set.pairs)} pairs of the data set ({data_set.layout}) were measured. All "
+        f"methods start from the same initial map ({Path(settings.init).name}).",
         "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",
-        "The mean and the median are over the pairs on which a method did not fail. The difference is the "
-        f"mean of the differences on single pairs, with a {CONFIDENCE:.0%} bootstrap interval.",
+        "The mean and the median are computed over the pairs on which a method did not fail. The column "
+        f"'minus {REFERENCE}' contains the mean over the pairs of the error minus the error of {REFERENCE}, "
+        f"with a {CONFIDENCE:.0%} bootstrap interval.",
         f"Times are medians over the pairs, without compilation, on {machines}. Each local worker process "
         "uses one core.",
     ]
@@ -240,8 +250,8 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
     **Arguments:**
 
     - `path`: the file to create or to replace.
-    - `rows`: rows with the columns `RESULT_COLUMNS`, as text. In the file, the column `curve` contains lists
-      of shares.
+    - `rows`: rows with the columns `RESULT_COLUMNS`, in which all values are text. In the file, the column
+      `curve` contains lists of shares.
 
     **Raises:** `InputError` if the file cannot be written.
     """

@@ -27,8 +27,8 @@ def write_textured_pair(
     """Writes `source.obj` and `target.obj` with the same checkerboard picture as texture.
 
     The picture is projected onto the target along the shortest principal axis of the target. The projection
-    has no seams, and front and back look the same. Each source vertex gets the texture coordinates of its
-    match on the target.
+    has no seams, and the front and the back of the target look the same. Each source vertex receives the
+    texture coordinates of its match on the target.
 
     **Arguments:**
 
@@ -58,7 +58,7 @@ def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # The signs of singular vectors are arbitrary. The sign is chosen such that the largest component is
+    # The signs of singular vectors are arbitrary. Here, the component with the largest absolute value is made
     # positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)

@@ -57,7 +57,7 @@ def _draw_wavelets(output: Path, data: Path, pair: PairName, settings: Settings)
 
 
 def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
-    """Draw intervals of paired differences from the default. Each frame and each ablation has its own row."""
+    """Draw the confidence interval of the difference from the default, for each frame and each ablation."""
     rows = {frame: {update: (frame, update) for update in UPDATES} for frame in study.settings.frames}
     rows |= {f"{frame}, {update}": {"filtering": (frame, update)} for frame, update in ABLATIONS}
 
@@ -72,7 +72,7 @@ def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
 
 
 def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings) -> None:
-    """Draw heat maps of errors: eigenvectors x filters (last iteration), and eigenvectors x iterations."""
+    """Draw heat maps of the mean error. The rows are eigenvectors. The columns are filters or iterations."""
     ks, filters = settings.parameter_eigenvectors, settings.parameter_filters
     iterations = range(1, settings.parameter_iterations + 1)
     errors = {}

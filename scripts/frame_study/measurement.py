@@ -104,7 +104,7 @@ class MeasuredPair:
     distances: Float64[np.ndarray, "p n"]
 
     def error(self, pointwise_map: Int[np.ndarray, " m"]) -> float:
-        """Return the mean error that `jaxsmw.evaluation.metrics.geodesic_error` defines, from `distances`."""
+        """Return the mean geodesic error of a map, in units of the square root of the area of Y."""
         errors = self.distances[np.arange(len(self.sources)), pointwise_map[self.sources]]
         return GeodesicError(errors, self.sources, "strips").mean
 
@@ -122,7 +122,7 @@ def read_pair(data: Path, name: PairName) -> tuple[Mesh, Mesh, GroundTruth]:
 
 
 def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
-    """Read a pair, and compute everything that all variants share."""
+    """Read a pair, and compute the spectra, the initial map and the distances, which all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
     prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=k)
@@ -142,7 +142,7 @@ def pad(spectrum: Spectrum) -> Spectrum:
 
 
 def pad_map(pointwise_map: Int[np.ndarray, " m"], padded: Spectrum) -> Int32[Array, " padded_m"]:
-    """Extend a pointwise map to a padded source; the masked vertices map to vertex 0."""
+    """Extend a pointwise map to a padded source. The match of each masked vertex is vertex 0."""
     n = len(padded.mask) - len(pointwise_map)
     return jnp.pad(jnp.asarray(pointwise_map, jnp.int32), (0, n))
 
@@ -158,9 +158,9 @@ class Diagnosis(NamedTuple):
 
     **Attributes:**
 
-    - `energy`: the energy of the last functional map under the last pointwise map, in the area norm (eq. (5)
-      of the MWP paper).
-    - `energy_of_zero`: the energy of the functional map C = 0 under the same pointwise map.
+    - `energy`: the energy of eq. (5) of the MWP paper in the area norm, for the last functional map and the
+      last pointwise map.
+    - `energy_of_zero`: the same energy for the functional map C = 0 and the last pointwise map.
     - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
       no least-squares problem.
     """
@@ -195,7 +195,7 @@ def _frames(number_of_filters: int) -> dict[str, FilterBank]:
 def measure_variants(
     pair: MeasuredPair, name: PairName, wanted: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Refine a pair with each wanted variant, and return a row of `results.csv` for each of them."""
+    """Refine a pair with each of the variants, and return one row of `results.csv` per variant."""
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
     start = np.asarray(pair.start)
     rows = []
@@ -226,10 +226,10 @@ def measure_variants(
 
 
 def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row:
-    """Return the error of each map, the share of changed matches, and the share of matches moved beyond
-    `MOVE`.
+    """Return the error of each map, and the changes in each iteration.
 
-    If the refinement failed, all values except the error of the initial map are NaN.
+    The changes are the share of matches that changed, and the share of matches that moved by more than
+    `MOVE`. If the refinement failed, all values except the error of the initial map are NaN.
     """
     m, positions = len(pair.mesh_x.vertices), pair.mesh_y.vertices / np.sqrt(pair.mesh_y.area)
     row: dict[str, float] = {"error_0": pair.error(maps[0])}
@@ -280,7 +280,7 @@ def measure_invariance(
 ) -> list[Row]:
     """Compare the wavelets of both shapes around corresponding vertices, for each frame and scale.
 
-    The values of two wavelets a and b at corresponding points are compared.
+    The vectors a and b are the values of two such wavelets at corresponding points.
 
     **Returns:** Rows of `invariance.csv`. Each row contains the median correlation and the median relative
     difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. It is
@@ -314,11 +314,9 @@ def measure_invariance(
 def wavelets(
     bank: FilterBank, spectrum: Spectrum, scale: int, centers: Int[np.ndarray, " c"]
 ) -> Float64[np.ndarray, "c n"]:
-    """Return the values at all n vertices of the wavelets of one scale around c vertices.
+    """Return the wavelets of one scale around c vertices, as values at all n vertices of the shape.
 
-    The wavelets follow eq. (2) of the MWP paper.
-
-    Scale 0 is the scaling function.
+    The wavelets follow eq. (2) of the MWP paper. Scale 0 is the scaling function.
     """
     eigenvectors = np.asarray(spectrum.eigenvectors, dtype=float)
     response = np.asarray(bank(spectrum.eigenvalues, spectrum.eigenvalues)[scale], dtype=float)
@@ -367,8 +365,6 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
     """Measure the time of the second update of every variant, and the time of a nearest-neighbour search.
-
-    The measurements run in turns.
 
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """

@@ -28,8 +28,8 @@ class Comparison(NamedTuple):
     **Attributes:**
 
     - `mean`, `median`: the mean and the median error of the variant over the pairs on which it did not fail.
-    - `difference`: the mean of the paired difference, the variant's error minus the default's error, with its
-      confidence interval.
+    - `difference`: the mean paired difference with its confidence interval. A paired difference is the
+      variant's error minus the default's error on the same pair.
     - `better`: the share of all pairs on which the variant has a smaller error than the default.
     - `failures`: the number of pairs on which the variant failed.
     """
@@ -44,8 +44,7 @@ class Comparison(NamedTuple):
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
     """Compare the errors of a variant with the errors of the default, pair by pair.
 
-    A NaN error means that the variant failed on the pair. On such a pair, the variant is not better than the
-    default.
+    A NaN error means that the variant failed on the pair. Such a pair is counted as not better.
     """
     succeeded = np.isfinite(errors)
     differences = (errors - reference)[succeeded & np.isfinite(reference)]
@@ -100,9 +99,10 @@ class Study:
         return 1e3 * self.numbers(variant, data_set, f"error_{self.settings.iterations}")
 
     def median_settling(self, variant: Variant, data_set: str) -> float:
-        """Return the median iteration in which maps settle; infinite if at least half of them never settle.
+        """Return the median of the iteration in which the map of a pair settles (see `SETTLED`).
 
-        The median leaves out pairs on which the variant failed.
+        The median is infinite if at least half of the maps never settle. The median leaves out pairs on which
+        the variant failed.
         """
         last = self.settings.iterations
         moved = np.array([self.numbers(variant, data_set, f"moved_{i}") for i in range(1, last + 1)])
@@ -112,12 +112,12 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """Return the difference from the default; NaN for None and for a variant that was not measured."""
+        """Return the difference from the default, or NaN if the variant is None or was not measured."""
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
-        """Return the mean difference between two variants over the pairs on which neither failed.
+        """Return the mean difference, as text, between two variants over the pairs on which neither failed.
 
         The text also states the number of pairs on which at least one of the variants failed.
         """
@@ -127,7 +127,7 @@ class Study:
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """Return the mean of E(C) / E(0), which makes frame functions of different heights comparable."""
+        """Return the mean of E(C) / E(0). This ratio makes frames of different heights comparable."""
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")
@@ -163,9 +163,9 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "the same SHOT matches (mean error "
         + ", ".join(f"{error:.1f} on {name}" for name, error in start.items())
         + f"). They use {settings.number_of_eigenvectors} eigenvectors per shape and {settings.iterations} "
-        f"iterations. Banks of any size have {settings.number_of_filters} filters. "
-        "`scripts/compare_frames.py` wrote this page. `provenance.json` has versions, seeds and settings, "
-        "and `results.csv` has the results of every pair.",
+        f"iterations. If the number of filters of a bank can be chosen, it is {settings.number_of_filters}. "
+        "`scripts/compare_frames.py` wrote this page. `provenance.json` contains versions, seeds and "
+        "settings. `results.csv` contains the results of every pair.",
         _list(
             "**error**: the mean geodesic error, in units of 10⁻³ times the square root of the target's "
             f"area. All variants are evaluated at the same {settings.evaluated_points} points of the ground "
@@ -176,18 +176,18 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             "pairs). Pairs share shapes, so the intervals are somewhat too narrow. If there were no true "
             f"differences, {1 - CONFIDENCE:.0%} of the intervals would still miss zero by chance.",
             "**better**: the share of pairs on which the error is smaller than the error of the default. A "
-            "failure counts as not better.",
+            "failed pair is counted as not better.",
             "**energy**: the ratio E(C) / E(0) for the last C. E is the energy of eq. (5) of the MWP paper "
             "under the last pointwise map, in the area norm and with the variant's own frame. The band mask "
             "uses the energy of the Meyer frame.",
             f"**settles**: the first iteration in which fewer than {SETTLED:.0%} of the matches move by more "
             f"than {MOVE} times the square root of the area, which is about the length of an edge. The table "
-            "has the median over the pairs.",
+            "states the median over the pairs.",
             "**update**: the milliseconds to compute a functional map from a pointwise map, without the "
-            f"search, which takes {search:.0f} ms. The table has the median of runs in turns on one core, "
+            f"search, which takes {search:.0f} ms. The table states the median over several runs on one core, "
             "for one pair of each data set.",
             "**condition**: the condition number of the first least-squares problem. For the regularized "
-            "update, the problem is its wavelet term. The table has the median over the pairs. In float32, a "
+            "update, the problem is its wavelet term. The table states the median over the pairs. In float32, a "
             "matrix with a condition number above 10⁵ is numerically singular.",
             "**failed**: the number of pairs on which the update reported a failure. Means and medians leave "
             "these pairs out.",
@@ -205,16 +205,16 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
         "## Ablations, both data sets",
         _ablations(study),
         "## What the update changes within a frame, pullback",
-        "The table has paired differences: the error with one update minus the error with another update.",
+        "Each paired difference is the error with one update minus the error with another update.",
         _updates_within_frames(study),
         "## What scaling and tightening change, pullback",
-        "The table has paired differences of the error. A scaled bank is multiplied by a number that gives "
-        "its frame function a mean of 1. A tightened bank is replaced by its canonical tight frame, whose "
-        "frame function is 1 everywhere.",
+        "The table states paired differences of the error. A scaled bank is multiplied by a number that "
+        "gives its frame function a mean of 1. A tightened bank is replaced by its canonical tight frame, "
+        "whose frame function is 1 everywhere.",
         _tightening(study),
         "## The height of C",
-        "The table has the mean error of filtering with the Meyer frame if every iteration multiplies C by a "
-        "number.",
+        "The table states the mean error of filtering with the Meyer frame if every iteration multiplies C "
+        "by a number.",
         _gains(study),
     ]
     for convention in CONVENTIONS:
@@ -225,9 +225,10 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             ]
     parts += [
         "## Invariance of wavelets under near-isometry",
-        "The table compares wavelets around corresponding vertices of the two shapes, at corresponding "
-        "vertices. It has the relative difference, which is 0 for equal and 1.41 for unrelated wavelets, and "
-        f"the correlation. Both are medians over {settings.wavelet_centers} centres and over the pairs. "
+        "The table compares the values, at corresponding vertices, of wavelets around corresponding vertices "
+        "of the two shapes. It states the relative difference and the correlation. The relative difference "
+        "is 0 for equal wavelets and 1.41 for unrelated wavelets. Both values are medians over "
+        f"{settings.wavelet_centers} centres and over the pairs. "
         "Scale 0 is the scaling function, and the last scale is the finest.",
         _invariance(study, invariance),
         "## Failures",
@@ -282,9 +283,9 @@ def _ablations(study: Study) -> str:
             rows.append([*cells, f"−{-least:.2g}" if least < -1e-4 else "≥ 0"])
     header = ["", *(title for name in [*data_sets, "both"] for title in (name, "difference"))]
     return _table([*header, "least eigenvalue of the kernel"], rows) + (
-        "\n\nThe last column is the smallest over the largest eigenvalue of the kernel by which C₀ is "
-        "multiplied, for X with itself: the minimum over all pairs. The kernel of a frame has no negative "
-        "eigenvalue."
+        "\n\nThe last column states the smallest eigenvalue divided by the largest eigenvalue of the kernel "
+        "by which C₀ is multiplied, for X with itself. The column states the minimum over all pairs. The "
+        "kernel of a frame has no negative eigenvalue."
     )
 
 
@@ -325,7 +326,8 @@ def _tightening(study: Study) -> str:
         f"{kind}, {update} − {reference_kind or 'plain'}" + (f", {reference}" if reference != update else "")
         for kind, update, reference_kind, reference in contrasts
     ]
-    # The table has one row for each contrast, because there are more contrasts than banks.
+    # The table has one row for each contrast and one column for each bank, because there are more contrasts
+    # than banks.
     return _table(["", *(row[0] for row in rows)], zip(header, *(row[1:] for row in rows), strict=True))
 
 

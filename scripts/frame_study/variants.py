@@ -71,7 +71,10 @@ UPDATES: dict[str, Solution] = {
 
 
 def frames(number_of_filters: int) -> dict[str, FilterBank]:
-    """Return all compared filter banks by name. Banks of any size get `number_of_filters` filters."""
+    """Return a dictionary from the name of each compared filter bank to the bank.
+
+    If the number of filters of a bank can be chosen, it is `number_of_filters`.
+    """
     not_tight = {
         "cubic spline": CubicSpline(number_of_filters),
         "Mexican hat": MexicanHat(number_of_filters),
@@ -109,9 +112,9 @@ QUICK_FRAMES = (
     "no filter",
 )
 
-# The ablations are pairs of a frame and an update that are not in the grid of frames and updates. They are
-# measured in both conventions. The gains are factors of C. Such a factor changes the matches, because only
-# one of the two point sets in the nearest-neighbour search is mapped by C.
+# Each ablation is a frame with an update that is not in `UPDATES`. A gain is a factor by which C is
+# multiplied. This factor changes the matches, because C maps only one of the two point sets in the
+# nearest-neighbour search.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -128,7 +131,7 @@ def variants(frame_names: Iterable[str]) -> list[Variant]:
 
 
 def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
-    """Return each variant that provably equals another variant, together with this other variant.
+    """Return a dictionary from each variant to a different variant that provably gives the same result.
 
     In the pushforward convention and the area norm, least squares divides the columns of the filtered map by
     the frame function. The frame function of a Parseval frame is 1, so least squares equals filtering.
@@ -216,7 +219,7 @@ def refiner(
     *,
     number_of_filters: int,
 ) -> TabulatedPreservation:
-    """Return the refiner of a variant for a pair, with zero filters added up to `number_of_filters`."""
+    """Return the refiner of a variant for a pair. Zero filters extend its bank to `number_of_filters`."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = NearestOrthogonal(Filtering())
@@ -246,13 +249,13 @@ _sample_bank: Callable[[FilterBank, Array], Array] = eqx.filter_jit(
 
 
 def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Float[Array, "filters k"]:
-    """Return the responses of a bank on a shape, with zero filters added up to `number_of_filters`."""
+    """Return the responses of a bank on a shape. Zero filters extend them to `number_of_filters` rows."""
     responses = _sample_bank(bank, spectrum.eigenvalues)
     return jnp.pad(responses, ((0, number_of_filters - len(responses)), (0, 0)))
 
 
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
-    """Return the octaves from the edge of the Meyer scaling function to each eigenvalue; 0 below the edge."""
+    """Return the number of octaves, at least 0, from the edge of the Meyer scaling function to each eigenvalue."""
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
 
@@ -262,9 +265,9 @@ def band_mask(
 ) -> Float64[np.ndarray, "k_out k_in"]:
     """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
 
-    Here d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for d <=
-    0.5, 0.5 at d = 1, and 0 for d >= 1.5. In between, the mask falls like a cosine. Because of its flat top,
-    the mask is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
+    The variable d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for
+    d <= 0.5, falls like a cosine from d = 0.5 to d = 1.5, and is 0 for d >= 1.5. Because of its flat top, the
+    mask is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
     """
     distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
     return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))
@@ -273,7 +276,7 @@ def band_mask(
 def matching_half_width(
     octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], total: float
 ) -> float:
-    """Return the half-width, in octaves, for which the entries of `band_mask` have the sum `total`."""
+    """Return the half-width, in octaves, for which the entries of `band_mask` sum to `total`."""
     return brentq(lambda width: band_mask(octaves_out, octaves_in, width).sum() - total, 1e-3, 100)
 
 

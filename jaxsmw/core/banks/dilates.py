@@ -51,8 +51,8 @@ class _LogSpacedDilates(FilterBank):
 class CubicSpline(_LogSpacedDilates):
     """A filter bank of a cubic-spline wavelet at several scales. The bank is not tight.
 
-    The wavelet is a function of y, the product of the scale and the eigenvalue lambda. It equals y² for y
-    below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
+    The wavelet is a function of y, the product of the scale and the eigenvalue lambda. The wavelet equals y²
+    for y below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
     log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function passes the eigenvalues
     below `lambda_max / ratio`.
 
@@ -67,8 +67,8 @@ class CubicSpline(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets pass the
-      eigenvalues from `lambda_max / ratio` on.
+    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
+      the eigenvalues from `lambda_max / ratio` to lambda_max.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
       1 / lambda_max. The default is False.
 
@@ -83,7 +83,8 @@ class CubicSpline(_LogSpacedDilates):
         return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        # At zero the scaling function equals the maximum of the wavelet, which is reached at 2 - 1 / sqrt(3).
+        # At zero, the scaling function equals the maximum of the wavelet. The wavelet reaches this maximum at
+        # 2 - 1 / sqrt(3).
         return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
 
 
@@ -105,8 +106,8 @@ class MexicanHat(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets pass the
-      eigenvalues from `lambda_max / ratio` on.
+    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
+      the eigenvalues from `lambda_max / ratio` to lambda_max.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
       1 / lambda_max. The default is False.
 
@@ -124,7 +125,7 @@ class MexicanHat(_LogSpacedDilates):
 class Heat(FilterBank):
     """A filter bank of heat kernels `exp(-t lambda / lambda_max)`, with several diffusion times t.
 
-    The bank is not tight. All filters are low-pass filters.
+    The bank is not tight. All filters of this bank are low-pass filters.
 
     `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
     row per diffusion time. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is

@@ -95,7 +95,7 @@ class Tightened(FilterBank):
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
-        # # NaN must remain in the result. This comparison is negated, because `>=` would be False for NaN and
+        # NaN must remain in the result. This comparison is negated, because `>=` would be False for NaN and
         # would replace NaN by zero.
         covered = ~(largest < jnp.finfo(points.dtype).tiny)
         scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
@@ -106,9 +106,9 @@ class Tightened(FilterBank):
 def tighten(bank: FilterBank) -> FilterBank:
     """Returns the canonical tight frame of a filter bank, which divides each filter g_l by `sqrt(G)`.
 
-    G is the frame function `sum_l g_l²`. At every eigenvalue, the responses of the canonical tight frame are
-    the responses of a Parseval frame that differ least from g_l, in the sum of squares. If the given bank is
-    a Parseval frame, its responses do not change.
+    G is the frame function `sum_l g_l²`. Among all Parseval frames, the canonical tight frame has the
+    smallest sum of squared differences from g_l at every eigenvalue. If the given bank is a Parseval frame,
+    its responses do not change.
 
     If all responses at an eigenvalue are below the smallest normal floating-point number, the new responses
     and their gradients are zero at this eigenvalue. The new bank is then a Parseval frame only on the rest of

@@ -45,7 +45,7 @@ class ExponentialWindow(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
-        # # At u = 0 and u = 1, an exponent is infinite and has no gradient. The clipping excludes both values
+        # At u = 0 and u = 1, an exponent is infinite and has no gradient. The clipping excludes both values
         # of u.
         tiny = jnp.finfo(points.dtype).eps
         u = jnp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
@@ -79,7 +79,7 @@ class LowPass(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
-        # # Beyond twice the edge, this sine is exactly zero. The equivalent `cos(pi / 2)` has a rounding
+        # Beyond twice the edge, this sine is exactly zero. The equivalent `cos(pi / 2)` has a rounding
         # error.
         return jnp.sin(jnp.pi / 2 * (1 - meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
 

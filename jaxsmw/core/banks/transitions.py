@@ -52,7 +52,7 @@ class _DyadicBands(_Transitions):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        # # More than 100 octaves could overflow 2^octaves. The limit does not change the responses, because
+        # More than 100 octaves could overflow 2^octaves. The limit does not change the responses, because
         # only the eigenvalue 0 is 100 octaves below the largest eigenvalue.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]

@@ -56,7 +56,7 @@ class Itersine(_UniformTranslates):
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that are positive at each eigenvalue, an even number, at least 2. The
+    - `overlap`: the number of windows that overlap at each eigenvalue, an even number, at least 2. The
       default is 2.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
@@ -88,7 +88,7 @@ class HalfCosine(_UniformTranslates):
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that are positive at each eigenvalue, at least 3. The default is 3.
+    - `overlap`: the number of windows that overlap at each eigenvalue, at least 3. The default is 3.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
     if `overlap` is below 3.

@@ -1,7 +1,7 @@
 """Solutions: methods that compute a functional map from a pointwise map.
 
-A `Solution` minimises the wavelet-preservation energy, exactly or approximately, with or without further
-energy terms. The refiner `WaveletPreservation` uses a solution in every iteration.
+The refiner `WaveletPreservation` uses a `Solution` in every iteration. Each solution minimises the
+wavelet-preservation energy, exactly or approximately, with or without further energy terms.
 """
 
 from jaxsmw.core.functional_map import WaveletProblem

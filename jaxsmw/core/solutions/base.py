@@ -21,10 +21,13 @@ class Solution(eqx.Module, Generic[PreparedT]):
     The refiner `WaveletPreservation` takes a solution as its argument `solution`. Ready subclasses are
     `Filtering` (the default), `LeastSquares`, `RegularizedLeastSquares` and `NearestOrthogonal`.
 
-    A subclass must define `solve`, which returns C (k_out, k_in). In the pullback convention (the default), C
-    maps functions on Y ("in") to functions on X ("out"). In the pushforward convention, C maps functions on X
-    to functions on Y. A subclass may also define `prepare`. The type parameter is the type of the values that
-    `prepare` returns.
+    A subclass must define `solve(problem, prepared, pointwise_map, previous)`, which returns C (k_out, k_in)
+    and a status code (`RESULTS`). In the pullback convention (the default), C maps functions on Y ("in") to
+    functions on X ("out"). In the pushforward convention, C maps functions on X ("in") to functions on Y
+    ("out").
+
+    A subclass may also define `prepare(problem)`. This method computes, once per refinement, values that
+    `solve` needs in every iteration. The type parameter of `Solution` is the type of these values.
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:

@@ -37,23 +37,24 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """The solution for Parseval frames: it filters the functional map C_0 of a pointwise map T.
+    """The solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)`, eq. (8) of the MWP paper. The filters g_l
-    are those of the bank, and Lambda_out and Lambda_in contain the eigenvalues of the shapes that C maps to
-    and maps from. The sum equals one elementwise product, so no linear system is solved. `Filtering` is a
-    `Solution`, for the argument `solution` of `WaveletPreservation`.
+    are those of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the shape
+    that C maps to and of the shape that C maps from. The sum equals the elementwise product of C_0 and the
+    `multiscale_kernel` of the bank, so no linear system is solved. `Filtering` is a `Solution`, for the
+    argument `solution` of `WaveletPreservation`.
 
-    If the bank is a Parseval frame and T preserves area, C minimises the wavelet-preservation energy in the
-    area norm (for the default pullback convention). If T does not preserve area, C is close to the minimiser.
-    If the bank is not a Parseval frame, C is only a smoothed map.
+    If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
+    default pullback convention, this is exact only if T preserves area; otherwise C is only close to the
+    minimiser. If the bank is not a Parseval frame, C is not the minimiser, but only a filtered map.
 
     **Arguments:**
 
     - `pseudo_inverse`: the pseudo-inverse `Phi^+` of the eigenvectors Phi of the shape that C maps to.
-      `"area"` (the default) is `Phi^T A`, with the vertex areas A. `"least_squares"` is
-      `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. When a refiner iterates on samples,
-      `Filtering` always uses `"least_squares"`.
+      `"area"` (the default) is `Phi^T A`, where the diagonal matrix A contains the vertex areas.
+      `"least_squares"` is `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. When a refiner
+      iterates on samples, `Filtering` always uses `"least_squares"`.
 
     **Raises:** `ValueError` if `pseudo_inverse` is unknown.
     """
@@ -90,6 +91,9 @@ class NearestOrthogonal(Solution[PreparedT]):
     `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
     et al. 2012). `NearestOrthogonal` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
 
+    The status code is that of the other solution, so a failure of the other solution is reported. If the
+    other map contains NaN, all entries of the new map are NaN.
+
     **Arguments:**
 
     - `solution`: the `Solution` whose functional map is replaced. The default is `Filtering()`.
@@ -118,12 +122,12 @@ class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
     The energy is that of eq. (5) of the MWP paper. The minimiser C (k_out, k_in) is computed by one Cholesky
-    factorisation of a (k_in, k_in) matrix, the gram matrix of the energy. `LeastSquares` is a `Solution`, for
-    the argument `solution` of `WaveletPreservation`.
+    factorisation of the gram matrix of the energy, which has the shape (k_in, k_in). `LeastSquares` is a
+    `Solution`, for the argument `solution` of `WaveletPreservation`.
 
-    `solve` returns the status code `RESULTS.undetermined_functional_map` if all filters are zero at an
-    eigenvalue of the shape that C maps from. It returns `RESULTS.singular_system` if the gram matrix is
-    singular to working precision.
+    `solve` returns C and the status code `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
+    `RESULTS.singular_system`. The map is undetermined if all filters are zero at an eigenvalue of the shape
+    that C maps from. The system is singular if the gram matrix is singular to working precision.
 
     **Arguments:**
 

@@ -17,8 +17,8 @@ class ProjectedDescriptors(eqx.Module):
     **Attributes:**
 
     - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with `Phi^+ = Phi^T A`.
-    - `operators`: (d, k, k), for each function f the operator `Phi^+ diag(f) Phi`, which multiplies another
-      function by f (Nogneng and Ovsjanikov 2017); None if no operators were computed.
+    - `operators`: (d, k, k), the operator `Phi^+ diag(f) Phi` of each function f, which multiplies other
+      functions by f (Nogneng and Ovsjanikov 2017); None if no operators were computed.
     """
 
     coefficients: Float[Array, "k d"]
@@ -52,11 +52,17 @@ class DescriptorPair(eqx.Module):
 
     **Attributes:**
 
-    - `x`, `y`: d functions on X and the corresponding d functions on Y. Both have the attributes
-      `coefficients`, (k_x, d) or (k_y, d), and `operators`, (d, k_x, k_x) or (d, k_y, k_y). `operators` is
-      None if no operators were computed.
+    - `x`, `y`: d functions on X and the corresponding d functions on Y, expressed in the eigenbases. The
+      attribute `coefficients` of `x` is (k_x, d) and that of `y` is (k_y, d). Column j contains the
+      coefficients of function j. The attribute `operators` is (d, k_x, k_x) for `x` and (d, k_y, k_y) for
+      `y`, or None. Matrix j multiplies other functions by function j, in the eigenbasis.
 
-    **Raises:** `ValueError` if X and Y have different numbers of functions.
+    Descriptor commutativity needs the operators of both shapes. If `x.operators` is None,
+    `RegularizedLeastSquares` raises `ValueError` when this term has a weight. If only `y.operators` is None,
+    it omits the term. `DescriptorPair.project` computes the operators of both shapes or of neither.
+
+    **Raises:** `ValueError` if `coefficients` does not have two dimensions on each shape, or if X and Y have
+    different numbers of functions.
     """
 
     x: ProjectedDescriptors
@@ -87,10 +93,12 @@ class DescriptorPair(eqx.Module):
         - `descriptors_x`, `descriptors_y`: the values of d functions on X (m, d) and of the corresponding
           functions on Y (n, d), in any unit.
         - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-        - `operators`: whether to compute the multiplication operators as well, which are d matrices of size
-          k x k per shape. Descriptor commutativity needs these operators. The default is False.
+        - `operators`: whether to compute the multiplication operators of both shapes as well, which are d
+          matrices of size k x k per shape. Descriptor commutativity needs these operators. The default is
+          False.
 
-        **Raises:** `ValueError` if the values do not have one row per vertex and one column per function.
+        **Raises:** `ValueError` if the values do not have one row per vertex and one column per function, or
+        if X and Y have different numbers of functions.
         """
         for name, values, spectrum in (("X", descriptors_x, spectrum_x), ("Y", descriptors_y, spectrum_y)):
             n = spectrum.mask.shape[0]

@@ -45,45 +45,50 @@ class RegularizedLeastSquares(Solution[None]):
     functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of eq. (5) of the MWP paper.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. Lambda_out and Lambda_in contain the
-      eigenvalues of the shapes that C maps to and maps from. Both are divided by the larger of the two
-      shapes' largest eigenvalues.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
+      Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps from. Both
+      matrices are divided by the larger of the two shapes' largest eigenvalues.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. Only this term
       is not quadratic.
-    - Descriptor preservation is `||C F_in - F_out||²`, where F contains the coefficients of the descriptors
-      (Ovsjanikov et al. 2012).
-    - Descriptor commutativity is `sum_d ||C D_in - D_out C||²`, where D is the operator that multiplies a
+    - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
+      descriptors on both shapes (Ovsjanikov et al. 2012).
+    - Descriptor commutativity is `sum_d ||C D_in - D_out C||²`, where the operators D_in and D_out multiply a
       function by descriptor d (Nogneng and Ovsjanikov 2017).
 
-    Each term is scaled so that its value is about k_out if C = 0, or if one side of its difference is zero.
-    Weights near one are therefore comparable, for all banks and all units of descriptors. The wavelet term is
-    divided by the mean of the frame function, which is one for a Parseval frame. `F_out` is scaled such
-    that its squared norm is k_out. The operators `D_out` are scaled by a common factor such that their
-    squared norms sum to k_out.
+    The terms are scaled to values of similar size. If one of the two matrices in the difference of a term is
+    replaced by zero, the term is about k_out for a nearly orthogonal C. Weights near one are therefore
+    comparable, for all banks and all units of descriptors. The wavelet term is divided by the mean of the
+    frame function, which is one for a Parseval frame. `F_out` and `F_in` are scaled by a common factor so
+    that the squared norm of `F_out` is k_out. All operators are scaled by a common factor so that the squared
+    norms of the operators `D_out` sum to k_out.
 
-    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. The
-    columns of both terms together are first reduced to k_in columns, without approximation. Then
-    `optimistix.least_squares` takes Gauss–Newton steps. Conjugate gradients solve each step without a matrix
-    of size k² x k². The solver starts from the functional map of the previous iteration, if there is one. C
-    is differentiable, by implicit differentiation at the minimum.
+    The terms for wavelet preservation and descriptor preservation sum over thousands of columns. An exact
+    reduction first replaces the columns of both terms by k_in columns. Then `optimistix.least_squares` takes
+    Gauss–Newton steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver
+    starts from the functional map of the previous iteration; in the first iteration, it starts from an
+    estimate. C is differentiable, by implicit differentiation at the minimum.
+
+    The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
+    `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
 
     **Arguments:**
 
     - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
       `descriptor_commutativity`: the weights of the five terms. Each weight is a single positive number or an
-      array of shape (); None omits the term. The defaults are 1, 1, 0.1, None and None.
-    - `descriptors`: a `DescriptorPair` for the two descriptor terms; None (the default) without these terms.
-      Descriptor commutativity needs `DescriptorPair.project(..., operators=True)`.
+      array of shape (), or None to omit the term. The defaults are 1, 1, 0.1, None and None, in this order.
+    - `descriptors`: a `DescriptorPair`, which the two descriptor terms need; None (the default) if neither
+      has a weight. Descriptor commutativity needs `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
       by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: the tolerance at which the solver stops, relative to C and to the residuals. The tolerance
-      is a positive number, by default 1e-3.
+    - `tolerance`: a positive number, by default 1e-3, which is both the relative and the absolute
+      tolerance of `optimistix.GaussNewton`.
     - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` in the following cases: a weight or the tolerance is not positive; `max_steps` is
-    below 1; `norm` is unknown; neither `wavelet_preservation` nor `descriptor_preservation` has a weight;
-    descriptors are given without a weight, or a weight without descriptors; operators are missing.
+    **Raises:** `ValueError` in the following cases: a weight or the tolerance is not a single positive
+    number; `max_steps` is below 1; `norm` is unknown; neither `wavelet_preservation` nor
+    `descriptor_preservation` has a weight; descriptors are given without a weight, or a weight without
+    descriptors; descriptor commutativity has a weight, but the descriptors on X have no operators.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -134,13 +139,13 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C of the objective, (k_out, k_in), and a status code (member of `RESULTS`).
+        """Returns the C that minimises the weighted sum of all terms, (k_out, k_in), and a status code
+        (`RESULTS`).
 
-        The solver starts from the previous functional map. If there is none, the solver starts from an
-        estimate.
+        The solver starts from `previous`. If `previous` is None, the solver starts from an estimate.
 
-        **Raises:** `ValueError` if the descriptors have another number of eigenvectors than the functional
-        map.
+        **Raises:** `ValueError` if the descriptors are expressed in another number of eigenvectors than the
+        functional map.
         """
         energy = None
         if self.wavelet_preservation is not None:
@@ -162,7 +167,7 @@ class RegularizedLeastSquares(Solution[None]):
         *,
         initial: Float[Array, "k_out k_in"] | None = None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the objective with a given energy in place of the wavelet-preservation energy.
+        """Minimises the weighted terms, with a given energy in place of the wavelet-preservation energy.
 
         **Arguments:**
 
@@ -177,7 +182,7 @@ class RegularizedLeastSquares(Solution[None]):
         **Returns:** The minimiser C (k_out, k_in), and a status code, which is a member of `RESULTS`.
 
         **Raises:** `ValueError` if an energy is given without a weight or a weight without an energy, or if
-        the descriptors have another number of eigenvectors than C.
+        the descriptors are expressed in another number of eigenvectors than C.
         """
         descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
         return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
@@ -199,15 +204,16 @@ class RegularizedLeastSquares(Solution[None]):
         determined = curvature > quadratic.rounding()
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
-        # The entries of C are scaled so that the quadratic terms have the same curvature in each of them.
-        # Then conjugate gradients need few steps.
+        # The entries of C are scaled so that the quadratic terms have the same curvature in each entry. Then
+        # conjugate gradients need few steps.
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if initial is None:
             initial = quadratic.cross * unit**2
         functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
         if len(terms) == 1:
             result = where(quadratic.is_regular(), result, RESULTS.singular_system)
-        # A NaN outside the quadratic terms, such as from a negative weight, appears only in the residuals.
+        # A NaN outside the quadratic terms appears only in the residuals. An example is the square root of a
+        # negative weight, which is not checked if the weight is traced.
         residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
         finite &= jnp.all(jnp.isfinite(residuals))
         result = where(solvable, result, RESULTS.undetermined_functional_map)
@@ -249,7 +255,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_in: Float[Array, " k_in"],
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Returns the quadratic energy and all further terms of the objective that have a weight."""
+        """Returns all terms of the objective that have a weight. The first term is the quadratic energy."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -270,13 +276,14 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the sum of the squared residuals, with the entries of C in the given units.
+        """Minimises the sum of the squared residuals. The solver iterates on `C / unit`.
 
         Returns the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
 
-        If the problem is not solvable, its residuals are replaced by zeros, so the solver stops immediately.
+        If `solvable` is False, the residuals are replaced by zeros, so the solver stops immediately.
         """
-        # These imports are inside the method because they take as long as computing an eigenbasis.
+        # The imports are inside the method because importing both packages takes as long as computing an
+        # eigenbasis.
         import lineax as lx
         import optimistix as optx
 
@@ -313,12 +320,12 @@ class _Term(NamedTuple):
 
 
 def _energy_term(energy: QuadraticEnergy) -> _Term:
-    """Returns the given energy as a term with k_in columns, up to a constant.
+    """Returns the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
 
-    The energy is a sum of squares over many columns. The Cholesky factor of the gram matrix has the same
-    inner products as these columns, so the factor can replace the columns. A ridge of the size of the
-    rounding error is added to the gram matrix. With this ridge the factor exists even if the energy alone
-    does not determine C.
+    The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
+    the gram matrix, because the factor has the same inner products as the columns. A ridge of the size of the
+    rounding error is added to the gram matrix, so the factor exists even if the energy alone does not
+    determine C.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))
@@ -330,7 +337,10 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """The weighted term `||Lambda_out C - C Lambda_in||²`, with eigenvalues divided by the largest one."""
+    """Returns the weighted term `||Lambda_out C - C Lambda_in||²`.
+
+    The eigenvalues are divided by the larger of the two shapes' largest eigenvalues.
+    """
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -338,7 +348,7 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """The weighted term `||C^T C - I||²` or `||C C^T - I||²`, whichever has the smaller matrix."""
+    """Returns the weighted term `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -346,7 +356,10 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """The weighted term `sum_d ||C D_in - D_out C||²`, with squared norms of the D_out that sum to k_out."""
+    """Returns the weighted term `sum_d ||C D_in - D_out C||²`.
+
+    A common factor scales all operators so that the squared norms of the D_out sum to k_out.
+    """
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
