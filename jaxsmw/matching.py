@@ -58,8 +58,8 @@ class Correspondence:
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the k_X and k_Y eigenvectors of the last stage.
       Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by the same factor,
       which gives the larger shape area 1.
-    - `refinement`: the `Refinement` of the last stage. It contains a `History` if `match` was called with
-      `history=True`.
+    - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
+      called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
@@ -146,9 +146,10 @@ class Correspondence:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
         `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
-        than `Correspondence.pointwise_map`. On four remeshed FAUST pairs, the former covers 76 to 82 % of Y's
-        vertices, and the latter covers 69 to 75 %. The errors of the former are between 4 % smaller and 2 %
-        larger than those of the latter. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations
+        than `Correspondence.pointwise_map`. On four remeshed FAUST pairs, `SoftMap.pointwise_map` covers 76
+        to 82 % of Y's vertices, and `Correspondence.pointwise_map` covers 69 to 75 %. The errors of
+        `SoftMap.pointwise_map` are between 4 % smaller and 2 % larger than those of
+        `Correspondence.pointwise_map`. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations
         are needed.
 
         An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
@@ -159,7 +160,7 @@ class Correspondence:
         - `temperature`: a positive number, in units of the area-weighted mean squared distance from the
           embedded vertices of X to their nearest embedded vertices of Y (see `jaxsmw.learning.sinkhorn`). A
           temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A temperature of 1 gives
-          a softer map.
+          a softer map than 0.3.
         - `iterations`: the largest number of iterations, an integer of at least 1.
         - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
           the area that vertices of Y receive in excess of their own areas. A tolerance below a few hundredths
@@ -261,9 +262,9 @@ def match(
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement, which is one of the following. The first four are adapted to small
-      meshes: they use at most half as many eigenvectors as vertices, and no samples if a mesh does not have
-      more vertices than samples. Given stages are not adapted.
+    - `preset`: the method of refinement, which is one of the following. Presets (the first four choices) are
+      adapted to small meshes: they use at most half as many eigenvectors as vertices, and no samples if a
+      mesh does not have more vertices than samples. Given stages are not adapted.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -279,7 +280,8 @@ def match(
           With `"shot"`, repair also tries alternative initial maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
           with the Laplacian (section 3.2 of the MWP paper). It is smoother than the initial map `"shot"` and
-          has smaller errors. However, the refined map often has larger errors (docs/results.md).
+          has smaller errors. However, the map after refinement often has larger errors than with `"shot"`
+          (docs/results.md).
         - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
           0-based. The initial map then consists of nearest neighbours in SHOT and in geodesic distances to

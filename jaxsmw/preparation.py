@@ -27,8 +27,7 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-# The largest number of vertices of a mesh that is padded. For larger meshes, the memory of the padding costs
-# more than the saved compilation time is worth.
+# The largest number of vertices of a mesh that is padded. For larger meshes, padding needs too much memory.
 _PADDED_UP_TO = 50_000
 
 
@@ -49,8 +48,8 @@ class PreparedPair:
     **Attributes:**
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, without padding. They
-      contain descriptors if descriptors were requested.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, without padding. The
+      spectra contain descriptors if descriptors were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
     - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
     - `samples`: a pair of arrays, the samples of X (s,) and of Y (s,) as 0-based vertices in farthest-point
@@ -77,8 +76,7 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # Refinement returns maps of type int32. With the same type, an initial map needs no further compiled
-        # program.
+        # Refinement returns int32 maps. If this map had another type, JAX would compile another program.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 

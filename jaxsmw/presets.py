@@ -27,10 +27,9 @@ class Preset:
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if `repair.stage`, the
-    position of the stage that repair repeats, is not a position of a stage. `InputError` is also raised if
-    the refiner of this stage has no levels, or if the stage has fewer samples than the largest fallback
-    level.
+    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if no stage has the
+    position `repair.stage`. `InputError` is also raised if the refiner of the stage at this position has no
+    levels, or if the stage has fewer samples than the largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]

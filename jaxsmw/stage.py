@@ -26,7 +26,7 @@ from jaxsmw.runtime.compilation import compile_ahead, compiled
 class Stage:
     """A stage of refinement for `jaxsmw.match` or a `Preset`: a refiner, and the sizes with which it runs.
 
-    All arguments except `refiner` are keyword arguments. They become attributes of the same names.
+    All arguments except `refiner` are keyword arguments. All arguments become attributes of the same names.
 
     **Attributes:**
 
@@ -34,10 +34,10 @@ class Stage:
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
     - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
-      refiner with levels (`FeatureRegression` or `Registration`), leave the argument out. The attribute is
-      then the largest level.
+      refiner with levels (`FeatureRegression` or `Registration`), leave the argument out, because the number
+      is then the largest level.
     - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
-      argument out. The attribute is then the number of levels.
+      argument out, because the number is then the number of levels.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates, at least the

@@ -131,7 +131,7 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table of the time of each candidate, in seconds and divided by the time of the candidate `of`."""
+    """Return a table of each candidate's time, in seconds and divided by the time of the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
@@ -738,7 +738,7 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # Dotted lines show runs without our compiler options, in the colour of the run with these options.
+            # Dotted lines show runs without our compiler options, in the colour of the run with them.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

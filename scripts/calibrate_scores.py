@@ -13,9 +13,9 @@ The script draws pairs at random from each data set (see `docs/datasets.md`) and
   states the true errors of each group.
 - The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
   this table only for the preset `accurate`. The table covers only full shapes whose mirrored ground truth
-  consists of vertices. To compute the mirrored map, the script starts from the mirrored ground truth, and runs
-  all stages except the first without repair. To compute the uncertainty of a map, the script runs a feature
-  regression with this map as its initial map.
+  consists of vertices. To compute the mirrored map, the script starts from the mirrored ground truth, and
+  runs all stages except the first without repair. To compute the uncertainty of a map, the script runs a
+  feature regression with this map as its initial map.
 """
 
 from __future__ import annotations

@@ -153,8 +153,8 @@ class Journals:
 def run(data: Path, journals: Journals, workers: int) -> None:
     """Measure the missing rows pair by pair in worker processes, and save the rows after each pair.
 
-    **Raises:** `InputError` if some pairs could not be measured. All other pairs are measured before this error
-    is raised.
+    **Raises:** `InputError` if some pairs could not be measured. The error is raised after all other pairs
+    are measured.
     """
     tasks = list(journals.missing())
     if not tasks:

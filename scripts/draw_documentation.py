@@ -130,7 +130,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Returns a decimated target. Its ground truth is the vertex nearest to each true match on the old target."""
+    """Returns a decimated target. The new ground truth is its vertex nearest to each old true match."""
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]
@@ -153,7 +153,7 @@ def draw_case(case: Case) -> str:
         expected = result.expected_error()
         cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
         if settings is case.failing:
-            # A vertex without ground truth is drawn with the error of the nearest vertex that has ground truth.
+            # A vertex without ground truth is drawn with the error of the nearest vertex with ground truth.
             known = KDTree(case.source.vertices[error.source_vertices])
             errors = error.errors[known.query(case.source.vertices)[1]]
             panels = {"Error": errors, "Expected error": expected}

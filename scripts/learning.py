@@ -314,7 +314,7 @@ def measure(
     **Arguments:**
 
     - `data`: the pairs for training and for evaluation.
-    - `of_pair`: a function that takes a pair, and returns a dictionary from the name of each map to its error.
+    - `of_pair`: a function that takes a pair, and returns a dictionary from map names to errors.
     - `number_of_pairs`: the maximum number of pairs from each data set.
     - `seed`: the seed of the random draws.
     - `directory`: the directory of `errors.csv`.

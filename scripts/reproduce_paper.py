@@ -17,8 +17,8 @@ experiment uses only the data sets that suit this experiment:
   sets of `table1`.
 
 In the output directory, the script creates one directory for each run, with the same files as
-`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same command continues from the
-saved results. With `--quick`, the script takes minutes on shapes with 5000 vertices.
+`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same command
+continues from the saved results. With `--quick`, the script takes minutes on shapes with 5000 vertices.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
     **Arguments:**
 
     - `options`: the parsed options.
-    - `needed`: the name of the option that may be missing, for the message.
+    - `needed`: the option that may be missing, as it is named in the message.
     - `is_given`: whether the option `needed` is given.
     - `names`: the options that have no effect without `needed`, as attribute names of `options`.
 

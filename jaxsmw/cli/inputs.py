@@ -110,7 +110,7 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
-    """Print a note that the indices of a `.mat` file are read as 1-based, unless `--index-base` is given."""
+    """If a `.mat` file is read without `--index-base`, print a note that its indices are read as 1-based."""
     from jaxsmw.io.mat_files import is_mat_file
 
     if index_base is None and is_mat_file(file):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _PATIENCE = 0.2
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
-# The first interruption acquires this lock and never releases it, so the process ends only once.
+# The thread that ends the process acquires this lock and never releases it, so no second thread interferes.
 _ending = allocate_lock()
 
 

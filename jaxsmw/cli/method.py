@@ -97,8 +97,8 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--solution",
         choices=tuple(_SOLUTIONS),
         help="computation of the functional map: filtering is meant for banks that are tight frames; "
-        "least-squares computes the exact minimiser for all banks; least-squares-frobenius is the same, but "
-        "gives all vertices the same weight; regularized is least-squares with additional terms for "
+        "least-squares computes the exact minimiser for all banks; least-squares-frobenius does the same "
+        "with equal weights for all vertices; regularized is least-squares with additional terms for "
         f"commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
@@ -144,8 +144,8 @@ def check_preset(options: argparse.Namespace) -> None:
 def preset_name(options: argparse.Namespace) -> PresetName:
     """Return the name of the preset to use.
 
-    If no preset is given, the preset is `paper` if an option changes the paper's method. Otherwise it is the
-    default preset.
+    Without `--preset`, the name is `paper` if an option changes the paper's method, and otherwise the name of
+    the default preset.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 

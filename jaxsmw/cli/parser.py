@@ -62,7 +62,7 @@ def make_parser() -> Parser:
 
 
 class _Version(argparse.Action):
-    """An action that prints the version. The slow look-up of the version runs only if it is requested."""
+    """An action that prints the version. The slow look-up runs only if the version is requested."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(

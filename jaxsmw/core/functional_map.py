@@ -30,7 +30,7 @@ The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of both s
 G_in contain the responses of the filters at these eigenvalues, one row per filter. For every matrix M, the
 sum over filters equals an elementwise product (`*`):
 `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on a matrix `gram`,
-a matrix `cross` and a constant. Computing them needs no loop over filters and no array of size m x n:
+a matrix `cross` and a constant. This computation needs no loop over filters and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
@@ -162,7 +162,7 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here <A, B> is the sum of the elementwise products of two matrices. Every sum of squares
+    Here `<A, B>` is the sum of the elementwise products of two matrices. Every sum of squares
     `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
     energy of C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy.
     `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of shape ().
@@ -210,9 +210,9 @@ class QuadraticEnergy(eqx.Module):
         return jnp.linalg.cholesky(self.gram, symmetrize_input=False)
 
     def is_regular(self) -> Bool[Array, ""]:
-        """Returns whether the gram matrix differs from a singular matrix by more than rounding."""
-        # If the matrix is singular, a pivot is as small as the rounding error. From the first negative pivot
-        # on, all pivots are NaN.
+        """Returns whether the gram matrix is non-singular to working precision."""
+        # If the gram matrix is singular, a pivot of its Cholesky factorisation is as small as the rounding
+        # error or negative. All pivots from the first negative pivot on are NaN, so the comparison is False.
         pivots = jnp.diagonal(self.cholesky()) ** 2
         return jnp.min(pivots) > self.rounding()
 

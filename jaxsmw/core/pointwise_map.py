@@ -96,10 +96,10 @@ def decode_to_triangles(
     surface in this space. Each vertex of X is mapped to the nearest point of this surface.
 
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
-    `decode_to_triangles` can map these vertices to different points. Textures and other functions therefore
-    stay smooth when this map transfers them. `decode_to_triangles` takes about ten times as long as `decode`
-    without patches: one second for shapes of 5000 vertices. The time grows with the product of the numbers of
-    vertices.
+    `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions
+    therefore stay smooth when this map transfers them. `decode_to_triangles` takes about ten times as long as
+    `decode` without patches: one second for shapes of 5000 vertices. The time grows with the product of the
+    numbers of vertices of X and Y.
 
     **Arguments:**
 
@@ -161,8 +161,8 @@ def chosen_patches(
 # If the geometric mean of the two numbers of vertices is at least this number, patches save more time than
 # the additional compilation takes.
 _PATCHES_FROM = 15_000
-# These sizes were the fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices per patch of
-# X. _RANK is the rank of the patches of Y. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch of Y has
-# _SMALLEST_PATCH vertices.
+# These values were the fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices per patch of
+# X. _RANK is the argument `rank` of `make_patches` for Y. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a
+# patch of Y has _SMALLEST_PATCH vertices.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

@@ -54,8 +54,8 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
-    # The distance from each end of the range to the nearest centre is 2 widths, which is 14 steps. Both ends
-    # together are 28 steps, and there are `dimensions - 1` steps between the centres.
+    # The distance from each end of the range to the nearest centre is 2 widths, which is 14 steps. These two
+    # distances sum to 28 steps, and there are `dimensions - 1` steps between the centres.
     width = 7 * (high - low) / (dimensions - 1 + 28)
     energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
     positive = spectrum.eigenvalues >= smallest
@@ -95,8 +95,8 @@ def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Flo
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Returns the smallest positive and the largest eigenvalue.
 
-    Each connected component has an eigenvalue zero, which rounding can make slightly positive. Eigenvalues
-    below 1e-6 of the largest eigenvalue are therefore treated as zero.
+    Each connected component has an eigenvalue zero, which rounding can make slightly positive. Eigenvalues up
+    to 1e-6 times the largest eigenvalue are therefore treated as zero.
     """
     largest = spectrum.eigenvalues[-1]
     positive = spectrum.eigenvalues > 1e-6 * largest

@@ -53,7 +53,8 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Returns the shape with all areas multiplied by a factor, and all lengths by the square root of the factor.
+        """Returns the shape with all areas scaled by a factor, and all lengths by the square root of this
+        factor.
 
         **Arguments:**
 

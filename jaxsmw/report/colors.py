@@ -110,8 +110,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Coordinates are rounded to this grid. Otherwise, the ranks on a flat mesh would depend on rounding errors,
-    # and its colours would be noisy.
+    # Coordinates are rounded to this grid. Otherwise, the ranks of vertices on a flat mesh would depend on
+    # rounding errors, which would make the colours noisy.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):

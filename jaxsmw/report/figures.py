@@ -63,9 +63,9 @@ def draw_correspondence(
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: a dictionary from names to arrays of errors. Each array (m,) contains the error of each match
-      as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array, the figure contains
-      a panel that shows the errors as colours on X.
+    - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
+      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
+      the figure contains a panel that shows the errors as colours on X.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two figures are comparable if their limits are equal.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
@@ -232,8 +232,8 @@ def draw_quality_curves(
     - `curves`: a dictionary from the name of each map to its curve, which is a pair of thresholds (p,) and
       shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order. The shares are numbers
       in [0, 1].
-    - `mean_errors`: a dictionary from the names of maps to their mean errors, which the legend shows. Maps
-      may be left out.
+    - `mean_errors`: a dictionary from the names of maps to their mean errors, which the legend shows. The
+      dictionary need not contain all maps.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -302,7 +302,7 @@ def draw_functions(
 
     **Arguments:**
 
-    - `meshes`: the bodies. Their numbers of vertices n may differ.
+    - `meshes`: the bodies, which may have different numbers of vertices n.
     - `functions`: for each body, the values of all functions at its vertices (functions, n).
     - `titles`: the titles of the columns, one per function.
     - `marked`: a 0-based vertex for each body, which the figure marks by a ring.
@@ -444,9 +444,9 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure of tables of positive numbers. Each cell shows its number, on a colour for this number.
+    """A figure of tables of positive numbers, whose cells are coloured by their numbers.
 
-    All tables have the same logarithmic colour scale.
+    Each cell also contains its number as text. All tables have the same logarithmic colour scale.
 
     **Arguments:**
 
@@ -555,7 +555,7 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draws the bodies next to each other at the same scale. The role and the name of a body are above it.
+    """Draws the bodies next to each other at the same scale, with the role and the name above each body.
 
     The pictures that `render` returns are not rescaled. `right_margin` is in pixels.
     """

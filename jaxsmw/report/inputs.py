@@ -49,8 +49,8 @@ def check_errors(
     **Arguments:**
 
     - `mesh_x`: the source, with m vertices.
-    - `errors`: a dictionary from names to arrays. Each array (m,) contains a non-negative error for each
-      vertex of X, or NaN where the error is unknown.
+    - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains a
+      non-negative error for each vertex of X, or NaN where the error is unknown.
 
     **Returns:** A dictionary from the same names to the arrays (m,) in float64.
 

@@ -71,9 +71,9 @@ class ShownMap:
     **Attributes:**
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: a dictionary from names to arrays of errors. Each array (m,) contains the error of each match
-      as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array, the page has a mode
-      that shows the errors as colours.
+    - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
+      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
+      the page has a mode that shows the errors as colours.
     - `functional_map`: the functional map C, which the page shows as a picture. The shape is (k_X, k_Y) in
       the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the page shows no
       functional map.
@@ -238,7 +238,7 @@ def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str
         **fragments,
         **{f"{name}_gradient": _gradient(colors) for name, colors in COLOR_SCALES.items()},
         "plain_color": _gradient(PLAIN[None]),
-        # A "<" could end the script element or open a comment in it.
+        # An unescaped "<" could end the script element or open a comment in it.
         "data": json.dumps(data).replace("<", "\\u003c"),
         "script": script,
         "script_hash": f"sha256-{encode_bytes(hashlib.sha256(script.encode()).digest())}",

@@ -29,16 +29,17 @@ _STAND = {
 # down in computer vision.
 _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # A body is slender along y if its spread along z is at most this multiple of its spread along y. For standing
-# people in y-up files, the ratio of these spreads is at most 0.42. Animals in z-up files are long along y,
-# but the ratio is at least 0.47, except for two animals that leap or crouch.
+# people in y-up files, the spread along z is at most 0.42 times the spread along y. For animals in z-up
+# files, the spread along z is at least 0.47 times the spread along y, except for two animals that leap or
+# crouch.
 _SLENDER = 0.45
 # For each usual axis, the amount by which the score of another axis must exceed the score of the usual axis.
 # If people stand on one foot with raised arms, an upside-down axis has a score that is up to 0.18 higher than
 # the score of the correct axis. If bodies sit or leap, a wrong axis has a score that is up to 0.09 higher.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
-# Stability is clipped to this range, because larger or smaller values carry no information. The unit is the
-# square root of the area.
+# Stability is clipped to this range, because larger or smaller values carry no information. The range is in
+# units of the square root of the area.
 _STABILITY_RANGE = (-0.2, 0.1)
 # A point is treated as touching the ground if its height above the lowest point is at most this share of the
 # body's height.
@@ -91,7 +92,7 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
 
     Y is scaled to area 1. The scale of X depends on the ratio of the smaller area to the larger area. If the
     ratio is between 1/16 and 0.6, one of the shapes seems to be partial, and X keeps its size relative to Y.
-    Otherwise X is also scaled to area 1. A larger ratio suggests two full shapes, and a smaller ratio
+    Otherwise X is also scaled to area 1. A ratio above 0.6 suggests two full shapes, and a ratio below 1/16
     suggests different units of length.
 
     **Arguments:**
@@ -164,10 +165,10 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
     """The sum of the squared lengths of the limbs that hang down.
 
     A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
-    lower. Its length is the persistence of its component in the sublevel sets of the height (Edelsbrunner,
-    Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that contains the
-    lowest point of the body is left out. Therefore the sum includes three limbs of a standing quadruped, and
-    no limb of a quadruped on its back.
+    lower. The length of a limb is the persistence of its component in the sublevel sets of the height
+    (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that
+    contains the lowest point of the body is left out. Therefore the sum includes three limbs of a standing
+    quadruped, and no limb of a quadruped on its back.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 

@@ -233,10 +233,10 @@ def write_comparison(
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
     - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
-      vertices of Y. The page lists the maps in this order.
+      vertices of Y. The page lists the maps in the order of the dictionary.
     - `errors`: a dictionary from the same names to a `GeodesicError`. The page shows these errors as colours.
-      It also contains a table of the mean errors and further statistics of all maps, and the correspondence
-      quality curves.
+      The page also contains a table of the mean errors and further statistics of all maps, and the
+      correspondence quality curves.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,

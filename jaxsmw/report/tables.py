@@ -31,7 +31,7 @@ class MethodSummary(NamedTuple):
       geodesic error, in thousandths of the square root of the target's area.
     - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. On each pair, the error of
       `REFERENCE` is subtracted from the error of this method. `difference` is the mean of these differences
-      over all pairs, with its confidence interval, in the same unit. It is NaN for `REFERENCE` itself.
+      over all pairs, with its confidence interval, in the unit of `mean`; NaN for `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
     - `area_under_curve`: the area under the correspondence quality curve, at most 1; the mean over all pairs.
@@ -190,11 +190,11 @@ def write_tables(
 
     **Arguments:**
 
-    - `directory`: an existing directory. Existing files with these names are replaced.
+    - `directory`: an existing directory. Existing files of the same names are replaced.
     - `data_set`: the data set on which the methods were measured.
     - `results`: the results of the benchmark.
     - `settings`: the settings of the benchmark.
-    - `methods`: a dictionary from names to methods. It must contain every method in `results`.
+    - `methods`: a dictionary from names to methods, which must contain every method in `results`.
 
     **Returns:** A dictionary from the name of each method to its summary.
 

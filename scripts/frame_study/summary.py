@@ -184,11 +184,11 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             f"than {MOVE} times the square root of the area, which is about the length of an edge. The table "
             "states the median over the pairs.",
             "**update**: the milliseconds to compute a functional map from a pointwise map, without the "
-            f"search, which takes {search:.0f} ms. The table states the median over several runs on one core, "
-            "for one pair of each data set.",
+            f"search, which takes {search:.0f} ms. The table states the median over several runs on one "
+            "core, for one pair of each data set.",
             "**condition**: the condition number of the first least-squares problem. For the regularized "
-            "update, the problem is its wavelet term. The table states the median over the pairs. In float32, a "
-            "matrix with a condition number above 10⁵ is numerically singular.",
+            "update, the problem is its wavelet term. The table states the median over the pairs. In float32, "
+            "a matrix with a condition number above 10⁵ is numerically singular.",
             "**failed**: the number of pairs on which the update reported a failure. Means and medians leave "
             "these pairs out.",
             "`=`: the variant provably equals filtering, so it is not computed again. In the pushforward "

@@ -131,7 +131,7 @@ def variants(frame_names: Iterable[str]) -> list[Variant]:
 
 
 def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
-    """Return a dictionary from each variant to a different variant that provably gives the same result.
+    """Return a dictionary from variants to other variants that provably give the same result.
 
     In the pushforward convention and the area norm, least squares divides the columns of the filtered map by
     the frame function. The frame function of a Parseval frame is 1, so least squares equals filtering.
@@ -255,7 +255,7 @@ def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Fl
 
 
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
-    """Return the number of octaves, at least 0, from the edge of the Meyer scaling function to each eigenvalue."""
+    """Return the octaves, at least 0, from the edge of the Meyer scaling function to each eigenvalue."""
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
 

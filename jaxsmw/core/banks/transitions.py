@@ -116,7 +116,8 @@ class SimpleTight(_DyadicBands):
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
         sine, cosine = jnp.sin(jnp.pi / 2 * ramp), jnp.cos(jnp.pi / 2 * ramp)
-        # This is the angle whose sine is sine², in units of pi / 2. The arctangent is smooth at both ends.
+        # The result is the angle whose sine is `sine**2`, in units of pi / 2. The arctangent is smooth at
+        # both ends of the ramp.
         return 2 / jnp.pi * jnp.arctan2(sine**2, cosine * jnp.sqrt(1 + sine**2))
 
 

@@ -122,8 +122,9 @@ class SpectralDistribution(Warp):
 
     An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
     the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is
-    repeated, the responses at the eigenvalues depend only on their indices. By Weyl's law the eigenvalues of
-    a surface grow nearly linearly. So this warp is nearly linear, and its effect is small.
+    repeated, the responses at the eigenvalues depend only on their indices. By Weyl's law, the eigenvalues of
+    a surface grow nearly linearly. On surfaces, this warp is therefore nearly linear, and its effect is
+    small.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:

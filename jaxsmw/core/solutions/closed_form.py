@@ -37,7 +37,7 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """The solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
+    """The solution for Parseval frames. It filters the functional map C_0 of a pointwise map T.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)`, eq. (8) of the MWP paper. The filters g_l
     are those of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the shape

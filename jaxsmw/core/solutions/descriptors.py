@@ -57,9 +57,10 @@ class DescriptorPair(eqx.Module):
       coefficients of function j. The attribute `operators` is (d, k_x, k_x) for `x` and (d, k_y, k_y) for
       `y`, or None. Matrix j multiplies other functions by function j, in the eigenbasis.
 
-    Descriptor commutativity needs the operators of both shapes. If `x.operators` is None,
+    The term for descriptor commutativity needs the operators of both shapes. If `x.operators` is None,
     `RegularizedLeastSquares` raises `ValueError` when this term has a weight. If only `y.operators` is None,
-    it omits the term. `DescriptorPair.project` computes the operators of both shapes or of neither.
+    `RegularizedLeastSquares` omits this term. `DescriptorPair.project` computes the operators of both shapes
+    or of neither.
 
     **Raises:** `ValueError` if `coefficients` does not have two dimensions on each shape, or if X and Y have
     different numbers of functions.
