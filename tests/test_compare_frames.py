@@ -86,7 +86,10 @@ def test_results_of_different_origin_are_never_mixed(tmp_path):
     ):
         with pytest.raises(InputError, match=name):
             claim(tmp_path, {**origin, group: {**origin[group], name: value}})
-    with claimed_directory(tmp_path, origin), pytest.raises(InputError, match="another process is adding results"):
+    with (
+        claimed_directory(tmp_path, origin),
+        pytest.raises(InputError, match="another process is adding results"),
+    ):
         claim(tmp_path, origin)
     (tmp_path / "provenance.json").write_text("{")
     with pytest.raises(InputError, match="is damaged"):

@@ -10,7 +10,7 @@ from jaxtyping import TypeCheckError
 from synthetic import random_spectrum
 
 from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer, frame_function
-from jaxsmw.core.functional_map import QuadraticEnergy
+from jaxsmw.core.functional_map import QuadraticEnergy, encode
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
@@ -274,7 +274,9 @@ def test_a_vanishing_frame_function_is_reported(pair, pointwise_map, solution, c
     refined = refine(*pair, pointwise_map, refiner=refiner)
     assert refined.result == RESULTS.undetermined_functional_map
     assert (refined.pointwise_map == -1).all()
-    assert "filters of the bank vanish" in RESULTS[refined.result] and "Filtering()" in RESULTS[refined.result]
+    assert (
+        "filters of the bank vanish" in RESULTS[refined.result] and "Filtering()" in RESULTS[refined.result]
+    )
     filtering = WaveletPreservation(bank=Gap(), convention=convention)
     assert refine(*pair, pointwise_map, refiner=filtering).result == RESULTS.successful
 
@@ -456,6 +458,12 @@ def test_invalid_settings_are_refused(options, message):
         RegularizedLeastSquares(**options)
 
 
+@pytest.mark.parametrize("option", ["convention", "pseudo_inverse"])
+def test_an_unknown_choice_is_refused(pair, pointwise_map, option, unchecked):
+    with pytest.raises(ValueError, match=f"{option}='other' is unknown"):
+        encode(pointwise_map, *pair, **{option: "other"})
+
+
 def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
     values = [jnp.ones((len(s.mask), 1)) for s in pair]
     descriptors = DescriptorPair.project(*values, *pair)
@@ -463,6 +471,11 @@ def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
         RegularizedLeastSquares(descriptors=descriptors)
     with pytest.raises(ValueError, match="operators=True"):
         RegularizedLeastSquares(descriptors=descriptors, descriptor_commutativity=1.0)
+    complete = DescriptorPair.project(*values, *pair, operators=True)
+    with pytest.raises(ValueError, match="operators=True"):
+        RegularizedLeastSquares(
+            descriptors=DescriptorPair(complete.x, descriptors.y), descriptor_commutativity=1.0
+        )
 
 
 def test_minimize_accepts_another_energy(pair):

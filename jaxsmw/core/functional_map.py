@@ -45,7 +45,7 @@ area. `docs/frames.md` derives these results.
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -54,6 +54,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
+from jaxsmw.core.checks import check_choice
 from jaxsmw.core.products import product
 from jaxsmw.core.soft_maps import PointwiseMap, pull_back
 from jaxsmw.core.spectrum import Spectrum
@@ -71,7 +72,10 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
     "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
     pullback convention and (Y, X) in the pushforward convention. The function is its own inverse: for the
     arguments (out, in), it returns (X, Y).
+
+    **Raises:** `ValueError` for an unknown convention.
     """
+    check_choice("convention", convention, get_args(Convention))
     return (of_x, of_y) if convention == "pullback" else (of_y, of_x)
 
 
@@ -86,7 +90,10 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
       `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
       authors' program uses this form. Both matrices are nearly equal if the vertices are spread evenly. If
       the spectrum contains only samples, only `"least_squares"` gives a pseudo-inverse.
+
+    **Raises:** `ValueError` for an unknown pseudo-inverse.
     """
+    check_choice("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
     gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)
@@ -119,6 +126,8 @@ def encode(
       same weight.
 
     **Returns:** C_0, (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention.
+
+    **Raises:** `ValueError` for an unknown convention or pseudo-inverse.
     """
     spectrum_out, spectrum_in = out_and_in(convention, spectrum_x, spectrum_y)
     dual_out = dual_eigenvectors(spectrum_out, pseudo_inverse)

@@ -192,10 +192,10 @@ class WaveletPreservationLayer(eqx.Module):
     - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES. Only `"implicit"` uses
       it.
 
-    **Raises:** The constructor raises `TypeError` if `recovery_of_features` is not a `Recovery`. A call raises
-    `ValueError` if the features have wrong shapes, `iterations` is below 1, `tolerance` is not positive or
-    `differentiation` is unknown. A call raises `TypeError` if `refiner` is not a `WaveletPreservation` or
-    `recovery` is not a `Recovery`.
+    **Raises:** The constructor raises `TypeError` if `recovery_of_features` is not a `Recovery`. A call
+    raises `ValueError` if the features have wrong shapes, `iterations` is below 1, `tolerance` is not
+    positive or `differentiation` is unknown. A call raises `TypeError` if `refiner` is not a
+    `WaveletPreservation` or `recovery` is not a `Recovery`.
     """
 
     refiner: WaveletPreservation = WaveletPreservation()

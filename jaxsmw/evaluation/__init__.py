@@ -1,4 +1,4 @@
-"""Data sets, ground truth, errors and benchmarks."""
+"""Readers for data sets and ground truth, geodesic errors of maps, and benchmarks."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
 """Measures the errors and times of several methods on the pairs of a data set, and stores the results.
 
-If a benchmark was interrupted, a second call with the same arguments continues the benchmark. Finished shapes
-and pairs are stored on disk and not measured again.
+Finished shapes and pairs are stored on disk. If a benchmark was interrupted, a second call of `run_benchmark`
+with the same arguments measures only the remaining shapes and pairs.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: one row with `RESULT_COLUMNS` for each method and each pair that all methods have finished.
-    - `shapes`: a dictionary from the name of each measured shape to its row with `SHAPE_COLUMNS`.
-    - `failures`: a dictionary from the name of each shape or pair that could not be measured to the error
-      message.
+    - `rows`: a list of dictionaries, each with the keys of `RESULT_COLUMNS`. The list contains one row for
+      each pair and method. A pair is left out if any method has no result for this pair.
+    - `shapes`: a dictionary from the name of each measured shape to a row with the keys of `SHAPE_COLUMNS`.
+    - `failures`: a dictionary from the names of shapes and pairs that could not be measured to error
+      messages. A key is the name of a shape, or the text "SOURCE to TARGET" for a pair.
     """
 
     rows: list[Row]
@@ -51,8 +52,8 @@ class Results(NamedTuple):
     def check(self) -> None:
         """Checks that every shape and every pair was measured.
 
-        **Raises:** `InputError` if a measurement failed. The message contains every error message, each with
-        the first shapes or pairs for which it occurred.
+        **Raises:** `InputError` if a measurement failed. The message lists the causes of all failures. For
+        each cause, it names the first three shapes or pairs that failed.
         """
         if not self.failures:
             return
@@ -72,12 +73,12 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Returns the first few names as text, with the number of the names that are left out."""
+    """Returns the first names as text, followed by the number of names that are left out."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
 
-# The largest number of shapes or pairs that a message names for the same fault.
+# For each cause of failures, the error message names at most this many shapes or pairs.
 _NAMED_FAILURES = 3
 
 
@@ -89,28 +90,30 @@ def run_benchmark(
     settings: Settings,
     executor: Executor,
 ) -> Results:
-    """Measures every method on every pair, and skips measurements whose results `output` already contains.
+    """Runs every method on every pair, and stores the errors and times in CSV files.
 
-    Each result is stored as soon as it is available. If a shape or pair cannot be measured, the benchmark
+    A method is not run on a pair for which `output` already contains its result.
+
+    Each result is stored when it is available. If a shape or pair cannot be measured, the benchmark
     continues with the remaining shapes and pairs.
 
     **Arguments:**
 
-    - `data_set`: the data set that contains the pairs.
-    - `pairs`: the pairs to match.
+    - `data_set`: the `DataSet` that contains the pairs.
+    - `pairs`: the pairs to match, each a `DataPair` of this data set.
     - `output`: an existing directory, to which `results.csv`, `shapes.csv` and `provenance.json` are written.
-    - `methods`: a dictionary from the names of methods in result tables to the methods, for example
-      `METHODS`.
-    - `settings`: the settings of the benchmark. Results that `output` already contains must have been
+    - `methods`: a dictionary from names to methods, for example `METHODS`. The names are written to the
+      column `method` of `results.csv`.
+    - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
       measured with the same settings.
     - `executor`: the executor that runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
 
-    **Returns:** The `Results` of these pairs and methods. `Results.check` raises an error if a shape or pair
-    could not be measured.
+    **Returns:** The `Results` of these pairs and methods. A shape or pair that could not be measured raises
+    no error here, but its error message is in `Results.failures`, and `Results.check` raises an error.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
-    data, settings or software versions; if another process is adding results to `output`; if a method is
-    undefined on a pair; or if a file with a published map is missing.
+    data, settings or software versions; if another process is adding results to `output`; if a method
+    cannot match a pair; or if the file of an initial map or a published map is missing.
     """
     for method in methods.values():
         method.check(pairs)
@@ -128,9 +131,9 @@ def run_benchmark(
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
-    This number is the same for most choices of methods. Stored results include the time of the
-    precomputation, which depends on this number. With the same number, a later run can add methods to
-    existing results.
+    A directory contains only results that were measured with the same number, because the time of the
+    precomputation depends on this number. The number is the same for most choices of methods, so a later run
+    can usually add methods to existing results.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 
@@ -173,11 +176,14 @@ class _Store:
                 )
 
     def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Returns the shapes that are not measured yet, as a dictionary from names to (name, mesh file)."""
+        """Returns a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns the pairs that lack a result of some method, as a dictionary from their names to tasks."""
+        """Returns a dictionary from the names of pairs to tasks, which contain the methods without results.
+
+        Pairs for which every method has a result are left out.
+        """
         tasks = {}
         for pair in self.pairs:
             missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
@@ -186,9 +192,10 @@ class _Store:
         return tasks
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
-        """Returns the results of all pairs that all methods have finished."""
-        # Pairs without results of some method are left out, so that all methods are compared on the same
-        # pairs.
+        """Returns the results of the pairs for which every method has a result.
+
+        All methods are thus compared on the same pairs.
+        """
         known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
         by_pair = [[(*pair.names, name) for name in methods] for pair in known]
         finished = [keys for keys in by_pair if all(key in self.results for key in keys)]

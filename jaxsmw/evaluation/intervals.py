@@ -23,9 +23,10 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        """The mean and, if they exist, the ends of the interval as text with signs and one decimal.
+        """Text with signs and one decimal, for example `+1.8 [+0.7, +4.8]`: the mean, then the interval.
 
-        If the mean is NaN, the text is a dash.
+        If the ends of the interval are NaN, the text contains only the mean. If the mean is NaN, the text is
+        a dash.
         """
         if np.isnan(self.mean):
             return "—"
@@ -35,15 +36,17 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
-    """Returns the mean of a sample and its bias-corrected and accelerated bootstrap interval (Efron 1987).
+    """Returns the mean of a sample and a confidence interval of this mean.
+
+    The interval is computed by the bias-corrected and accelerated (BCa) bootstrap (Efron 1987).
 
     **Arguments:**
 
     - `values`: the sample (p,).
     - `seed`: the seed of the random resampling.
 
-    **Returns:** The mean and its interval with confidence level 0.95 (`CONFIDENCE`), computed from 9999
-    resamples (`RESAMPLES`). The ends of the interval are NaN if the sample has fewer than three values. The
+    **Returns:** An `Interval` with confidence level 0.95 (`CONFIDENCE`), computed from 9999 resamples
+    (`RESAMPLES`). The ends of the interval are NaN if the sample has fewer than three values. The
     mean is also NaN if the sample is empty.
     """
     if len(values) == 0:

@@ -20,8 +20,9 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# Reports contain the share of points with an error of at most each of `THRESHOLDS`. Reported correspondence
-# quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the target's area.
+# For each of `THRESHOLDS`, reports contain the share of points whose error is at most this threshold. Reported
+# correspondence quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the
+# target's area.
 THRESHOLDS = (0.02, 0.05, 0.1)
 LARGEST_THRESHOLD = 0.25
 
@@ -31,14 +32,16 @@ class GeodesicError:
     """The geodesic errors of a pointwise map X -> Y, as `geodesic_error` returns them.
 
     All errors and thresholds are in units of the square root of the area of Y. The properties `mean`,
-    `median`, `within` and `unreachable` and the methods `correspondence_quality_curve` and `area_under_curve`
-    compute statistics of the errors. `as_dictionary` returns all statistics for JSON.
+    `median` and `unreachable` (the share of infinite errors) are numbers. The property `within` is a
+    dictionary from the thresholds 0.02, 0.05 and 0.1 to the shares of points with at most this error. The
+    methods `correspondence_quality_curve` and `area_under_curve` compute further statistics. The method
+    `as_dictionary` returns all statistics as a dictionary for JSON.
 
     **Attributes:**
 
-    - `errors`: the error of each evaluated row of the ground truth (p,). An error is inf if the match and the
-      true point are on different connected components of Y.
-    - `source_vertices`: the 0-based vertex of X to which each error belongs (p,).
+    - `errors`: the errors (p,), float64, one for each evaluated row of the ground truth. An error is inf if
+      the match and the true point are on different connected components of Y.
+    - `source_vertices`: the 0-based vertices of X (p,), int64, to which the errors belong.
     - `method`: the method that computed the geodesic distances, `"strips"` or `"exact"`.
     """
 
@@ -68,7 +71,10 @@ class GeodesicError:
 
     @property
     def within(self) -> dict[float, float]:
-        """The shares of points with an error of at most 0.02, 0.05 and 0.1, as a dictionary by threshold."""
+        """A dictionary from the thresholds 0.02, 0.05 and 0.1 to the shares of points with at most this error.
+
+        Shares are numbers from 0 to 1.
+        """
         shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
         return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
 
@@ -84,7 +90,11 @@ class GeodesicError:
     def as_dictionary(self) -> dict[str, Any]:
         """Returns the main statistics and the correspondence quality curve as a dictionary for JSON.
 
-        An infinite mean or median becomes None. The curve has 251 equally spaced thresholds from 0 to 0.25.
+        The keys are `mean`, `median`, `within`, `area_under_curve`, `unreachable`, `points` (the number of
+        errors), `method` and `curve`. An infinite mean or median becomes None. `within` is a dictionary from
+        thresholds, as text, to shares of points. `curve` is a dictionary with two lists: `thresholds`
+        contains 251 equally spaced numbers from 0 to 0.25, and `shares` contains the shares of points with at
+        most these errors.
         """
         thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
@@ -106,7 +116,8 @@ class GeodesicError:
 
         **Arguments:**
 
-        - `thresholds`: the thresholds (t,) in any order, in units of the square root of the area of Y.
+        - `thresholds`: an array of thresholds (t,) in any order, in units of the square root of the area of
+          Y.
 
         **Returns:** The shares (t,), in [0, 1].
         """
@@ -117,7 +128,8 @@ class GeodesicError:
         """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
 
         The curve has a step at each error e, so its mean height is exactly the mean of
-        `max(0, 1 - e/largest)` over all errors. The value is in [0, 1]. It is 1 if all errors are zero.
+        `max(0, 1 - e/largest)` over all errors. The mean height is in [0, 1], and is 1 if all errors are
+        zero.
 
         **Arguments:**
 
@@ -146,21 +158,24 @@ def geodesic_error(
 
     **Arguments:**
 
-    - `mesh_y`: the target Y.
+    - `mesh_y`: the target Y, a `Mesh` with n vertices.
     - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y or as `SurfacePoints` on Y.
     - `ground_truth`: the `GroundTruth` of X and Y, with the true points on Y of some or all vertices of X.
     - `method`: the method that computes geodesic distances. `"strips"` (the default) finds shortest paths
-      along edges and straight shortcuts, which on bodies are 0.03 to 0.07 % too long on average. `"exact"`
-      takes about 100 times as long, and works only between vertices of a manifold mesh.
-    - `number_of_samples`: the number of rows of the ground truth to evaluate, drawn at random without
-      replacement. If None (the default), or if the ground truth has fewer rows, all rows are evaluated.
+      that consist of edges and of straight lines across faces. On bodies, these paths are 0.03 to 0.07 % too
+      long on average. `"exact"` takes about 100 times as long, and works only between vertices of a manifold
+      mesh.
+    - `number_of_samples`: the number of rows of the ground truth to evaluate, at least 1. These rows are
+      drawn at random without replacement. If None (the default), or if the ground truth has fewer rows, all
+      rows are evaluated.
     - `seed`: the seed of the random draw.
 
-    **Returns:** A `GeodesicError` with one error for each evaluated row of the ground truth.
+    **Returns:** A `GeodesicError` with one error for each evaluated row of the ground truth. Its array
+    `errors` (p,) contains the errors, and its properties `mean` and `median` summarise them.
 
-    **Raises:** `InputError` if the map, the ground truth and the mesh do not fit each other; if the ground
-    truth is empty; if `number_of_samples` is less than 1; or if `"exact"` cannot be used (see
-    `jaxsmw.geodesic_distances`).
+    **Raises:** `InputError` if the map or the ground truth contains a vertex or face that Y does not have; if
+    the map has no entry for a vertex of X in the ground truth; if the ground truth is empty; if
+    `number_of_samples` is less than 1; or if `"exact"` cannot be used (see `jaxsmw.geodesic_distances`).
     """
     images = check_points(pointwise_map, mesh_y, "pointwise map")
     targets = check_points(ground_truth.targets, mesh_y, "ground truth")
@@ -185,13 +200,15 @@ def geodesic_error(
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Returns the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
-    Each matched vertex of Y contributes its vertex area, a third of the area of the triangles around it. The
-    coverage is in [0, 1]. Its computation needs no ground truth.
+    Each vertex of Y that matches at least one vertex of X contributes its vertex area, a third of the area of
+    the triangles around this vertex. The coverage is in [0, 1], and needs no ground truth.
 
     **Arguments:**
 
-    - `mesh_y`: the target Y.
+    - `mesh_y`: the target Y, a `Mesh`.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+
+    **Returns:** The coverage, a float.
 
     **Raises:** `InputError` if an entry of the map is not a vertex of Y.
     """

@@ -35,18 +35,19 @@ def prepare_pair(
 
     **Arguments:**
 
-    - `data`: the pair in its data set. Only its `names` and its flag `partial` are used.
+    - `data`: the `DataPair`, of which only the attributes `names` and `partial` are used.
     - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
-    - `init`: the name of an initial map (see `jaxsmw.match`), or a directory with initial maps in files
-      `X_Y.map`.
-    - `number_of_eigenvectors`: the number k of eigenvectors of both spectra.
-    - `number_of_descriptors`: the number of principal components of SHOT; 0 for no descriptors.
+    - `init`: the name of an initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see
+      `jaxsmw.match`); or a directory that contains initial maps in files named `X_Y.map`.
+    - `number_of_eigenvectors`: the number of eigenvectors that are computed for each shape.
+    - `number_of_descriptors`: the number of principal components of the SHOT descriptors; 0 for no
+      descriptors.
     - `both_directions`: whether to compute the initial map Y -> X as well.
 
     **Returns:** A `MethodInput`, with arrays padded to the same sizes as in `jaxsmw.match`.
 
-    **Raises:** `InputError` if a spectrum or an initial map cannot be computed, or if the directory has no
-    usable initial map X -> Y; `ArithmeticError` if the computation of an initial map fails numerically.
+    **Raises:** `InputError` if a spectrum or an initial map cannot be computed, or if the directory contains
+    no valid map X -> Y; `ArithmeticError` if the computation of an initial map fails numerically.
     """
     pair = Pair(mesh_x, mesh_y, data.partial)
     prepared = prepare(

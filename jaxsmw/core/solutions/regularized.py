@@ -88,7 +88,7 @@ class RegularizedLeastSquares(Solution[None]):
     **Raises:** `ValueError` in the following cases: a weight or the tolerance is not a single positive
     number; `max_steps` is below 1; `norm` is unknown; neither `wavelet_preservation` nor
     `descriptor_preservation` has a weight; descriptors are given without a weight, or a weight without
-    descriptors; descriptor commutativity has a weight, but the descriptors on X have no operators.
+    descriptors; descriptor commutativity has a weight, but the descriptors on X or Y have no operators.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -125,7 +125,7 @@ class RegularizedLeastSquares(Solution[None]):
         if (
             self.descriptor_commutativity is not None
             and self.descriptors is not None
-            and self.descriptors.x.operators is None
+            and (self.descriptors.x.operators is None or self.descriptors.y.operators is None)
         ):
             raise ValueError(
                 "descriptor_commutativity needs operators, which the descriptors lack: compute the "
