@@ -47,7 +47,7 @@ MethodName = Literal[
     "zoomout",
     "zoomout-sampled",
 ]
-"""The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.opponents.METHODS`."""
+"""The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.registry.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
 """The names of methods of other libraries. A benchmark can measure them if these libraries are installed."""
 

@@ -32,7 +32,7 @@ _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
-    """A shape with its compared vertices, which are the vertices at which descriptors are compared.
+    """A shape with its compared vertices. Descriptors are compared only at these vertices.
 
     On a large mesh, the compared vertices are samples. On any other mesh, all vertices are compared vertices.
 
@@ -72,7 +72,7 @@ class SampledShape(NamedTuple):
 
 
 class SampledPair(NamedTuple):
-    """A pair with its compared vertices, which are the vertices at which descriptors are compared.
+    """A pair with its compared vertices. Descriptors are compared only at these vertices.
 
     **Attributes:**
 
@@ -191,7 +191,7 @@ def paired_shot(
 
     **Arguments:**
 
-    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
     - `radius`: the radius of the neighbourhoods, in `Pair.units_of_length`.
 
     **Returns:** The descriptors of X (m, 352) and of Y (n, 352), where m and n are the numbers of compared

@@ -114,8 +114,8 @@ def prepare(
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
       function issues a `UserWarning` instead, and the spectra contain no descriptors.
 
-    **Returns:** A `PreparedPair` with the attributes `pair`, `spectrum_x`, `spectrum_y`, `init`,
-    `initial_map` (m,), `samples` and `seconds`.
+    **Returns:** A `PreparedPair`. Its attributes include `spectrum_x`, `spectrum_y`, the pointwise map
+    `initial_map` (m,), and `samples`, a pair of arrays of vertices of X and of Y (None without samples).
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required

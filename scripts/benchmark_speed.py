@@ -1,16 +1,16 @@
-"""Measures the speed of each part of the library, and compares it with a lower bound or another library.
+"""Measures the times of the parts of the library, and compares them with lower bounds or other libraries.
 
     python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
 
-- `refinement`: the time of three iterations in float32 with 100 eigenvectors, as in the paper, at several
-  sizes. The candidates are exhaustive search, search in patches, refinement on samples, and a plain argmin
-  over stored distances. The lower bound is the time of three matrix products (m x k) (k x n), in the fastest
-  of several implementations.
+- `refinement`: the time of three iterations in float32 with 100 eigenvectors, as in the MWP paper, for
+  several sizes. The candidates are exhaustive search, search in patches, refinement on samples, and a plain
+  argmin over stored distances. The lower bound is the time of three matrix products (m x k) (k x n), in the
+  fastest of several implementations.
 - `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert
   `eigsh` with default settings. The note above the table states the errors of the approximate eigenvalues.
 - `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
   compared with the time to compute one eigenbasis.
-- `stages`: the times of other computations on the host for one shape, such as SHOT and samples.
+- `stages`: the times of other computations on the host for one shape, such as SHOT and sampling.
 - `command`: the times of whole commands, from the start of Python until the map is written, with and without
   cached compiled programs.
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
@@ -140,7 +140,7 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
     """Return several implementations of the product of the eigenvector matrices of X and Y.
 
     The keys are names. Each function computes the product `ITERATIONS` times. The time of the fastest
-    function is a lower bound for an exhaustive search.
+    function is a lower bound for the time of an exhaustive search.
     """
     # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
@@ -251,7 +251,7 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
 def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
     """For each size, yield the wall-clock times to compute the eigenbases of two shapes concurrently.
 
-    The processes start before the timed runs, so the times exclude their start.
+    The processes start before the timed runs, so the times exclude the start of the processes.
     """
     for size in options.sizes:
         pair = creature_pair(vertices=size)
@@ -291,12 +291,12 @@ def keep(meshes: Sequence[Mesh]) -> None:
 
 
 def eigenbasis_of(number: int) -> None:
-    """Compute the eigenbasis of the mesh with this index in `kept_meshes`."""
+    """Compute the eigenbasis of `kept_meshes[number]`."""
     eigenpairs(kept_meshes[number], EIGENVECTORS)
 
 
 def eigenbasis_in_one_thread(number: int) -> None:
-    """Compute the eigenbasis of the mesh with this index in `kept_meshes`, with one BLAS thread."""
+    """Compute the eigenbasis of `kept_meshes[number]` with one BLAS thread."""
     with one_blas_thread():
         eigenbasis_of(number)
 
@@ -507,7 +507,7 @@ def matched_from_files(
         """Records the times of log messages, each of which marks the start of a stage."""
 
         def emit(self, record: logging.LogRecord) -> None:
-            if not record.args:  # messages with arguments report results and start no stage
+            if not record.args:  # log messages with arguments do not mark the start of a stage
                 stages.append((record.getMessage(), time.perf_counter(), peak_memory()))
 
     logger = logging.getLogger("jaxsmw")
@@ -529,7 +529,7 @@ def scale(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
-    """Measure one preset at several sizes. Each size runs in a new process."""
+    """Measure one preset at several sizes, each in a new process."""
     truth = pair_with_truth(options)
     rows, measured = [], []
     for size in sizes:
@@ -552,7 +552,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
     columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
 
     def exponent(values: list[float]) -> str:
-        # The fit leaves out the smallest size, because constant costs dominate its time.
+        # The fit leaves out the smallest size, because constant costs dominate the time at this size.
         return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
 
     if len(measured) > 2:
@@ -595,7 +595,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
         our_initial_map(*files)
         measured: dict[str, dict[str, Any]] = {}
-        for turn in range(2 if options.quick else 4):  # JAX compiles in the first turn
+        for turn in range(2 if options.quick else 4):  # the first turn includes compilation
             for name, run in runs.items():
                 if turn > 1 and name.startswith("geomfum"):
                     continue  # geomfum is timed only once, because each of its runs takes a minute

@@ -5,12 +5,12 @@
 
 The script draws pairs at random from each data set (see `docs/datasets.md`) and prints three tables:
 
-- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. It
-  states the rank correlation of both errors and the share of gross errors. A gross error exceeds 0.1 times
-  the square root of the area. The last column states the share of the gross errors that belong to the 10 % of
-  the vertices with the largest expected errors.
-- The second table divides the vertices of all pairs into ten groups of equal size by expected error, and
-  states the true errors of each group.
+- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. The
+  table states the rank correlation of expected and true errors, and the share of gross errors. A gross error
+  exceeds 0.1 times the square root of the area. The last column states the share of the gross errors that
+  belong to the 10 % of the vertices with the largest expected errors.
+- For the second table, the script sorts the vertices of all pairs by expected error, and divides them into
+  ten groups of equal size. The table states the true errors of each group.
 - The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
   this table only for the preset `accurate`. The table covers only full shapes whose mirrored ground truth
   consists of vertices. To compute the mirrored map, the script starts from the mirrored ground truth, and
@@ -43,7 +43,7 @@ from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
-# These are all stages of the preset except the first. They run without repair.
+# If stages are given instead of a preset, `match` does not repair maps.
 WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 

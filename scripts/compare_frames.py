@@ -1,4 +1,4 @@
-"""Compares frames, updates and conventions on remeshed FAUST and TOSCA, and writes figures and tables.
+"""Compares frames, updates of the functional map, and conventions on remeshed FAUST and TOSCA.
 
     python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
                                      [--workers N] [--quick]
@@ -13,7 +13,7 @@ line. The script writes the figures and these files to the output directory:
 - `results.csv`: the results of each variant on each pair;
 - `parameters.csv`: the errors for each number of eigenvectors, filters and iterations;
 - `invariance.csv`: the similarity of wavelets around corresponding points;
-- `times.csv`: the time of each update and of the nearest-neighbour search;
+- `times.csv`: the time of each update of the functional map and of the nearest-neighbour search;
 - `provenance.json`: versions, machine, seeds and settings.
 
 After an interruption, the same command continues from the saved results.

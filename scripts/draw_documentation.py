@@ -33,13 +33,12 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# With dithering, smoothly coloured bodies need no more colours. The files are a third as large as in full
-# colour.
+# For smoothly coloured bodies, 256 dithered colours are enough. They reduce the files to a third of the size.
 COLORS = 256
 
 
 class Case(NamedTuple):
-    """A pair of meshes that `jaxsmw.match` does not match correctly with some options.
+    """A failure case: a pair of meshes that `jaxsmw.match` does not match correctly with certain options.
 
     **Attributes:**
 
@@ -60,7 +59,7 @@ class Case(NamedTuple):
 
 
 def procedural_cases() -> Iterator[Case]:
-    """Yields the failure cases with procedural shapes, which need no data."""
+    """Yields the failure cases with procedural shapes, which need no data set."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
@@ -93,7 +92,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Returns a unit sphere deformed to a body with five equal arms, and the undeformed vertices (n, 3)."""
+    """Returns a sphere that is deformed into a body with five equal arms, and its undeformed vertices."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -130,7 +129,10 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Returns a decimated target. The new ground truth is its vertex nearest to each old true match."""
+    """Returns a decimated target and its ground truth.
+
+    Each true match is replaced by the nearest vertex of the decimated target.
+    """
     positions, faces, *_ = igl.decimate(pair.target.vertices, pair.target.faces, 2 * vertices)
     coarse = jaxsmw.make_mesh(positions, faces, name=f"{pair.target.name}, coarser")
     nearest = KDTree(positions).query(pair.truth.positions(pair.target))[1]

@@ -12,8 +12,8 @@ of Adam (optax) uses one pair of the first five people of FAUST. The script trai
 `labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
 The script then tests both networks on pairs of the other people and of TOSCA. The preset `paper` refines each
-pair from four initial maps. Each initial map matches nearest neighbours of descriptors. These descriptors are
-SHOT descriptors, or come from the untrained network or one of the trained networks. The script writes:
+pair from four initial maps. Each initial map is a nearest-neighbour search among descriptors. The descriptors
+are SHOT, or the output of the untrained network or of one of the trained networks. The script writes:
 
 - `summary.md`: the comparison;
 - `curves.png`: the losses against the training steps;
@@ -251,7 +251,7 @@ class Matched(NamedTuple):
     - `by_descriptors`: the soft map that the layer recovers from the descriptors alone.
     - `by_layer`: the soft map that the layer recovers from its functional map.
     - `functional_map`: the functional map of the layer.
-    - `energy`: the wavelet-preservation energy of the functional map under the soft map `by_layer`, divided
+    - `energy`: the wavelet-preservation energy of the functional map for the soft map `by_layer`, divided
       by the number of eigenvectors.
     """
 

@@ -153,7 +153,7 @@ def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
 
 
 def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
-    """Return the loss `cycles`: the mean distance from each point of X to its image under both soft maps."""
+    """Return the loss `cycles`: the mean distance from points of X to their images on a round trip via Y."""
     forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
     return root_mean_square(

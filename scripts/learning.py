@@ -129,7 +129,7 @@ class Trained(NamedTuple):
     - `model`: the trained model.
     - `losses`: the loss of every step.
     - `steps`: the numbers of completed steps after which the loss on the watched pairs was evaluated.
-    - `watched`: the mean loss on the watched pairs after each of these numbers of steps.
+    - `watched`: the mean loss on the watched pairs after each number of steps in `steps`.
     """
 
     model: Any
@@ -159,13 +159,13 @@ def train(
 
     **Arguments:**
 
-    - `name`: the name of the loss, for the name of the file and for the progress bar.
+    - `name`: the name of the loss, which appears in the name of the file and in the progress bar.
     - `loss`: a function that takes the model and a prepared pair, and returns the loss.
     - `model`: the initial model.
     - `pairs`: the training pairs.
     - `prepare`: a function that prepares a pair for the loss.
     - `optimizer`: the optax optimiser.
-    - `steps`: the number of steps.
+    - `steps`: the number of training steps.
     - `seed`: the seed of the random draws.
     - `directory`: an existing directory for the saved state.
     - `unit`: a function that takes a prepared pair and returns a number. Each recorded loss is divided by
@@ -267,7 +267,7 @@ def reading(path: Path) -> Iterator[BinaryIO]:
 
 
 def padded(spectrum: Spectrum) -> Spectrum:
-    """Pad a spectrum with masked vertices to a multiple of `_SIZES`."""
+    """Pad a spectrum with masked vertices up to the next multiple of `_SIZES`."""
     return spectrum.pad(-(-spectrum.mask.shape[0] // _SIZES) * _SIZES)
 
 
@@ -305,7 +305,7 @@ def measure(
     seed: int,
     directory: Path,
 ) -> Measured:
-    """Measure random pairs of the other people and of TOSCA.
+    """Measure the errors of random test pairs of FAUST and TOSCA.
 
     The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the file
     already contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset
@@ -336,7 +336,7 @@ def measure(
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """Return a table of mean errors, and of mean paired differences from `names[0]` with their intervals."""
+    """Return a table of mean errors, and of mean differences from `names[0]` with confidence intervals."""
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}
@@ -401,7 +401,7 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
 
     **Arguments:**
 
-    - `arguments`: the parser, made by `parser`.
+    - `arguments`: the parser that the function `parser` returned.
     - `settings`: further settings that all results in the output directory must share.
     """
     options = arguments.parse_args()

@@ -17,8 +17,9 @@ experiment uses only the data sets that suit this experiment:
   sets of `table1`.
 
 In the output directory, the script creates one directory for each run, with the same files as
-`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same command
-continues from the saved results. With `--quick`, the script takes minutes on shapes with 5000 vertices.
+`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same
+command continues from the saved results. With `--quick`, the script takes minutes on shapes with 5000
+vertices.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
 # `fig9` divides the number of pairs (`--pairs`, by default 40) by this number, and uses at least 2 pairs.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
-# These descriptors cannot distinguish left from right. SHOT and "functional", which uses SHOT, can do so.
+# Unlike SHOT and "functional", which uses SHOT, these descriptors cannot distinguish left from right.
 _MIRRORED = {"wks", "hks", "wavelet"}
 
 
@@ -69,7 +70,7 @@ class Run(NamedTuple):
 
 
 def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
-    """Opens the data sets in a directory that have the given names, or all if there are no names.
+    """Opens the data sets with the given names in a directory, or all data sets if there are no names.
 
     **Raises:** `InputError` if a named data set cannot be opened, or if there is no data set.
     """
@@ -153,8 +154,8 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # Published results come from initial maps in another directory. The name of the directory with the
-        # results begins with the name of the directory with these initial maps.
+        # Some directories contain published initial maps. Other directories contain results, and their names
+        # begin with the name of the directory with the initial maps of these results.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {

@@ -36,7 +36,7 @@ def runner(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
 
 
 def assert_refused(outcome: Outcome, *, naming: str) -> None:
-    """Check that the command ended with exit code 2 and one sentence that contains `naming`."""
+    """Check that the exit code is 2, and that the error message is one sentence that contains `naming`."""
     assert outcome.code == 2, outcome.errors
     assert outcome.output == ""
     assert outcome.errors.count("\n") == 1 and len(outcome.errors) > 40

@@ -1,4 +1,4 @@
-"""Settings and fixtures of all tests: double precision, strict type promotion, and the real shapes."""
+"""Settings and fixtures for all tests."""
 
 import os
 from collections.abc import Iterator
@@ -10,19 +10,19 @@ import jaxtyping
 import pytest
 from threadpoolctl import threadpool_limits
 
-# The tests spend most of their time compiling small programs that run once. With XLA's older loop emitters,
-# this compilation takes a third of the time. The flag is set only for versions of JAX that have it, because
-# XLA ends the process at an unknown flag.
+# The tests spend most of their time compiling small programs that run once. XLA's older loop emitters reduce
+# the compilation time to a third. The flag is set only for versions of JAX that have it, because XLA ends the
+# process at an unknown flag.
 if jax.__version_info__[:2] == (0, 10):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_disable_most_optimizations", True)
-# Recording the call stack of every operation would take 10 % of the time of the tests.
+# Without this setting, JAX records the call stack of every operation, which takes 10 % of the test time.
 jax.config.update("jax_include_full_tracebacks_in_locations", False)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# An example may compile a program, which can take longer than Hypothesis's default deadline.
+# A Hypothesis example may compile a program, which can take longer than Hypothesis's default deadline.
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
 
@@ -32,8 +32,8 @@ def shared() -> Path:
     """The directory with real shapes (`data/`) and reference results (`oracle/`).
 
     `JAXSMW_SHARED` names the directory. The default is `shared/` next to the checkout. If the directory is
-    missing, the tests on real shapes are skipped. If `CI` is also set, these tests fail instead, because a
-    skip would hide that nothing was tested.
+    missing, the tests on real shapes are skipped. If the environment variable `CI` is also set, these
+    tests fail instead, because a skip would hide that nothing was tested.
     """
     default = Path(__file__).resolve().parents[2] / "shared"
     directory = Path(os.environ.get("JAXSMW_SHARED", default))
@@ -60,7 +60,7 @@ def one_thread_each() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Give all commands that the tests start in any worker a common cache of compiled programs."""
+    """Set one cache of compiled programs for all commands that the tests start."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:

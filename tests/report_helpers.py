@@ -18,7 +18,7 @@ def ellipsoid(*half_axes: float, subdivisions: int = 3, name: str = "ellipsoid")
 
 
 def renumbered(mesh: Mesh, seed: int = 0) -> tuple[Mesh, np.ndarray]:
-    """Return the surface with shuffled vertices and faces, and the new number of each vertex."""
+    """Return the surface with shuffled vertices and faces, and the new index of each vertex."""
     generator = np.random.default_rng(seed)
     order = generator.permutation(len(mesh.vertices))
     number = np.argsort(order)

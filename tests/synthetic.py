@@ -8,7 +8,7 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 
 
 def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) -> Spectrum:
-    """A random spectrum that belongs to no mesh.
+    """A spectrum with random eigenvectors, which does not belong to any mesh.
 
     The eigenvectors are orthonormal with respect to random vertex areas. The eigenvalues grow as Weyl's law
     predicts.
@@ -71,7 +71,7 @@ def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bumpy_mesh(subdivisions: int = 4) -> Mesh:
-    """A sphere with waves that have no symmetry."""
+    """A sphere that is deformed by waves without symmetry."""
     vertices, faces = sphere_mesh(subdivisions)
     waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
     return make_mesh(vertices * (1 + waves)[:, None], faces)

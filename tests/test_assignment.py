@@ -1,5 +1,3 @@
-"""One-to-one maps use no target twice, and have the lowest cost according to a brute-force search."""
-
 from itertools import permutations
 
 import numpy as np
@@ -40,7 +38,6 @@ def test_no_target_is_used_twice_among_5000(generator, dtype):
 def test_a_renumbering_is_recovered(generator):
     x, order = generator.normal(size=(400, 5)), generator.permutation(400)
     np.testing.assert_array_equal(one_to_one_map(x, x[order]), np.argsort(order))
-    # A translation of both embeddings and a change of their signs have no effect.
     np.testing.assert_array_equal(one_to_one_map(x + 1e3, x[order] + 1e3), np.argsort(order))
     signs = np.array([1, -1, -1, 1, -1])
     np.testing.assert_array_equal(one_to_one_map(signs * x, signs * x[order]), np.argsort(order))
@@ -71,7 +68,7 @@ def test_arrays_of_wrong_shapes_are_named(generator, unchecked):
 
 def test_impossible_problems_are_refused(generator, monkeypatch):
     x = generator.normal(size=(5, 3))
-    with pytest.raises(InputError, match=r"5 vertices of the source .* 4 of the target: swap"):
+    with pytest.raises(InputError, match=r"5 vertices of the source .* 4 of the target, .*: swap"):
         one_to_one_map(x, x[:4])
     mask = np.arange(5) < 3
     with pytest.raises(InputError, match=r"5 vertices of the source .* 3 of the target"):

@@ -1,5 +1,3 @@
-"""Pairs in a batch get the results of single pairs, with padding, several devices and several processes."""
-
 import os
 import socket
 import subprocess

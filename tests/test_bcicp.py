@@ -68,7 +68,7 @@ def dense_adjacency(mesh: Mesh) -> np.ndarray:
 
 
 def with_wrong_disc(x, y, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The true map, except that a small disc is matched to the opposite side, and a mask of this disc."""
+    """Return the true map with a small disc matched to the opposite side, and a mask of this disc."""
     disc = np.linalg.norm(x.positions - x.positions[7], axis=1) < 0.12
     assert 3 < disc.sum() < 30
     t = truth.copy()
@@ -231,7 +231,7 @@ def test_nonmanifold_meshes_with_unreferenced_vertices_get_valid_maps():
     initial_map = np.where(generator.random(n) < 0.2, generator.choice(used, n), np.arange(n))
     initial_map[unreferenced] = unreferenced
     surface = steps._Surface.of(mesh, spectrum)
-    # The mesh has a small connected component, which is not an outlier.
+    # BCICP must not treat a small connected component as an outlier.
     assert surface.areas[surface.component > 0].sum() < 0.05
     assert not steps._outliers(surface, surface, np.arange(len(used))).any()
     for found in bcicp(mesh, mesh, spectrum, spectrum, initial_map, initial_map, iterations=2, smoothing=5):

@@ -44,7 +44,7 @@ from jaxsmw.runtime.provenance import measured_code
 
 @pytest.fixture(scope="module")
 def scape(tmp_path_factory) -> Path:
-    """Three deformed copies of a bumpy sphere, in the layout of SCAPE."""
+    """Three deformed copies of a bumpy sphere, in the directory layout of the data set SCAPE."""
     directory = tmp_path_factory.mktemp("bodies")
     mesh = bumpy_mesh(4)
     for number, stretch in enumerate(([1, 1, 1], [1.05, 1, 0.97], [1, 0.95, 1.04])):
@@ -212,7 +212,6 @@ def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
 
 
 def test_functions_refuse_names_longer_than_the_file_system_allows(scape):
-    """The command line refuses such names before it calls these functions."""
     calls = [
         (lambda: open_data_set(TOO_LONG), "is not a directory"),
         (lambda: find_methods([TOO_LONG]), "is not a method"),
@@ -237,7 +236,7 @@ class LocalExecutor(Executor):
 
 
 def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
-    """Run some methods on some pairs, in this process."""
+    """Run a benchmark in this process."""
     data_set = open_data_set(data)
     chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
     return run_benchmark(data_set, chosen, output, find_methods(names), every, LocalExecutor())
@@ -428,7 +427,6 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
 
 @pytest.mark.slow
 def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
-    """Environment, listeners and compiled programs do not change, because only workers release programs."""
     monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
     double = jax.jit(lambda x: 2 * x)
     double(1.0)
@@ -527,7 +525,7 @@ class Slow(Method):
 
 
 def test_times_exclude_compilation(monkeypatch):
-    """A method runs a second time if its first run compiles a program and does not take long."""
+    """A method runs a second time if its first run compiles a program and is short."""
     monkeypatch.setattr(measurement, "_LONG", 0.5)
     monkeypatch.setattr(measurement, "_warm", {"short"})
     spectrum = random_spectrum(30, 5, seed=0)

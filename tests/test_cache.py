@@ -231,10 +231,6 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
 
 @pytest.mark.slow
 def test_commands_cache_compiled_programs(tmp_path):
-    """A second command loads the programs that the first command compiled.
-
-    A disabled cache stays empty.
-    """
     mesh = tmp_path / "mesh.off"
     write_mesh(mesh, make_mesh(*sphere_mesh(2)))
     command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), "--eigenvectors", "20"]

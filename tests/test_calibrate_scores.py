@@ -44,7 +44,7 @@ def test_a_mirrored_map_has_a_worse_distortion():
     found = match(pair.source, pair.target, preset="fast")
     scores = scores_of(found)
     assert np.isfinite(list(scores.values())).all()
-    # This map equals the found map after an exchange of left and right.
+    # The mirrored map is the found map with left and right exchanged.
     other = pair.target.vertices * (-1, 1, 1)
     mirrored = cKDTree(pair.target.vertices).query(other[found.pointwise_map])[1]
     wrong = scores_of(match(pair.source, pair.target, init=mirrored, preset="fast"))

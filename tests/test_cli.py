@@ -73,7 +73,6 @@ def test_every_command_has_a_help_text(run, command):
 
 
 def test_the_help_states_the_defaults_of_the_library(run):
-    """Names and sizes come from `jaxsmw.choices`, whose defaults equal the defaults of the functions."""
     words = {command: " ".join(run(command, "--help").output.split()) for command in COMMANDS}
     defaults = {name: entry.default for name, entry in inspect.signature(match).parameters.items()}
     assert f"(default: {defaults['preset']}, or paper if" in words["match"]
@@ -165,7 +164,7 @@ def test_quiet_prints_nothing_on_standard_error(run, pair, tmp_path):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """All settings of each call of `match`: of the function, of the stage and of the refiner, by name."""
+    """A list with one dictionary of settings for each call of `match`."""
     calls, match = [], jaxsmw.matching.match
 
     def recorded(*meshes, preset, **settings):
@@ -248,7 +247,6 @@ def test_the_report_has_all_files_settings_and_maps(run, pair, tmp_path):
 
 @pytest.mark.slow
 def test_the_default_preset_is_accurate_and_options_select_paper(run, pair, tmp_path):
-    """The default preset is `accurate`. Options that change the paper's method need the preset `paper`."""
     maps = {}
     for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100"),
                     ("--preset", "fast"), ("--samples", "500")):  # fmt: skip
@@ -308,7 +306,6 @@ def test_a_page_compares_maps(run, pair, tmp_path):
 
 @pytest.mark.filterwarnings("default:the page has no wavelets")
 def test_a_page_of_a_partial_shape_uses_a_common_range_of_eigenvalues(run, pair, tmp_path):
-    """Both spectra cover the same range of eigenvalues. Without a common range the page has no wavelets."""
     call = ["render", pair / "x.off", pair / "y.ply", pair / "truth.txt", "--output", tmp_path / "p.html"]
     assert run(*call, "--partial").code == 0
     # The smaller shape has fewer eigenvalues in the common range.
@@ -526,7 +523,6 @@ def test_a_note_names_all_options_that_replace_the_preset(run, tmp_path):
 
 @pytest.mark.slow
 def test_written_files_are_named(run, pair, tmp_path):
-    """Standard error has a line for every file that a command writes."""
     meshes, truth = (pair / "x.off", pair / "y.ply"), pair / "truth.txt"
     for arguments in (
         ["match", *meshes, *SMALL, "--output", tmp_path / "m.txt", "--surface-points", tmp_path / "p.baryc_gt",
@@ -599,7 +595,7 @@ def test_a_closed_pipe_causes_no_error_message(pair):
 def test_the_readme_names_existing_options(run):
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     helps = "".join(run(command, "--help").output for command in COMMANDS)
-    readme = re.sub(r"^python3 .*", "", readme, flags=re.MULTILINE)  # options of pip and pytest
+    readme = re.sub(r"^python3 .*", "", readme, flags=re.MULTILINE)  # removes options of pip and pytest
     for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", readme)) - {"--quiet", "--help"}:
         assert option in helps, option
 

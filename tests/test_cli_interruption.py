@@ -114,7 +114,7 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
     call += ("--expected-error", tmp_path / "e") if program == IN_A_WRITE else ()
     process = started(program, *call)
-    if program == IN_A_WRITE:  # in this case the interruption comes after the map is complete
+    if program == IN_A_WRITE:  # here the interruption comes after the map is complete
         process.wait(timeout=60)
         (tmp_path / "m").unlink()
     assert_interrupted(process, tmp_path)

@@ -391,7 +391,6 @@ def test_the_largest_accepted_numbers_get_a_message_of_the_library(run, pair, tm
 
 
 def test_functions_refuse_names_that_are_too_long(tmp_path):
-    """Functions of the library raise the same kind of message as the command line."""
     path = tmp_path / ("n" * 300)
     for check in (check_writable, check_directory, make_directory):
         with pytest.raises(InputError, match=r"cannot be .*File name too long"):

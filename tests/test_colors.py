@@ -30,8 +30,7 @@ def test_position_colors_vary_smoothly_and_differ_between_opposite_ends() -> Non
     assert color.min() >= 0 and color.max() <= 1
     edges = mesh.edges
     assert np.abs(color[edges[:, 0]] - color[edges[:, 1]]).max() < 0.2
-    # The two ends of the body along each axis have different colours. The colours along the first two axes
-    # differ more than along the third axis.
+    # The colours of the two ends of the body differ more along the first two axes than along the third axis.
     ends = [(mesh.vertices[:, axis].argmin(), mesh.vertices[:, axis].argmax()) for axis in range(3)]
     difference = [np.abs(color[low] - color[high]).max() for low, high in ends]
     assert min(difference) > 0.15 and min(difference[:2]) > 0.4
@@ -76,6 +75,6 @@ def test_signed_colors_are_blue_below_zero_and_red_above() -> None:
         assert np.ptp(color[3]) < 0.03 and np.all(color[:3, 2] > color[:3, 0] + 0.2)
         assert np.all(color[4:, 0] > color[4:, 2] + 0.2)
         luminance = colors.srgb_to_linear(color) @ [0.2126, 0.7152, 0.0722]
-        # Zero has the colour of the background. Positive and negative values far from zero stand out.
+        # The contrast with the background grows with the absolute value.
         assert np.all(np.diff(luminance[3:6]) * (1 if on_dark else -1) > 0.05)
         assert np.all(np.diff(luminance[1:4]) * (-1 if on_dark else 1) > 0.05)

@@ -164,11 +164,11 @@ def test_only_missing_measurements_run_after_a_kill(tmp_path):
     first.send_signal(signal.SIGKILL)
     first.wait()
     begun = [line.split() for line in log.read_text().splitlines()]
-    # The worker processes must also end.
+    # After the kill, the worker processes must also end.
     while any(is_alive(int(pid)) for pid, *_ in begun):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    # This file lacks its last row, and the row before that row is incomplete.
+    # Remove the last row of the file, and cut off the end of the row before.
     lines = results.read_bytes().splitlines(keepends=True)
     kept = [*lines[:-2], lines[-2][:-4]]
     results.write_bytes(b"".join(kept))
@@ -266,7 +266,7 @@ def test_band_mask_is_as_wide_as_the_kernel_but_belongs_to_no_frame():
     mask = variants.band_mask(octaves, octaves, 0.8)
     np.testing.assert_array_equal(mask, mask.T)
     np.testing.assert_allclose(mask[0, [0, 4, 8, 12, 13]], [1, 1, 0.5, 0, 0], atol=1e-12)
-    # All eigenvalues up to the edge of the scaling function have the octave 0.
+    # The octave is 0 for all eigenvalues up to the edge of the scaling function.
     np.testing.assert_allclose(variants.octaves(np.array([0, 1, 2, 4, 32.0]), 5), [0, 0, 0, 1, 4])
 
 
@@ -397,8 +397,8 @@ def test_comparison_is_paired_and_counts_failures():
 def made_up() -> summary.Study:
     """A study with invented numbers.
 
-    On every second pair, every other variant has ten times the error of the default. Low-pass variants fail
-    on all pairs unless their update is filtering.
+    On every second pair, the error of all variants except the default is ten times the error of the default.
+    Low-pass variants fail on all pairs unless their update is filtering.
     """
     settings = replace(compare_frames.QUICK, pairs=4, iterations=3)
     every = variants.variants(settings.frames)

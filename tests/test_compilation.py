@@ -1,5 +1,3 @@
-"""Compiler options and compilation ahead of time."""
-
 import logging
 from concurrent.futures import wait
 from pathlib import Path
@@ -28,7 +26,7 @@ def test_the_options_disable_the_library_for_matrix_products(points):
     )
     assert "__ynn_fusion" not in ours or not compiler_options()
     if jax.default_backend() == "cpu" and jax.__version_info__[:2] == (0, 10):
-        # In this version of JAX, XLA is known to use the library without these options.
+        # In this version of JAX, XLA uses the library YNN unless these options disable it.
         assert "__ynn_fusion" in plain and compiler_options()
 
 

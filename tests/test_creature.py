@@ -125,7 +125,6 @@ def test_the_same_seed_gives_identical_pairs():
 
 
 def test_another_seed_gives_another_individual(kind, rest):
-    """Another seed changes the proportions of the body and the variation of the pose."""
     assert np.abs(_grown(kind, 5).signed_distance(rest.vertices)).mean() > 0.005
     stand = _KINDS[kind][1]["stand"]
     angles = [_grown(kind, 4).angles(stand, _random(seed, "stand")) for seed in (4, 5)]

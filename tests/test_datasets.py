@@ -19,7 +19,7 @@ VERTICES, FACES = grid_mesh(4, 5)
 
 
 def put(path: Path, contents: str | None = None) -> None:
-    """Write a file with the given contents, or a mesh with twenty vertices."""
+    """Write a file with the given contents, or a mesh with twenty vertices if there are no contents."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if contents is not None:
         path.write_text(contents)
@@ -220,7 +220,7 @@ def test_shapes_with_different_numbers_of_vertices_are_refused(tmp_path):
     put(tmp_path / "cat0.off")
     write_mesh(tmp_path / "cat1.off", make_mesh(*grid_mesh(5, 5)))
     pair = open_data_set(tmp_path).pairs[0]
-    with pytest.raises(InputError, match=r"25 vertices where .* has 20"):
+    with pytest.raises(InputError, match=r"25 vertices and .* has 20"):
         pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
 
 

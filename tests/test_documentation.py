@@ -52,7 +52,7 @@ def code_blocks(page: str, language: str = "python") -> list[str]:
 
 
 def commands(page: str) -> list[str]:
-    """The lines in the code blocks of a page that begin with `jaxsmw` or `python`."""
+    """Return the lines that begin with `jaxsmw` or `python` in the code blocks of a page."""
     lines = "\n".join(code_blocks(page, "")) + "\n"
     lines += "\n".join(re.findall(r"^    (.+)$", (ROOT / page).read_text("utf-8"), flags=re.MULTILINE))
     return [
@@ -61,7 +61,7 @@ def commands(page: str) -> list[str]:
 
 
 def mentioned_commands(page: str) -> list[str]:
-    """The commands that the text mentions in inline code, with some of their options."""
+    """Return the commands, with their options, in the inline code of a page."""
     return re.findall(r"`(jaxsmw [a-z]+ [^`]+)`", (ROOT / page).read_text("utf-8"))
 
 

@@ -49,7 +49,7 @@ def test_the_sphere_has_the_known_eigenvalues():
 
 
 def test_the_square_has_the_known_eigenvalues():
-    """The unit square with a free boundary has the eigenvalues pi^2 (i^2 + j^2)."""
+    """The unit square with a free boundary has the eigenvalues pi^2 (i^2 + j^2) for integers i, j >= 0."""
     spectrum = compute_spectrum(make_mesh(*grid_mesh(60, 60)), 20)
     i, j = np.mgrid[:8, :8]
     exact = np.sort((np.pi**2 * (i**2 + j**2)).ravel())[:20]
@@ -84,7 +84,7 @@ def test_results_are_reproducible_with_canonical_signs():
 
 
 def test_components_keep_all_multiplicities():
-    """A mesh of two spheres and a triangle has each sphere eigenvalue twice, and zero three times."""
+    """The spectrum of two spheres and a triangle contains each eigenvalue of a sphere twice, and zero thrice."""
     sphere = make_mesh(*sphere_mesh(3))
     triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
     mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
@@ -144,7 +144,6 @@ def test_impossible_numbers_of_eigenvectors_are_refused(k):
 
 
 def test_two_threads_give_the_results_of_one():
-    """The results are equal even if one thread finishes before the other thread starts."""
     meshes = make_mesh(*sphere_mesh(3)), body_with_arms()
     for mesh, (values, vectors, _) in zip(
         meshes, side_by_side(lambda mesh: eigenpairs(mesh, 40), *meshes), strict=True
@@ -230,7 +229,7 @@ def test_no_copy_of_a_multiple_eigenvalue_is_missing(k, monkeypatch):
 
 @pytest.mark.parametrize("length", [0.01, 1, 1000])
 def test_eigenvalues_are_exact_on_shapes_far_from_weyls_law(length, monkeypatch):
-    """On a thin strip, eigenvalues grow with the square of their index, so the solver corrects the shift."""
+    """On a thin strip, eigenvalues grow with the square of their index, so the solver must correct its shift."""
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
     vertices, faces = grid_mesh(12, 60)
     vertices = (vertices + 0.003 * np.random.default_rng(0).normal(size=vertices.shape)) * [1, length, 1]
@@ -254,10 +253,6 @@ def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
 
 @pytest.mark.parametrize("numbering", ["as subdivided", "at random"])
 def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
-    """Approximate eigenvalues are at most 0.6 % too large.
-
-    The approximate eigenvectors are orthonormal and reproducible, and they span nearly the same space.
-    """
     mesh = bumpy_mesh(5)
     if numbering == "at random":
         order = np.random.default_rng(1).permutation(len(mesh.vertices))
@@ -269,7 +264,7 @@ def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
     assert excess.min() > 0 and excess.max() < 0.006
     weighted = exact[2][:, None] * approximate[1]
     np.testing.assert_allclose(approximate[1].T @ weighted, np.eye(k), atol=1e-10)
-    # The last eigenvectors mix with eigenvectors beyond the end of the basis.
+    # The last eigenvectors are left out, because they mix with eigenvectors beyond the end of the basis.
     inside = weighted.T @ exact[1][:, : k - 5]
     assert np.sqrt(1 - np.sum(inside**2, axis=0)).max() < 0.05
     np.testing.assert_array_equal(approximate[1], eigenpairs(mesh, k, eigensolver="approximate")[1])
@@ -277,7 +272,6 @@ def test_the_approximate_eigenbasis_is_near_the_exact_one(numbering):
 
 @pytest.mark.parametrize("subdivisions", [4, 5])
 def test_the_approximation_error_does_not_grow_with_the_mesh(subdivisions):
-    """With a subspace of the same dimension, four times as many vertices do not increase the errors."""
     mesh = bumpy_mesh(subdivisions)
     exact, approximate = (eigenpairs(mesh, 15, eigensolver=s)[0] for s in ("exact", "approximate"))
     np.testing.assert_allclose(approximate, exact, rtol=0.006)
@@ -316,7 +310,6 @@ def stretched(factor):
     ids=["hubs", "graded", "stretched"],
 )
 def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
-    """The meshes have vertices with many neighbors, triangles of very different sizes, or long triangles."""
     mesh = make_mesh(*shape)
     with pytest.warns(RuntimeWarning, match="cannot be approximated"):
         found = eigenpairs(mesh, 20, eigensolver="approximate")
@@ -325,7 +318,7 @@ def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
 
 
 def falls_back(mesh, k):
-    """Return whether the exact solver takes over. If it does not, check that the approximation is accurate."""
+    """Return whether the exact solver takes over. Otherwise check that the approximation is accurate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
         approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
@@ -334,8 +327,8 @@ def falls_back(mesh, k):
     return bool(caught)
 
 
-# The cells of the subspace have a radius of one edge in the first case, and of three edges in the second
-# case.
+# The approximate solver uses subspace cells with a radius of one edge for (60, 40), and of three edges for
+# (120, 10).
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])
@@ -353,7 +346,7 @@ def test_an_approximation_is_accurate_or_refused(size, k, factor, noise):
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1, 3, 5, 10, 20])
 def test_a_region_of_bad_triangles_is_detected(factor):
-    """The mesh is an even grid, except that ten columns of triangles are longer by `factor`."""
+    """The mesh is an even grid, except that ten columns of triangles are `factor` times as long."""
     (width, height), part = (100, 100), 10
     vertices, faces = grid_mesh(width, height)
     column = np.arange(len(vertices)) % width

@@ -183,7 +183,7 @@ class TestReading:
         null = mesh("shrec16_partial/null/dog.off")
         paths = [data / f"shrec16_partial/holes/holes_dog_shape_1.baryc_gt{end}" for end in ("", "_sym")]
         direct, mirrored = (read_ground_truth(path, part, null).targets.positions(null) for path in paths)
-        # The dog stands upright and looks straight ahead, so mirroring is a reflection.
+        # The dog stands upright and looks straight ahead, so its mirrored ground truth is a reflection.
         assert len(direct) == len(part.vertices)
         spread = np.abs(direct - mirrored).max(axis=0) / np.ptp(null.vertices, axis=0)
         assert spread.max() > 0.5
@@ -230,7 +230,7 @@ class TestBadFiles:
     @pytest.mark.parametrize(
         ("name", "content", "message"),
         [
-            ("x.vts", "1\n2\n", "x.vts: is one half of a pair"),
+            ("x.vts", "1\n2\n", "x.vts: describes only one shape"),
             ("t.txt", "1 2 3\n", "line 1: has 3 numbers: give a file with one per line"),
             ("t.txt", "1 2\n3\n", "line 2: has 1 number instead of 2"),
             (
@@ -261,7 +261,7 @@ class TestBadFiles:
 
     def test_bad_pairs_of_files_are_refused(self, write):
         one, two = write("x.vts", "1\n2\n"), write("y.vts", "1\n2\n3\n")
-        with pytest.raises(InputError, match=r"y.vts: has 3 lines where .*x.vts has 2"):
+        with pytest.raises(InputError, match=r"y.vts: has 3 lines and .*x.vts has 2"):
             read_ground_truth([one, two], X, Y)
         with pytest.raises(InputError, match=r"x.vts, line 1: has 2 numbers instead of 1"):
             read_ground_truth([write("x.vts", "1 2\n2 3\n"), one], X, Y)
@@ -366,7 +366,7 @@ class TestGeodesicError:
         expected = geodesic_error(
             make_mesh(vertices, faces), pointwise_map, GroundTruth.of_all_vertices(targets)
         )
-        # Vertex i of X gets the number x[i], and vertex i of Y gets the number y[i].
+        # Vertex i of X becomes vertex x[i], and vertex i of Y becomes vertex y[i].
         x, y = generator.permutation(20), generator.permutation(36)
         renumbered_map, moved = np.empty(20, dtype=np.int64), np.empty_like(vertices)
         renumbered_map[x], moved[y] = y[pointwise_map], vertices

@@ -1,4 +1,4 @@
-"""Exchange with other libraries and with MATLAB: results agree on both sides, and bad input is refused.
+"""Spectra and maps keep their meaning in other libraries and in MATLAB, and bad input is refused.
 
 Tests of packages that are not installed are skipped. Stand-ins for pyvista and geomfum are always tested.
 `pip install '.[peers]' pyvista` installs all packages.

@@ -1,5 +1,3 @@
-"""The extremities of a body, and the pairings of the extremities of two bodies."""
-
 import numpy as np
 import pytest
 from synthetic import body_with_arms, sphere_mesh
@@ -26,7 +24,7 @@ def test_the_tips_of_arms_are_extremities():
 
 @pytest.mark.slow
 def test_distances_run_along_the_surface(creature):
-    """Distances follow edges, so they are slightly too long. Their unit is the mean of `remoteness`."""
+    """Distances along edges are slightly too long. The unit of distances is the mean of `remoteness`."""
     pair, ends, _ = creature
     assert 3 <= len(ends.vertices) <= 6
     exact = geodesic_distances(pair.source, ends.vertices)[:, ends.vertices]

@@ -1,5 +1,3 @@
-"""Refinement by feature regression."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,7 +43,7 @@ def features(spectrum):
 
 
 def predicted(moments_xx, moments_xy, moments_yy):
-    """Return the matrix that predicts the features of X from Y, and the precision matrix of the residual."""
+    """Return the matrix that predicts features of X from features of Y, and the precision of the residual."""
 
     def least_squares(cross, gram):
         return cross @ np.linalg.inv(gram + 1e-3 * np.eye(len(gram)))
@@ -70,7 +68,7 @@ def test_refinement_agrees_with_the_definition(pair, partial):
             forward_squared = cdist(a, b @ matrix.T, "mahalanobis", VI=precision)[np.arange(M), t] ** 2
             distances = cdist(b, a @ reverse_matrix.T, "mahalanobis", VI=reverse_precision)
             backward_squared = distances[np.arange(M), reverse_map] ** 2
-            # The reverse map has larger residuals than the forward map, so only the weights of Y change.
+            # The residuals of the reverse map are larger than those of the forward map, so only w_y changes.
             assert w_x @ forward_squared < w_y @ backward_squared
             w_y = w_y / (1 + (backward_squared / (w_x @ forward_squared)) ** 2)
             w_y /= w_y.sum()
@@ -114,7 +112,6 @@ def test_recovers_a_copy_with_mixed_features_better_with_descriptors(pair):
 
 
 def test_a_level_equals_a_truncated_spectrum(pair):
-    """Level 5 gives the same maps as spectra with only 5 eigenvectors."""
     x, y, initial_map, _ = pair
     found = refine(x, y, initial_map, refiner=FeatureRegression((5, 5, 5)), iterations=3)
     truncated = refine(x.truncate(5), y.truncate(5), initial_map, refiner=FeatureRegression(), iterations=3)
@@ -149,7 +146,6 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
 
 @pytest.mark.slow
 def test_search_in_patches_ignores_descriptors(pair):
-    """The first iteration gives the same map as for spectra without descriptors."""
     x, y, initial_map, truth = pair
     maps = [
         refine(x, y, initial_map, refiner=FeatureRegression(search=search), iterations=1).pointwise_map

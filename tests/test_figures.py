@@ -39,7 +39,7 @@ def pixels(figure: Any) -> np.ndarray:
 
 
 def panels(figure: Any) -> dict[str, np.ndarray]:
-    """Return the images of the bodies in a figure by the labels of their axes."""
+    """Return a dictionary from axis labels to the images of the bodies in a figure."""
     return {axes.get_label(): np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images}
 
 
@@ -49,7 +49,7 @@ def test_correspondence_transfers_colors() -> None:
     figure = draw_correspondence(TALL, other, number)
     shown = panels(figure)
     assert list(shown) == ["Source", "Target"]
-    # The ground truth gives source and target the same picture.
+    # With the ground truth, the pictures of source and target are equal.
     assert np.abs(shown["Source"].astype(int) - shown["Target"]).max() <= 1
     wrong = panels(draw_correspondence(TALL, other, np.roll(number, 1)))
     assert np.array_equal(wrong["Target"], shown["Target"])

@@ -126,7 +126,7 @@ def test_impossible_names_are_refused_in_one_sentence(tmp_path, name, call):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     path = tmp_path / name
     if call is make_directory and name.startswith("new"):
-        path.parent.mkdir()  # otherwise make_directory creates this parent before it fails
+        path.parent.mkdir()  # otherwise make_directory would create this parent before its error
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError) as caught:
         call(path)
@@ -136,7 +136,7 @@ def test_impossible_names_are_refused_in_one_sentence(tmp_path, name, call):
 
 
 def test_names_with_a_too_long_temporary_name_are_refused(tmp_path):
-    """The temporary name repeats the long suffix, so it exceeds the limit although the final name does not."""
+    """The temporary name repeats the long suffix, so only the temporary name exceeds the limit."""
     path = tmp_path / ("a." + "x" * 250)
     for write in (check_writable, lambda path: atomic_write(path).__enter__()):
         with pytest.raises(InputError, match="File name too long"):

@@ -38,8 +38,7 @@ WARPS = {
     "power": Power(),
     "distribution": SpectralDistribution(),
 }
-# The banks in this table and in the next table are Parseval frames. The banks in this table allow any number
-# of at least 5 filters.
+# These banks are Parseval frames for every number of filters from 5.
 PARSEVAL_OF_ANY_SIZE = {
     "meyer": Meyer,
     "simple tight": SimpleTight,
@@ -218,7 +217,7 @@ def test_a_softmax_frame_resembles_another_bank_at_its_knots():
     for bank in (Meyer(5), Itersine(4)):
         similar = SoftmaxFrame.like(bank, 33, floor=1e-6)
         np.testing.assert_allclose(sample(similar, knots, knots), sample(bank, knots, knots), atol=1e-5)
-    # For a bank that is not tight, only the ratios between the filters agree.
+    # `SoftmaxFrame.like` preserves only the ratios between the filters of a bank that is not tight.
     squares = sample(Heat([1.0, 10.0]), knots, knots) ** 2
     similar = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
     np.testing.assert_allclose(similar[0], squares[0] / squares.sum(axis=0), atol=1e-3)
@@ -378,13 +377,13 @@ def test_banks_accept_traced_parameters():
     assert jnp.isfinite(eqx.filter_jit(lambda e: Warped(Gabor(), Power())(e, e))(eigenvalues)).all()
 
 
-# The next tests compare banks with an independent toolbox. Their tables state every difference in convention.
+# The next tests compare banks with an independent toolbox. Their tables convert between the conventions.
 
 PARSEVAL_FACTOR = np.sqrt(9 / 8)  # the squared half cosines of the toolbox sum to 9/8
 
 
 def as_in_the_toolbox(lambda_max):
-    """Returns our banks by their toolbox names, with factors that convert our responses to the toolbox's."""
+    """Returns a dictionary from toolbox names to our banks and to factors that convert our responses."""
     # The toolbox normalises filters by a scale in units of 1 / lambda.
     scale_units = np.r_[1, np.full(5, 1 / np.sqrt(lambda_max))]
     logarithm = Logarithm(10 * lambda_max)
@@ -433,7 +432,7 @@ def test_the_logarithm_and_regular_equal_the_independent_toolbox(shared, lambda_
     grid = jnp.asarray(reference["x"])
     warped = Logarithm(10 * lambda_max)(grid, grid)
     np.testing.assert_allclose(warped, reference["warped_log_wf"], atol=1e-10)
-    # The toolbox returns the high-pass filter first. It computes the low-pass filter as sqrt(1 - high²),
+    # The toolbox returns the high-pass filter first. Its low-pass filter is computed as sqrt(1 - high²),
     # which has only half of the correct digits near zero.
     low, high = Regular()(grid, grid)
     np.testing.assert_allclose(high, reference["regular"][:, 0], atol=1e-10)

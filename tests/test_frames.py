@@ -134,7 +134,7 @@ def test_tightened_responses_vanish_with_the_frame_function():
     np.testing.assert_allclose(responses[0, passed], 1, atol=1e-15)
     slopes = jax.grad(lambda b, e: jnp.sum(tighten(b)(e, e)), argnums=(0, 1))(bank, EIGENVALUES)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
-    # These filters underflow far from their centres. Their squares underflow already closer to the centres.
+    # These filters underflow far from their centres, and their squares underflow closer to the centres.
     narrow = Gabor(3, 0.007)
     points = jnp.asarray([0.0, 0.25, 0.3, 0.4, 0.49, 1.0])
     plain, tight = narrow(points, points), tighten(narrow)(points, points)

@@ -68,7 +68,7 @@ def test_kernel_is_the_sum_over_scales(pair):
 
 
 def stacked(pair, pointwise_map, convention, norm):
-    """Returns the input, output and weight of every vertex of X, as the definition of the energy states."""
+    """Returns the inputs, outputs and weights of all vertices of X in the definition of the energy."""
     x, y = pair
     p = permutation_matrix(pointwise_map)
     areas_x = np.asarray(x.vertex_areas)
@@ -144,7 +144,6 @@ def test_no_map_has_less_energy_than_the_minimizer(case):
 
 
 def test_minimizer_agrees_with_closed_forms(pair, pointwise_map):
-    """The minimiser agrees with four formulas that were derived separately."""
     x, y = pair
     g_x, g_y = (responses(spectrum, tight=False) for spectrum in pair)
     areas_x = np.asarray(x.vertex_areas)
@@ -205,10 +204,7 @@ def test_energies_add_and_scale():
 
 
 def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair, pointwise_map):
-    """Remark 4.1 of the MWP paper holds for any T in the pushforward convention with a Parseval frame.
-
-    The reason is that Phi_X is orthonormal.
-    """
+    """Remark 4.1 of the MWP paper holds for any T in the pushforward convention, as Phi_X is orthonormal."""
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)

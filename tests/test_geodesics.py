@@ -1,5 +1,3 @@
-"""Geodesic distances: closed forms, exact algorithms, the axioms of a metric, and difficult meshes."""
-
 import tracemalloc
 
 import numpy as np
@@ -376,7 +374,7 @@ def test_distances_between_points_on_a_flat_sheet_are_euclidean():
     expected = np.linalg.norm(points.positions(mesh) - others.positions(mesh), axis=1)
     distances = geodesic_distances_between(mesh, points, others)
     assert (distances - expected).min() > -1e-12
-    assert (distances - expected)[300:900].max() < 1e-12  # straight paths on equal or touching faces
+    assert (distances - expected)[300:900].max() < 1e-12  # straight paths: the faces share a vertex
     assert (distances / np.maximum(expected, 0.05) - 1).max() < 0.02
     np.testing.assert_allclose(geodesic_distances_between(mesh, others, points), distances, atol=1e-12)
     to_vertices = np.linalg.norm(points.positions(mesh)[:, None] - mesh.vertices, axis=2)

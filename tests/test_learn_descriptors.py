@@ -1,5 +1,3 @@
-"""The script that learns descriptors: invariances, resumed training, and complete files."""
-
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -114,7 +112,7 @@ def test_descriptors_do_not_depend_on_signs_of_eigenvectors(network, spectra):
     signs = jnp.where(jnp.arange(30) % 3 == 1, -1.0, 1.0)[None, :]
     flipped = eqx.tree_at(lambda s: s.eigenvectors, x, x.eigenvectors * signs)
     np.testing.assert_allclose(network(flipped), network(x), atol=1e-12)
-    # Descriptors do depend on the eigenvectors: fewer eigenvectors give other descriptors.
+    # The network uses the eigenvectors, so fewer eigenvectors give other descriptors.
     assert float(jnp.abs(network(x.truncate(5)) - network(x)).max()) > 1e-3
 
 
@@ -139,7 +137,7 @@ def test_nearest_descriptors_are_vertices_of_the_target(network, creatures, spec
 
 
 class InterruptedPreparation:
-    """Returns the prepared pair `left` times and then raises KeyboardInterrupt."""
+    """Returns the prepared pair `left` times, and raises KeyboardInterrupt in the next call."""
 
     def __init__(self, pair, left):
         self.pair, self.left = pair, left
@@ -157,10 +155,10 @@ def test_resumed_training_gives_the_same_result(network, pair, tmp_path, monkeyp
         (tmp_path / name).mkdir()
     whole = learn(network, pair, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        # The four prepared pairs serve one watched pair and three steps.
+        # Training prepares one watched pair and one pair for each of three steps before the interruption.
         learn(network, pair, tmp_path / "parts", prepare=InterruptedPreparation(pair, 4))
     assert [file.name for file in (tmp_path / "parts").iterdir()] == ["training_labels.eqx"]
-    again = InterruptedPreparation(pair, 5)  # for four steps and one watched pair
+    again = InterruptedPreparation(pair, 5)  # enough pairs for four steps and one watched pair
     resumed = learn(network, pair, tmp_path / "parts", prepare=again)
     assert again.left == 0
     for found, expected in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):

@@ -118,7 +118,7 @@ def test_files_of_big_endian_machines_are_read():
     parts = (6, (6, 0)), (5, (2, 1)), (9, np.array([3.5, -1], ">f8").tobytes())
     contents = [data if isinstance(data, bytes) else struct.pack(">2i", *data) for _, data in parts]
     elements = [struct.pack(">2I", kind, len(c)) + c for (kind, _), c in zip(parts, contents, strict=True)]
-    elements.insert(2, struct.pack(">2H", 1, 1) + b"x\0\0\0")  # the name, as a small element
+    elements.insert(2, struct.pack(">2H", 1, 1) + b"x\0\0\0")  # the name x as a small data element
     packed = zlib.compress(struct.pack(">2I", 14, sum(map(len, elements))) + b"".join(elements))
     data = HEADER[:124] + b"\x01\x00MI" + struct.pack(">2I", 15, len(packed)) + packed
     assert parse_variables(data)["x"].tolist() == [3.5, -1]

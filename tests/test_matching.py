@@ -1,5 +1,3 @@
-"""Matching one pair, from meshes to the correspondence."""
-
 import inspect
 import logging
 from dataclasses import replace
@@ -149,7 +147,7 @@ def compilations():
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["fast", "accurate", replace(STAGE, stop_when_unchanged=True)], ids=str)
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
-    """Refinement runs the programs that were compiled ahead from the shapes of the arrays."""
+    """Refinement uses the programs that `match` compiles ahead of time."""
     jax.clear_caches()
     found = match(*pair[:2], preset=preset)
     assert compilations.count("jit(refine)") == len(found.preset.stages)
@@ -258,7 +256,7 @@ def test_landmarks_are_matched_to_each_other(pair):
         ),
         (
             {"preset": replace(STAGE, number_of_samples=150)},
-            lambda found: found.refinement.history.pointwise_maps is None,  # which holds only for samples
+            lambda found: found.refinement.history.pointwise_maps is None,  # as always on samples
         ),
         ({"preset": "accurate"}, lambda found: len(found.preset.stages) == 3 and found.distortion < 1.05),
         ({"preset": "paper"}, lambda found: found.functional_map.shape == (100, 100)),
@@ -279,7 +277,7 @@ def test_every_option_has_its_effect(pair, options, is_as_requested):
 
 
 def multiplies(found: Correspondence, bank: FilterBank) -> bool:
-    """Whether the last functional map is a product with the kernel of the bank, as in eq. (8) of the paper."""
+    """Return whether filtering with the bank (equation (8) of the MWP paper) gives the last map."""
     x, y = found.spectrum_x, found.spectrum_y
     before = jnp.asarray(found.refinement.history.pointwise_maps[-2])
     kernel = multiscale_kernel(*(bank(s.eigenvalues, s.eigenvalues) for s in (x, y)))
@@ -408,8 +406,7 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
         monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *spectra))
     assert len(starts) == 3
-    # For spectra with descriptors, pairings of extremities give further initial maps. This body gives only
-    # one.
+    # If spectra have descriptors, pairings of extremities give further initial maps. This body has one.
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
     without = RepairSettings(alternatives=())
@@ -419,7 +416,7 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
     usual = initial_map(Pair(mesh_x, mesh_y), *spectra)
     for start in starts:
         assert start.dtype == np.int64 and start.shape == truth.shape
-        # Maps from a filtered functional map are smoother than maps from nearest neighbours.
+        # A filtered functional map gives a smoother map than nearest neighbours.
         assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, usual, truth)
     if thinned:  # otherwise all maps are nearly exact
         assert all(np.any(a != b) for a, b in combinations(starts, 2))
@@ -443,7 +440,6 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
 
 @pytest.mark.slow
 def test_the_functional_initial_map_is_better_than_nearest_neighbours(pair):
-    """From the same descriptors, a functional map gives better matches than nearest neighbours."""
     mesh_x, mesh_y, truth = pair
     spectra = [compute_spectrum(mesh, 30) for mesh in (mesh_x, mesh_y)]
     nearest, functional = (

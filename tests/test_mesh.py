@@ -1,4 +1,4 @@
-"""Meshes are checked and cleaned, have correct properties, survive all file formats, and refuse bad files."""
+"""Meshes are checked and cleaned, have correct properties, and keep their data in all file formats."""
 
 import dataclasses
 import errno
@@ -147,7 +147,6 @@ def test_invalid_arrays_are_refused_in_one_sentence(vertices, faces, fault, weld
 
 @pytest.mark.parametrize("scale", [1e-20, 1, 1e20])
 def test_distant_vertices_are_accepted_within_the_limits(scale):
-    """The cases are a mesh far from the origin, a distant unreferenced vertex, and a distant corner."""
     for vertices in (np.array(SQUARE) + 1e11, [*SQUARE, [1e11, 0, 0]], [*SQUARE[:3], [0, 1e5, 0]]):
         mesh = make_mesh(np.array(vertices) * scale, SQUARE_FACES)
         np.testing.assert_array_equal(mesh.vertices, np.array(vertices) * scale)
@@ -538,7 +537,7 @@ def test_files_written_by_trimesh_are_read(tmp_path, suffix):
     mesh = bumpy_grid(9)
     path = tmp_path / f"m.{suffix}"
     exporter = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert len(exporter.vertex_normals) == len(mesh.vertices)  # trimesh exports only computed normals
+    assert len(exporter.vertex_normals) == len(mesh.vertices)  # computes the normals for the export
     exporter.export(path)
     again = read_mesh(path)
     if suffix == "stl":

@@ -106,7 +106,7 @@ def test_all_methods_repair_a_noisy_initial_map():
 
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
-    """Other libraries get no padding and no unreferenced vertices, and their maps use our vertex numbers."""
+    """Other libraries receive no padding and no unreferenced vertices. Returned maps use our vertex numbers."""
     peers = installed_peers()
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")

@@ -144,7 +144,7 @@ def test_viewer_bundle_is_current_licensed_and_safe_to_embed() -> None:
     assets = ROOT / "jaxsmw" / "report" / "assets"
     viewer, license = (assets / "viewer.js").read_text("utf-8"), (assets / "THREE-LICENSE").read_text("utf-8")
     assert license.strip() in viewer and "MIT" in license
-    # The script must neither end its element early nor open a comment that hides the end tag.
+    # The script must not end the script element early, and must not open a comment that hides the end tag.
     assert "</script" not in viewer.lower() and "<!--" not in viewer
     # The bundle was built from the current viewer.js.
     source = (ROOT / "scripts" / "build_viewer" / "viewer.js").read_bytes()

@@ -1,4 +1,4 @@
-"""The energies of partial functional maps equal plain NumPy programs, and the method matches a cut shape."""
+"""The energies of partial functional maps agree with NumPy, and the method matches a cut shape."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -89,7 +89,7 @@ def test_fidelity_and_map_energy_are_those_of_the_paper():
 def test_weights_are_distances_from_a_slanted_diagonal():
     k_x, k_y = 4, 10
     weights = np.asarray(steps.slanted_weights(k_x, k_y))
-    # Our column i and row j are row i and column j of the paper.
+    # The matrix of the paper is the transpose of our matrix.
     normal = np.array([1, k_x / k_y, 0]) / np.hypot(1, k_x / k_y)
     for row in range(k_x):
         for column in range(k_y):
@@ -130,7 +130,7 @@ def test_derivatives_agree_with_finite_differences():
     v, along = (jnp.asarray(generator.random(n)) for _ in range(2))
     slope = (energy(v + 1e-6 * along) - energy(v - 1e-6 * along)) / 2e-6
     assert jnp.vdot(jax.grad(energy)(v), along) == pytest.approx(float(slope), rel=1e-5)
-    # Where a column or a gradient vanishes, the derivative of the norm is zero.
+    # Where the gradient of the function vanishes, the derivative of its norm must be zero, not NaN.
     assert (jax.grad(gradient.total_variation)(jnp.ones(n)) == 0).all()
 
 

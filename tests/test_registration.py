@@ -1,5 +1,3 @@
-"""Refinement by registration."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -278,7 +276,6 @@ def test_does_not_stop_before_the_last_level(pair):
 
 
 def test_a_single_constant_eigenvector_is_no_failure(pair):
-    """A mesh has such a spectrum if it has as many connected components as requested eigenvectors."""
     x, y, initial_map, *_ = pair
     found = refine(x.truncate(1), y.truncate(1), initial_map, refiner=Registration())
     assert found.result == RESULTS.successful and (np.asarray(found.pointwise_map) >= 0).all()

@@ -1,5 +1,3 @@
-"""Scores and expected errors of maps, which need no ground truth."""
-
 import igl
 import jax
 import numpy as np
@@ -111,7 +109,7 @@ def test_a_map_that_collapses_is_distorted(spectrum, mesh):
 
 
 def test_scattered_matches_are_no_distortion(spectrum, mesh):
-    """Independent errors of about one edge are no distortion, but a map of an arm to one vertex is."""
+    """Independent errors of about one edge cause no distortion, unlike a map of an arm to one vertex."""
     edge = np.sqrt(mesh.area / len(mesh.vertices))
     moved = mesh.vertices + edge * np.random.default_rng(0).normal(size=mesh.vertices.shape)
     _, rough = KDTree(mesh.vertices).query(moved)
@@ -183,7 +181,7 @@ def test_same_map_ignores_a_few_different_matches(mesh):
     )
     few = np.arange(len(mesh.vertices)) < 5
     assert same_map(Pair(mesh, mesh), identity, np.where(few, mirrored, identity))
-    # For a partial pair, distances on the small piece are small, because their unit is that of the full shape.
+    # Distances on the small piece of a partial pair are small, because their unit comes from the full shape.
     piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
     moved = np.empty_like(identity)
     moved[shift] = np.roll(shift, 40)
@@ -206,7 +204,7 @@ def test_lengths_on_a_partial_shape_use_the_unit_of_the_full_shape(mesh):
 
 
 def test_errors_on_a_partial_shape_are_in_its_own_unit(mesh, spectrum):
-    """The same displacements are larger relative to a partial target with a smaller area."""
+    """On a target with a smaller area, the same displacements are larger errors."""
     kept = mesh.vertices[:, 0] < 1
     old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
     part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))

@@ -102,7 +102,7 @@ def test_vmap_equals_a_loop():
 
 
 def test_search_never_stores_all_distances():
-    """All 50 000 x 50 000 distances would take 10 GB in float32. The program uses less than 2 % of that."""
+    """All 50 000 x 50 000 distances would take 10 GB in float32. The program uses less than 0.2 GB."""
     points = jax.ShapeDtypeStruct((50_000, 100), jnp.float32)
     memory = jax.jit(nearest_neighbor).lower(points, points).compile().memory_analysis()
     assert memory.temp_size_in_bytes < 200e6

@@ -74,7 +74,7 @@ def test_the_cost_is_close_to_the_cost_of_the_best_assignment():
     distances = cdist(queries, database, "sqeuclidean")
     least = distances[linear_sum_assignment(distances)].mean()
     more = np.sum(plan(soft) * distances) - least
-    # No plan with these marginals has a lower cost. The entropy in the objective is at most log 40.
+    # No plan with these marginals costs less than `least`. The entropy in the objective is at most log 40.
     assert -1e-4 * distances.max() < more < float(soft.temperature) * np.log(40) < 0.4 * least
 
 
@@ -168,7 +168,6 @@ def test_derivatives_agree_with_finite_differences():
 
 @pytest.mark.slow
 def test_iterations_converge_for_degenerate_points():
-    """The cases are single points, coinciding points, exact matches, and equal distances."""
     one, three = jnp.zeros((1, 2)), jnp.asarray([[0.0, 0], [1, 0], [0, 1]])
     for queries, database in (
         (one, one),

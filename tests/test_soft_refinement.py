@@ -1,5 +1,3 @@
-"""Soft recoveries and differentiable refinement have the right limits, derivatives, memory and failures."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -57,7 +55,7 @@ def test_softmax_follows_its_definition():
     expected = b_ * np.exp(-distances / temperature)
     expected /= expected.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(Softmax(0.7), queries, database, a, b), expected, atol=1e-12)
-    # NearestFew gives the same shares after all but the nearest rows are removed.
+    # NearestFew gives the same shares if all database rows except the nearest rows are removed.
     few = np.where(distances <= np.sort(distances, axis=1)[:, 4:5], expected, 0)
     few /= few.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(NearestFew(5, 0.7), queries, database, a, b), few, atol=1e-12)
@@ -270,7 +268,6 @@ def test_a_soft_initial_map_has_a_derivative(pair):
 
 
 def test_the_layer_learns_features_that_match(pair):
-    """Gradient descent through the layer turns random features into features that match."""
     x, y, _ = pair
     truth = jnp.argmin(jnp.sum((x.eigenvectors[:, None] - y.eigenvectors[None]) ** 2, axis=2), axis=1)
     layer = WaveletPreservationLayer(recovery_of_features=Softmax(1.0), recovery=Softmax(10.0), iterations=1)
@@ -489,7 +486,7 @@ def test_derivatives_exist_at_the_lowest_temperatures(pair, kind, dtype):
 
     differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
     one = jnp.asarray(1, dtype)
-    # At these temperatures, all soft maps equal nearest neighbours, so only the factor changes the result.
+    # At these temperatures, all soft maps equal nearest neighbours, so the temperature has no effect.
     value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
     for temperature in (1e-12, 1e-30, 1e-37):
         found, (in_temperature, in_factor) = differentiate(jnp.asarray(temperature), one)

@@ -401,7 +401,8 @@ def test_projected_descriptors_are_coefficients_and_symmetric_operators(pair):
     values = x.eigenvectors @ coefficients
     projected = DescriptorPair.project(values, values, x, x, operators=True)
     np.testing.assert_allclose(projected.x.coefficients, coefficients, atol=1e-12)
-    # Multiplication by a function is a symmetric matrix in the basis, and the identity for the function 1.
+    # In the eigenbasis, multiplication by a function is a symmetric matrix. For the constant function 1, this
+    # matrix is the identity.
     operators = projected.x.operators
     np.testing.assert_allclose(operators, operators.transpose(0, 2, 1), atol=1e-12)
     ones = jnp.ones((M, 1))

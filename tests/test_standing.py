@@ -1,4 +1,4 @@
-"""Bodies stand upright in pictures for every direction of the up axis in the file."""
+"""Bodies stand upright in pictures, whatever the up axis of their file is."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,7 @@ FROM_Y_UP = {
 
 
 def in_convention(mesh: Mesh, up: str) -> Mesh:
-    """Return a body in y-up coordinates in the coordinates of another convention."""
+    """Convert a body from y-up coordinates to the coordinates of another convention."""
     return replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[up].T)
 
 
@@ -67,7 +67,7 @@ def test_up_is_guessed_for_bodies_without_limbs() -> None:
     assert guess_up(Mesh(vertices, faces)) == "y"
     assert guess_up(Mesh(vertices[:, [0, 2, 1]], faces)) == "z"
     assert guess_up(Mesh(np.eye(3), np.array([[0, 1, 2]]))) == "z"
-    # A body without limbs counts as a person with y up if it is slender along y. Otherwise z is up.
+    # If a body without limbs is slender along y, it is treated as a standing person. Otherwise z is up.
     person, animal = np.array([0.4, 1, 0.3]), np.array([0.3, 0.6, 1])
     assert guess_up(ellipsoid(*person)) == "y" and guess_up(ellipsoid(*person[[0, 2, 1]])) == "z"
     assert guess_up(ellipsoid(*animal[[0, 2, 1]])) == "z"
@@ -123,7 +123,7 @@ def test_a_partial_shape_keeps_its_size_next_to_the_full_shape() -> None:
     assert shown_whole.area == pytest.approx(1) and shown_part.area == pytest.approx(part.area / TALL.area)
     assert np.array_equal(shown_whole.vertices, whole.vertices)
     assert stand_pair(TALL, part)[0].area == pytest.approx(TALL.area / part.area)
-    # A copy that is 1.2 times as large counts as a full shape. A copy that is 1000 times as large counts as a
-    # full shape in another unit. Both copies are scaled to area 1.
+    # A copy that is 1.2 times as large is treated as a full shape. A copy that is 1000 times as large is
+    # treated as a full shape in another unit. Both copies are scaled to area 1.
     for other in (1.2, 1000.0):
         assert stand_pair(replace(TALL, vertices=other * TALL.vertices), TALL)[0].area == pytest.approx(1)

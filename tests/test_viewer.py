@@ -414,14 +414,14 @@ def comparison(browser: Any, comparison_file: Path) -> Iterator[OpenPage]:
 def rounding(values: np.ndarray) -> np.ndarray:
     """Return a bound (n, k) on the rounding errors of the page's eigenvectors.
 
-    An error is at most half of the distance between adjacent levels, which grows with the value.
+    A rounding error is at most half of the distance between adjacent quantisation levels.
     """
     largest, half = np.abs(values).max(axis=0), 0.5 / 127
     return largest * (2 * half * np.sqrt(np.abs(values) / largest) + half**2) + 1e-6 * largest
 
 
 def wavelets(spectrum: Spectrum, vertex: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the wavelets of all scales around a vertex (filters, n), and bounds on their page errors."""
+    """Return the wavelets of all scales around a vertex (filters, n), and bounds on their errors."""
     responses = np.asarray(Meyer(FILTERS)(spectrum.eigenvalues, spectrum.eigenvalues))
     values = np.asarray(spectrum.eigenvectors)
     off = rounding(values)
@@ -477,7 +477,7 @@ def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[
     assert comparison.state["filter"] == FILTERS - 1
     assert comparison.find("#filter-name").text == f"wavelet {FILTERS - 1} of {FILTERS - 1} (narrowest)"
     assert all(differ(a, b) > 0.02 for a, b in pairwise(views))
-    # If a target vertex is picked, the source shows the wavelet around a vertex whose match is the picked one.
+    # If a target vertex is picked, the source shows the wavelet around a vertex that is matched to it.
     target = int(NUMBER[first])
     comparison.point_at(*comparison.place("y", target), click=True)
     exact, bound = wavelets(spectra[0], first)

@@ -144,8 +144,8 @@ def check_preset(options: argparse.Namespace) -> None:
 def preset_name(options: argparse.Namespace) -> PresetName:
     """Return the name of the preset to use.
 
-    Without `--preset`, the name is `paper` if an option changes the paper's method, and otherwise the name of
-    the default preset.
+    If `--preset` is not given, the preset is `paper` when the user sets an option of the paper's method.
+    Otherwise it is the default preset.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 

@@ -24,7 +24,7 @@ def run_command(arguments: Sequence[str]) -> int:
             _run(arguments)
         finally:
             flush_output()
-    except SystemExit as ending:  # from the parser, for help and bad arguments
+    except SystemExit as ending:  # The parser raises it after the help, and for bad arguments.
         return int(ending.code or 0)
     except InputError as error:
         say(f"jaxsmw: {error}")

@@ -113,6 +113,8 @@ def decode_to_triangles(
     **Returns:** A pair of arrays: for each vertex of X, the index of a triangle of Y, int32 (m,), and the
     barycentric weights of the three corners of this triangle (m, 3). The weights are not negative and sum to
     1.
+
+    **Raises:** `ValueError` for an unknown convention.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_point_on_triangles(queries, database, faces_y)

@@ -168,6 +168,10 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
 
     **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
 
+    Entries of a pointwise map are not checked: JAX replaces an index above n - 1 by n - 1, and counts a
+    negative index from the end. In particular, check `Refinement.result` first, because the map of a failed
+    refinement is -1 everywhere.
+
     **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
     """
     if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):

@@ -92,10 +92,9 @@ def run_benchmark(
 ) -> Results:
     """Runs every method on every pair, and stores the errors and times in CSV files.
 
-    A method is not run on a pair for which `output` already contains its result.
-
-    Each result is stored when it is available. If a shape or pair cannot be measured, the benchmark
-    continues with the remaining shapes and pairs.
+    A method is not run on a pair for which `output` already contains its result. Each new result is stored
+    when it is available. If a shape or pair cannot be measured, the benchmark continues with the remaining
+    shapes and pairs.
 
     **Arguments:**
 
@@ -108,8 +107,8 @@ def run_benchmark(
       measured with the same settings.
     - `executor`: the executor that runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
 
-    **Returns:** The `Results` of these pairs and methods. A shape or pair that could not be measured raises
-    no error here, but its error message is in `Results.failures`, and `Results.check` raises an error.
+    **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured, no error is
+    raised, but `Results.failures` contains the error message, and `Results.check` raises an error.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
     data, settings or software versions; if another process is adding results to `output`; if a method
@@ -180,9 +179,10 @@ class _Store:
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns a dictionary from the names of pairs to tasks, which contain the methods without results.
+        """Returns a dictionary from the names of pairs to tasks.
 
-        Pairs for which every method has a result are left out.
+        The task of a pair contains the methods that have no result for this pair. Pairs for which every
+        method has a result are left out.
         """
         tasks = {}
         for pair in self.pairs:

@@ -26,18 +26,19 @@ from jaxsmw.io.mesh_files import MESH_SUFFIXES
 class DataPair:
     """A pair of shapes in a data set: their names, their mesh files, and the files of their ground truth.
 
-    `open_data_set` creates the pairs of a data set. The method `ground_truth` reads the ground truth.
+    `open_data_set` creates the pairs of a data set. The method `ground_truth` reads the files of the ground
+    truth, and returns a `GroundTruth`.
 
     **Attributes:**
 
     - `source`, `target`: the names of the source X and the target Y.
-    - `source_file`, `target_file`: the mesh files of X and Y.
-    - `truth`: the ground-truth files, as `read_ground_truth` accepts them. The tuple is empty if vertex i of
-      X corresponds to vertex i of Y.
-    - `mirrored_truth`: the files of the left-right mirrored ground truth, as `read_ground_truth` accepts
-      them; None if the data set has no mirrored ground truth.
-    - `index_base`: the index of the first vertex in these files, 0 or 1; None for the default of their
-      format.
+    - `source_file`, `target_file`: the paths of the mesh files of X and Y.
+    - `truth`: a tuple with the paths of the one or two ground-truth files, in a format that
+      `read_ground_truth` reads. If the tuple is empty, vertex i of X corresponds to vertex i of Y.
+    - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth, in which left and
+      right are exchanged; None if the data set has no mirrored ground truth.
+    - `index_base`: the index of the first vertex in the ground-truth files, 0 or 1; None for the default of
+      their format.
     - `partial`: whether X is a partial shape of Y. Both meshes then have the same unit of length.
     """
 
@@ -52,7 +53,7 @@ class DataPair:
 
     @property
     def name(self) -> str:
-        """The names of both shapes, for messages and progress bars."""
+        """The text "SOURCE to TARGET" with the names of both shapes."""
         return f"{self.source} to {self.target}"
 
     @property
@@ -73,7 +74,8 @@ class DataPair:
         - `mesh_x`, `mesh_y`: the meshes of X and Y, as read from `source_file` and `target_file`.
         - `mirrored`: whether to return the mirrored ground truth instead of the direct ground truth.
 
-        **Returns:** A `GroundTruth`, with the true points on Y of vertices of X.
+        **Returns:** A `GroundTruth`, with vertices of X (`source_vertices`) and their true points on Y
+        (`targets`).
 
         **Raises:** `InputError` if a ground-truth file cannot be read or does not fit the meshes; if
         `mirrored` is True, but `mirrored_truth` is None; or if `truth` is empty, but X and Y have different
@@ -89,7 +91,7 @@ class DataPair:
         m, n = len(mesh_x.vertices), len(mesh_y.vertices)
         if m != n:
             raise InputError(
-                f"{self.target_file}: has {n} vertices where {self.source_file} has {m}, but in this data "
+                f"{self.target_file}: has {n} vertices and {self.source_file} has {m}, but in this data "
                 "set vertex i of one shape corresponds to vertex i of the other: use the original mesh files."
             )
         return GroundTruth.of_all_vertices(np.arange(m))
@@ -99,17 +101,17 @@ class DataPair:
 class DataSet:
     """A data set: the shapes and pairs in a directory, as `open_data_set` returns them.
 
-    The property `name` is the name of the directory. The property `shapes` is a dictionary from the names of
-    all shapes to their mesh files.
+    The property `name` is the name of the directory. The property `shapes` is a dictionary from the name of
+    each shape that occurs in a pair to the path of its mesh file.
 
     **Attributes:**
 
-    - `directory`: the directory that contains the files.
+    - `directory`: the path of the directory that contains the files.
     - `layout`: the name of the recognised layout: `"a remeshed set"`, `"SHREC'19 humans"`,
       `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"FAUST registrations"`, `"SCAPE"` or `"TOSCA"`.
     - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
-      tuple has the order of the list.
-    - `others`: further pairs with ground truth, which are not in `pairs`.
+      tuple contains the listed pairs in the order of the list.
+    - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`.
     """
 
     directory: Path
@@ -124,7 +126,7 @@ class DataSet:
 
     @property
     def shapes(self) -> dict[str, Path]:
-        """The mesh files of all shapes that occur in pairs, as a dictionary by name of the shape."""
+        """A dictionary from the name of each shape that occurs in a pair to its mesh file."""
         found = {}
         for pair in (*self.pairs, *self.others):
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
@@ -134,12 +136,14 @@ class DataSet:
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     """Opens a data set, and recognises its layout from its files.
 
-    The function recognises the following layouts. NAME, I, J and NNN are parts of file names.
+    The function recognises the following layouts. NAME, I, J, NN and NNN denote parts of file names.
 
     - **Remeshed sets** (FAUST, TOSCA, SCAPE and others; Ren et al. 2018): one folder (`off/`, `shapes/`, …)
-      contains the meshes. For each mesh, `corres/` contains a file `NAME.vts` and optionally `NAME.sym.vts`.
-    - **SHREC'19 humans** (Melzi et al. 2019): the meshes are `1.obj`, …, and a folder `FARMgt_txt` contains a
-      file `I_J.txt` for each pair. The remeshed version has files `I_J.map` in `corres/` instead.
+      contains the meshes. For each mesh, `corres/` contains a file `NAME.vts`, and optionally a file
+      `NAME.sym.vts` for the mirrored ground truth.
+    - **SHREC'19 humans** (Melzi et al. 2019): the meshes are `1.obj`, `2.obj`, …, and a folder `FARMgt_txt`
+      contains a file `I_J.txt` for each pair. In the remeshed version, a folder `corres` contains files
+      `I_J.map` instead.
     - **SHREC'16 partial** (Cosmo et al. 2016): `null/` contains the full shapes, and `cuts/` or `holes/`
       contain the partial shapes. In each pair a partial shape is the source, and its full shape is the
       target.
@@ -152,14 +156,15 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
     If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line), the
     attribute `pairs` of the result contains the listed pairs. Otherwise `pairs` contains all ordered pairs of
-    different shapes with ground truth. If the names of shapes contain a class (`cat0`, `cat1`), both shapes
-    of such a pair belong to the same class.
+    different shapes with ground truth. In remeshed sets and in TOSCA, these are only pairs within a class.
+    The class of a shape is its name without the number at the end, for example `cat` for `cat0`.
 
     **Arguments:**
 
-    - `directory`: the directory of one unpacked data set.
+    - `directory`: the path of the directory of one unpacked data set.
 
-    **Returns:** A `DataSet`.
+    **Returns:** A `DataSet`. Its attribute `pairs` is a tuple of `DataPair`, and its property `shapes` is a
+    dictionary from the names of shapes to their mesh files.
 
     **Raises:** `InputError` if the directory does not exist, has no known layout, lacks a file, cannot be
     read, or contains several data sets.
@@ -226,23 +231,23 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _meshes(directory: Path) -> dict[str, Path]:
-    """Returns the mesh files in a directory, as a dictionary by name, in the order of `_natural`."""
+    """Returns a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
     found: dict[str, Path] = {}
     for file in sorted(files, key=lambda file: MESH_SUFFIXES.index(file.suffix.lower())):
-        # If a shape has files in several formats, the file whose suffix comes first in MESH_SUFFIXES is used.
+        # If a shape has files in several formats, the first suffix in MESH_SUFFIXES takes precedence.
         found.setdefault(file.stem, file)
     return {name: found[name] for name in sorted(found, key=_natural)}
 
 
-# The pairs to match, and further pairs with ground truth.
+# The lists `pairs` and `others` of a `DataSet`.
 _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Returns the mesh files whose names match a pattern, as a dictionary by name.
+    """Returns a dictionary from the names of meshes that match a pattern to the mesh files.
 
     All files come from the same folder: the directory itself if it contains such a mesh, or otherwise the
     first folder below it that contains such a mesh.
@@ -256,7 +261,7 @@ def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """Returns the pairs in the list that a data set contains, or None if it contains no list."""
+    """Returns the names in the list of pairs that a data set contains; None if it contains no list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
     if not lists:
         return None
@@ -266,15 +271,16 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
     """Reads a list of pairs of shapes.
 
-    Each line has the names of the source and the target, separated by spaces, a comma or a semicolon. Text
-    after `#` is a comment.
+    Each line contains the names of the source and the target, separated by spaces, a comma or a semicolon.
+    Text after `#` is a comment.
 
     **Arguments:**
 
     - `path`: the text file.
     - `shapes`: the names of all shapes of the data set.
 
-    **Returns:** The names of the source and the target of each pair, in the order of the file.
+    **Returns:** One tuple for each pair, with the names of its source and its target, in the order of the
+    file.
 
     **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if the
     file names no pair.
@@ -283,7 +289,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     try:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}): give a text file of pairs.") from error
+        raise InputError(f"{path}: cannot be read as text ({error}): give a list of pairs.") from error
     for number, line in enumerate(lines, start=1):
         names = re.split(r"[,;\s]+", line.partition("#")[0].strip())
         if names == [""]:
@@ -304,9 +310,10 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     **Arguments:**
 
     - `data_set`: the data set.
-    - `wanted`: the choice, in one of three forms. A number, as text, draws this many pairs at random without
-      replacement, or all pairs if the data set has fewer. A path chooses the pairs that a text file lists
-      (see `read_pairs`); repeated pairs are used once. If None, all pairs of the data set are chosen.
+    - `wanted`: a number of pairs, the path of a list of pairs, or None. If `wanted` is the text of a number,
+      this many pairs are drawn at random without replacement. If the data set has fewer pairs, all pairs are
+      chosen. If `wanted` is a path, the pairs in this text file are chosen (see `read_pairs`), and repeated
+      pairs are chosen once. If `wanted` is None, all pairs of the data set are chosen.
     - `seed`: the seed of the random draw.
 
     **Returns:** The chosen pairs, in the order of the data set or, if a path is given, of the text file.
@@ -455,9 +462,10 @@ def _topology(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Returns a function that opens data sets without ground-truth files, given a pattern of mesh names.
+    """Returns a function for `_LAYOUTS` that opens data sets whose mesh names match the pattern `names`.
 
-    In these data sets vertex i of one shape corresponds to vertex i of the other shapes of its class.
+    These data sets have no ground-truth files, because vertex i of one shape corresponds to vertex i of every
+    other shape of its class.
     """
     pattern = re.compile(names)
 
@@ -477,7 +485,7 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     return open_layout
 
 
-# The function of each layout returns the pairs of a directory, or None if the directory has another layout.
+# Each function returns the pairs of a directory, or None if the directory has another layout.
 _LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
     "a remeshed set": _remeshed,
     "SHREC'19 humans": _shrec19,

@@ -1,4 +1,4 @@
-"""Ground truth, and a reader for its common file formats.
+"""Ground truth, with a reader for common file formats and a writer.
 
 `jaxsmw.io.map_files` parses the files. By default, the format of a file determines whether its vertices are
 counted from 0 or from 1.
@@ -32,14 +32,15 @@ _WEIGHT_TOLERANCE = 1e-4
 class GroundTruth:
     """The ground truth of a pair: the true points on Y of some or all vertices of X.
 
-    `read_ground_truth` reads a ground truth from files. `GroundTruth.of_all_vertices` creates the ground
-    truth of all vertices of X.
+    `read_ground_truth` reads a ground truth from files. `GroundTruth.of_all_vertices(targets)` creates a
+    ground truth from the true points of all vertices of X.
 
     **Attributes:**
 
     - `source_vertices`: 0-based vertices of X (p,), as int64. A vertex may occur several times or not at all.
-    - `targets`: the true point of each source vertex, as p vertices of Y (0-based, int64) or as p
-      `SurfacePoints` on Y. A surface point consists of a triangle and three barycentric weights.
+    - `targets`: the true point on Y of each source vertex. The true points are either p vertices of Y (an
+      int64 array of 0-based vertices), or p `SurfacePoints` on Y. A surface point consists of a triangle and
+      three barycentric weights.
 
     **Raises:** `InputError` if the number of source vertices differs from the number of targets.
     """
@@ -63,10 +64,10 @@ class GroundTruth:
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-        """Returns a map X -> Y (m,): each vertex takes the target of the nearest vertex with ground truth.
+        """Extends the ground truth to a map X -> Y (m,) of all vertices of X, as 0-based vertices of Y.
 
-        Nearest vertices are found by the Euclidean distance between vertices of `mesh_x`. The map contains
-        0-based vertices of Y.
+        Each vertex of X receives the target of the nearest vertex that has ground truth. Nearest vertices are
+        found by the Euclidean distance between vertices of `mesh_x`.
 
         **Raises:** `InputError` if the targets are `SurfacePoints` and not vertices.
         """
@@ -88,8 +89,9 @@ def read_ground_truth(
     The number of files, their suffix and their number of columns determine the format:
 
     - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
-      line contains one vertex, counted from 1. Line i of both files describes the same point. Two files with
-      other suffixes have the same format, but their vertices are counted from 0 (from 1 in `.mat` files).
+      line contains one vertex, counted from 1. The vertices in line i of both files correspond to each other.
+      Two files with other suffixes have the same format, but their vertices are counted from 0 (from 1 in
+      `.mat` files).
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
       source, as a face of the target and three barycentric weights. Faces are counted from 1.
     - One file with two columns: each line contains a vertex of the source and its target vertex, both counted
@@ -101,13 +103,14 @@ def read_ground_truth(
 
     **Arguments:**
 
-    - `paths`: one file, or a sequence of two files.
-    - `mesh_x`, `mesh_y`: the meshes of the source X and the target Y.
+    - `paths`: the path of one file, or a sequence of one or two paths.
+    - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
     - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
       default), the index base of the format is used, as listed above.
 
-    **Returns:** A `GroundTruth` without the vertices of X that no face references. If such vertices are left
-    out, a warning gives their number.
+    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are p
+    vertices of Y, or p `SurfacePoints` if the file has the format `.baryc_gt`. Vertices of X that no face
+    references are left out, and a `UserWarning` states their number.
 
     **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
     message names the file, the line and the fault.
@@ -138,7 +141,7 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         tables = [Table(file, columns=1) for file in files]
         if tables[0].rows != tables[1].rows:
             raise InputError(
-                f"{files[1]}: has {tables[1].rows} lines where {files[0]} has {tables[0].rows}, "
+                f"{files[1]}: has {tables[1].rows} lines and {files[0]} has {tables[0].rows}, "
                 "but line i of both files must describe the same point: give two files of one data set."
             )
         bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
@@ -147,7 +150,7 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
 
     (file,) = files
     if file.suffix == ".vts":
-        raise InputError(f"{file}: is one half of a pair: give the .vts files of both source and target.")
+        raise InputError(f"{file}: describes only one shape: give the .vts files of both source and target.")
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
         table = Table(file, columns=4)
         table.require_rows(mesh_x)
@@ -177,8 +180,8 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
     - `path`: the file to create or to replace. `read_ground_truth` recognises its format by the suffix
       `.baryc_gt`.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-    - `mesh_y`: the target Y. The written faces are numbered as in the mesh file of Y, which also counts faces
-      that were dropped when the mesh was read.
+    - `mesh_y`: the target Y, a `Mesh`. The written faces have the numbers of the mesh file of Y, counted
+      from 1. This numbering includes faces that were dropped when the mesh was read.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.
@@ -200,7 +203,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
     """Returns a column of a table as 0-based faces of a mesh.
 
-    The file also counts faces that were dropped when the mesh was read.
+    The numbers in the file include faces that were dropped when the mesh was read.
     """
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)

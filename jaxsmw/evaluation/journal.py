@@ -1,6 +1,6 @@
-"""Result files that remain usable after an interruption at any time.
+"""Result files that remain usable if the program is interrupted at any time.
 
-A directory never mixes results that were measured with different settings or software versions.
+All results in a directory are measured with the same settings and software versions.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
-"""A row of a journal: a dictionary from column names to values. Values from a file are text."""
+"""A row of a journal: a dictionary from column names to values. In rows from a file, all values are text."""
 
 Columns = Mapping[str, Callable[[str], Any]]
-"""The columns of a journal in order: a mapping from their names to functions that parse their values.
+"""A mapping from the names of a journal's columns, in order, to functions that parse the values of a column.
 
 Such a function takes the text of a value, and raises `ValueError` if the text is invalid.
 """
@@ -33,17 +33,16 @@ Such a function takes the text of a value, and raises `ValueError` if the text i
 class Journal:
     """A CSV file to which whole rows are appended.
 
-    `key in journal` checks whether the journal has a row with this key, and `journal[key]` returns the row.
-    The values of keys are compared as text. If a process was killed while it wrote a line, the unfinished
-    line is removed when the file is opened again.
+    The key of a row is the tuple of its values in the key columns, compared as text. `key in journal` checks
+    whether the journal contains a row with this key, and `journal[key]` returns the row. If a process was
+    killed while it wrote a line, the unfinished line is removed when the file is opened again.
 
     **Arguments:**
 
     - `path`: the file, which need not exist yet.
-    - `key`: the names of the columns that identify a row. If two rows have the same key, the second row is
-      ignored.
-    - `columns`: the columns that the file must have, each with the function that checks its values. If None,
-      the file may have any columns that include the columns of `key`.
+    - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
+    - `columns`: a mapping from the names of the columns that the file must have to the functions that check
+      their values. If None, the file may have any columns that include the key columns.
 
     **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. The
     file is then not changed.
@@ -117,9 +116,9 @@ class Journal:
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrites the file with one row for each of `keys`, in the order of `keys`, and removes other rows.
+        """Rewrites the file with the rows of `keys` only, in the order of `keys`.
 
-        The order of appended rows is arbitrary, because workers finish their tasks in an arbitrary order.
+        Before this call the order of rows is arbitrary, because workers finish tasks in an arbitrary order.
 
         **Raises:** `KeyError` if the journal has no row for a key; `InputError` if the file cannot be
         written.
@@ -185,17 +184,20 @@ def claimed_directory(
     """Locks a directory against other processes while results are added.
 
     The function is a context manager, and releases the lock at the end of the `with` block. The first call
-    for a directory writes `provenance` to the file `provenance.json`. Later calls check that their
-    `provenance` has the same contents.
+    for a directory writes `provenance` to the file `provenance.json`. Later calls check that their argument
+    `provenance` equals the stored provenance.
 
     **Arguments:**
 
     - `directory`: an existing directory.
-    - `provenance`: groups of settings and versions that must be the same for all results in the directory.
-    - `noted`: further information that the first call writes to the file. It may differ in later calls.
+    - `provenance`: a dictionary from the names of groups, such as `"settings"`, to dictionaries from names to
+      values. These values must be the same for all results in the directory.
+    - `noted`: a dictionary of further information that the first call writes to the file. In later calls, it
+      may differ.
 
     **Raises:** `InputError` if the directory contains results with another `provenance` or without
-    `provenance.json`, if `provenance.json` is damaged, or if another process is adding results.
+    `provenance.json`, if `provenance.json` is damaged, if the directory cannot be locked, or if another
+    process is adding results.
     """
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)

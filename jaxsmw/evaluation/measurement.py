@@ -1,4 +1,4 @@
-"""The two kinds of tasks of a benchmark: the precomputation of a shape, and the measurement of a pair."""
+"""The tasks of a benchmark: the precomputation for one shape, and the measurement of methods on one pair."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ Geodesic errors and thresholds are in units of the square root of the area of Y.
 
 
 def read_curve(text: str) -> list[float]:
-    """Parses a correspondence quality curve: for each threshold in `CURVE`, the share of errors up to it.
+    """Parses a correspondence quality curve, as it is stored in `results.csv`.
 
     **Arguments:**
 
-    - `text`: the shares, separated by spaces.
+    - `text`: one share for each threshold in `CURVE`, separated by spaces.
 
-    **Returns:** The shares, one for each threshold.
+    **Returns:** The shares of points with an error of at most each threshold, as a list of numbers.
 
     **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """
@@ -77,10 +77,11 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(FIGURES, float),
     "curve": read_curve,
 }
-"""The columns of `results.csv`, each with the function that parses its text.
+"""A dictionary from the name of each column of `results.csv` to the function that parses its values.
 
-The file has one row for each pair and method. `seconds` is the wall time from the initial map to the final
-map, without compilation. `truth` names the ground truth that was used, `direct` or `mirrored`.
+The file contains one row for each pair and method. `result` is `successful`, or a sentence that explains why
+the method failed. `seconds` is the wall time from the initial map to the final map, without compilation.
+`truth` is the ground truth with which the errors were computed, `direct` or `mirrored`.
 """
 
 SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
@@ -90,9 +91,10 @@ SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
     "seconds_spectrum": float,
     "seconds_descriptors": float,
 }
-"""The columns of `shapes.csv`, each with the function that parses its text.
+"""A dictionary from the name of each column of `shapes.csv` to the function that parses its values.
 
-The file has one row for each shape. `digest` is a hash of the mesh file.
+The file contains one row for each shape. `digest` is a hash of the mesh file. `seconds_spectrum` and
+`seconds_descriptors` are the wall times of the precomputation.
 """
 
 
@@ -102,11 +104,12 @@ class Settings:
 
     **Attributes:**
 
-    - `init`: the initial map from which all methods start: the name of an initial map (see `jaxsmw.match`),
-      or a directory with initial maps in files `X_Y.map`.
-    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. The errors
-      are then stored for the ground truth with the smaller mean error. This setting is for methods and
-      initial maps that cannot tell left from right.
+    - `init`: the initial map from which all methods start. It is the name of an initial map, `"shot"`
+      (default), `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see `jaxsmw.match`), or a directory with
+      initial maps in files named `X_Y.map`.
+    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If so, the
+      stored errors are those with the smaller mean. Use this setting for methods and initial maps that do not
+      distinguish left from right.
     - `evaluated_points`: the number of rows of each ground truth that are evaluated. The rows are the same
       for all methods. If None, all rows are evaluated.
     - `seed`: the seed of the random draw of these rows.
@@ -143,7 +146,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Task:
-    """A pair, and the methods to run on this pair, as a dictionary from names to methods."""
+    """A task of a benchmark: to run several methods on one pair.
+
+    **Attributes:**
+
+    - `pair`: the pair.
+    - `methods`: a dictionary from the names of the methods to the methods.
+    """
 
     pair: DataPair
     methods: dict[str, Method]
@@ -170,7 +179,7 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
     - `shape`: the name of the shape and its mesh file.
     - `number_of_eigenvectors`: the number of eigenvectors of the spectrum.
 
-    **Returns:** One row with `SHAPE_COLUMNS`; times are in seconds.
+    **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`. Times are in seconds.
 
     **Raises:** `InputError` if the file cannot be read, or if its spectrum or descriptors cannot be computed.
     """
@@ -194,11 +203,11 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
     - `task`: the pair and the methods.
     - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors of the spectra, at least the largest number that a
-      method uses.
+    - `number_of_eigenvectors`: the number of eigenvectors that are computed for each shape, at least as many
+      as any method of the task uses.
 
-    **Returns:** One row with `RESULT_COLUMNS` for each method. If a method failed, all statistics of its map
-    are NaN.
+    **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. If a method
+    failed, all statistics of its map are NaN.
 
     **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
@@ -231,7 +240,7 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
     """Runs a method, and returns its map, its status code (`RESULTS`) and its wall time in seconds.
 
-    The time does not include compilation. For published maps the time is NaN.
+    The time does not include compilation. For maps that are read from files, the time is NaN.
     """
     for _ in range(2):
         with _CompilationClock() as compilation, one_blas_thread():
@@ -241,7 +250,7 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
         # The first run of a method takes longer than later runs, for example because of imports, so the
-        # method runs a second time. If the first run is long, the difference is negligible.
+        # method runs a second time. This difference is negligible if the first run takes long.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
@@ -275,9 +284,10 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Returns the statistics of a map, for the ground truth with the smallest mean error.
+    """Returns the statistics of a map, computed with the ground truth for which the mean error is smallest.
 
-    If the method failed, all statistics are NaN.
+    `truths` is a dictionary from `"direct"` and, if requested, `"mirrored"` to a ground truth. If the method
+    failed, all statistics are NaN.
     """
     if (pointwise_map < 0).any():
         return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}

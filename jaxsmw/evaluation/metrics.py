@@ -20,7 +20,7 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# For each of `THRESHOLDS`, reports contain the share of points whose error is at most this threshold. Reported
+# For each of `THRESHOLDS`, reports contain the share of points with at most this error. Reported
 # correspondence quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the
 # target's area.
 THRESHOLDS = (0.02, 0.05, 0.1)
@@ -71,10 +71,7 @@ class GeodesicError:
 
     @property
     def within(self) -> dict[float, float]:
-        """A dictionary from the thresholds 0.02, 0.05 and 0.1 to the shares of points with at most this error.
-
-        Shares are numbers from 0 to 1.
-        """
+        """A dictionary from the thresholds 0.02, 0.05, 0.1 to the share of points with at most this error."""
         shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
         return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
 
@@ -200,7 +197,7 @@ def geodesic_error(
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Returns the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
-    Each vertex of Y that matches at least one vertex of X contributes its vertex area, a third of the area of
+    Each vertex of Y that is the match of a vertex of X contributes its vertex area, a third of the area of
     the triangles around this vertex. The coverage is in [0, 1], and needs no ground truth.
 
     **Arguments:**

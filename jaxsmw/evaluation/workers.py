@@ -64,9 +64,9 @@ class Workers(ProcessPoolExecutor):
 class _OneCoreProcess(SpawnProcess):
     """A process that is limited to one core.
 
-    The environment variables that set this limit must exist before the process starts, because NumPy and JAX
-    read them only once, on import. A worker imports the main module of the calling program before it runs any
-    function of this library. This main module may import NumPy and JAX.
+    The environment variables that set this limit must exist before the process starts. NumPy and JAX read
+    these variables only once, on import, and the worker imports them early if the main module of the calling
+    program does.
     """
 
     def start(self) -> None:
@@ -94,7 +94,7 @@ def _one_thread_flags() -> str:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables while a process starts, which takes milliseconds, then restores them."""
+    """Sets environment variables within the `with` block, and restores the previous values at its end."""
     with _starting:
         before = {name: os.environ.get(name) for name in variables}
         os.environ.update(variables)
@@ -129,7 +129,7 @@ def _start_worker() -> None:
 
 
 def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Calls a function in a worker, after the release of compiled programs if they use too much memory.
+    """Releases compiled programs in a worker if they use too much memory, then calls a function.
 
     A worker processes many pairs of different sizes, and each size needs its own compiled programs.
     """
@@ -172,11 +172,11 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
         from distributed import Client
     except ImportError:
         raise InputError(
-            "--scheduler needs the package distributed of Dask: run pip install 'jaxsmw[cluster]'."
+            "--scheduler needs Dask's package distributed: run pip install 'jaxsmw[cluster]'."
         ) from None
     try:
-        # The port is checked before the client is created, because a client that fails without a port leaves
-        # threads that log errors later.
+        # The port is checked first, because the creation of a client for an address without a port fails and
+        # leaves threads that log errors later.
         if urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}").port is None:
             raise ValueError("the address has no port")
         client = Client(scheduler, timeout=5, set_as_default=False)
@@ -198,16 +198,16 @@ def run_tasks(
 
     - `function`: the function that is called once with each task. The function and the tasks must be
       picklable.
-    - `tasks`: a dictionary from names to tasks.
+    - `tasks`: a dictionary from the name of each task to the task, which is the argument of `function`.
     - `executor`: the executor that runs the calls; see `open_executor`.
 
-    **Yields:** The name of a task and its result, in the order in which the tasks end. If a task raised an
-    exception, the exception takes the place of the result.
+    **Yields:** A tuple for each task, with the name of the task and the result of `function`. If `function`
+    raised an exception, the tuple contains the exception instead of a result. The order is the order in which
+    the tasks end.
     """
     futures = {executor.submit(function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
-        # The future is removed from the dictionary, so that the memory of its result is freed after the
-        # result is yielded.
+        # The dictionary must not keep the future, because the future holds the result in memory.
         name = futures.pop(future)
         error = future.exception()
         yield name, future.result() if error is None else error

@@ -30,7 +30,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 
-# The number of edges that a straight line of the graph may cross.
+# A straight line of the graph may cross at most this number of edges of the mesh.
 _DEPTH = 10
 
 # The number of sides from which strips are unfolded together, and the number of distances that are stored

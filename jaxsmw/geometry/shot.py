@@ -129,8 +129,8 @@ def _describe(
     - `positions`, `normals`: the positions of all vertices, in units of the square root of the area, and
       their unit normals.
     - `block`: the vertices to describe.
-    - `center`, `neighbor`, `distance`: pairs of a vertex in the block and a neighbour. A pair is given by an
-      index into `block`, the neighbouring vertex, and the distance between both.
+    - `center`, `neighbor`, `distance`: pairs of a vertex in the block and a neighbour. A pair consists
+      of a vertex (as an index into `block`), one of its neighbours, and the distance between the two.
     - `radius`: the radius of the neighbourhoods, in the unit of the positions.
     """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)

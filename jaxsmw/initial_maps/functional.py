@@ -27,7 +27,7 @@ def functional_features(
 
     **Arguments:**
 
-    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
 
     **Returns:** The embeddings of X (m, k_X) and of Y (n, k_X), with one row per compared vertex.
 

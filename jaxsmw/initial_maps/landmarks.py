@@ -25,7 +25,7 @@ def landmark_features(
 
     **Arguments:**
 
-    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
     - `landmarks`: integers (l, 2), with a vertex of X and its match on Y in each row.
 
     **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex. The first 352
@@ -67,7 +67,7 @@ def distance_features(
 
     **Arguments:**
 
-    - `side`: the shape and its compared vertices, at which descriptors are compared.
+    - `side`: the shape, with its vertices at which descriptors are compared.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
     - `unit`: the unit of the returned distances, as a length in the unit of the mesh; see
       `Pair.units_of_length`.

@@ -19,7 +19,7 @@ def nearest_map(
 
     **Arguments:**
 
-    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
     - `features_x`, `features_y`: the features (a, d) and (b, d), with one row per compared vertex.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
@@ -57,7 +57,7 @@ def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int
 
     **Arguments:**
 
-    - `sampled`: the pair and the compared vertices of both shapes, at which descriptors are compared.
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
     - `found`: for each compared vertex of X (a,), the 0-based number of a compared vertex of Y.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.

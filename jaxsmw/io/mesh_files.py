@@ -409,7 +409,8 @@ def _ply_table(
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
     """Return where the values of a row are stored, and the offset of the row's end.
 
-    For each property of the row, the first result contains the offset and the number of its values.
+    The returned list has one entry for each property of the row: the offset of the property's first value,
+    and the number of its values.
 
     **Raises:** `EOFError` if the body ends within the row.
     """

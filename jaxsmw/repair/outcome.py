@@ -97,7 +97,7 @@ class Judge:
         return score(outcome, self.settings.uncertainty_weight)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
-        """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
+        """Return those faults of an outcome that repair can remove. Each is a mask of vertices of X (m,).
 
         One fault consists of the vertices with orientation reversal. The other fault consists of the vertices
         in discontinuous parts. A fault is not returned if its share of X's area is at most `negligible_area`

@@ -22,9 +22,9 @@ def largest_contents(size_of_file: int) -> int:
     """Return the largest plausible size of the unpacked contents of a compressed file, in bytes.
 
     A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to
-    1 GiB are always plausible, because a mesh of ten million vertices has this size. Larger contents can only
-    be eigenvectors. Compression hardly reduces their size, so contents of up to four times the size of the
-    compressed file are plausible.
+    1 GiB are always accepted, because a mesh of ten million vertices has this size. Only files of
+    eigenvectors have larger contents. Compression hardly reduces the size of eigenvectors, so larger
+    contents are accepted if they have at most four times the size of the compressed file.
 
     **Arguments:**
 

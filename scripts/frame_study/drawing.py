@@ -72,7 +72,11 @@ def _draw_differences(path: Path, study: Study, convention: Convention) -> None:
 
 
 def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings) -> None:
-    """Draw heat maps of the mean error. The rows are eigenvectors. The columns are filters or iterations."""
+    """Draw two heat maps of the mean error.
+
+    The first heat map shows the error against the numbers of eigenvectors and filters. The second heat map
+    shows the error against the numbers of eigenvectors and iterations.
+    """
     ks, filters = settings.parameter_eigenvectors, settings.parameter_filters
     iterations = range(1, settings.parameter_iterations + 1)
     errors = {}

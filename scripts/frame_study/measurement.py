@@ -136,7 +136,7 @@ def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
 
 
 def pad(spectrum: Spectrum) -> Spectrum:
-    """Pad a spectrum with masked vertices to a multiple of `_PADDING`."""
+    """Pad a spectrum with masked vertices up to the next multiple of `_PADDING`."""
     n = len(spectrum.mask)
     return spectrum.pad(n + -n % _PADDING)
 
@@ -158,8 +158,8 @@ class Diagnosis(NamedTuple):
 
     **Attributes:**
 
-    - `energy`: the energy of eq. (5) of the MWP paper in the area norm, for the last functional map and the
-      last pointwise map.
+    - `energy`: the energy of equation (5) of the MWP paper in the area norm, for the last functional map and
+      the last pointwise map.
     - `energy_of_zero`: the same energy for the functional map C = 0 and the last pointwise map.
     - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
       no least-squares problem.
@@ -246,7 +246,7 @@ def _follow(pair: MeasuredPair, maps: list[np.ndarray], successful: bool) -> Row
 def measure_parameters(
     pair: MeasuredPair, name: PairName, wanted: list[tuple[int, int]], settings: Settings
 ) -> list[Row]:
-    """Refine by filtering with the Meyer frame, for several numbers of eigenvectors and filters.
+    """Refine a pair by filtering with the Meyer frame, for several numbers of eigenvectors and filters.
 
     **Returns:** A row of `parameters.csv` for each combination, with the error after each iteration.
     """
@@ -280,11 +280,11 @@ def measure_invariance(
 ) -> list[Row]:
     """Compare the wavelets of both shapes around corresponding vertices, for each frame and scale.
 
-    The vectors a and b are the values of two such wavelets at corresponding points.
+    The vectors a and b contain the values of two such wavelets at corresponding points.
 
     **Returns:** Rows of `invariance.csv`. Each row contains the median correlation and the median relative
-    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. It is
-    0 for equal wavelets and sqrt(2) for unrelated wavelets.
+    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. This
+    difference is 0 for equal wavelets and sqrt(2) for unrelated wavelets.
     """
     banks = _frames(settings.number_of_filters)
     vertices = pair.sources, pair.targets
@@ -316,7 +316,7 @@ def wavelets(
 ) -> Float64[np.ndarray, "c n"]:
     """Return the wavelets of one scale around c vertices, as values at all n vertices of the shape.
 
-    The wavelets follow eq. (2) of the MWP paper. Scale 0 is the scaling function.
+    The wavelets are defined by equation (2) of the MWP paper. Scale 0 is the scaling function.
     """
     eigenvectors = np.asarray(spectrum.eigenvectors, dtype=float)
     response = np.asarray(bank(spectrum.eigenvalues, spectrum.eigenvalues)[scale], dtype=float)
@@ -364,7 +364,7 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
-    """Measure the time of the second update of every variant, and the time of a nearest-neighbour search.
+    """Measure the time of the second functional map of every variant, and of a nearest-neighbour search.
 
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """

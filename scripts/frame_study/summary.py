@@ -1,4 +1,4 @@
-"""Paired differences between variants with confidence intervals, and the tables of the study."""
+"""Computes paired differences between variants, and writes the tables of the study."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ class Comparison(NamedTuple):
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
     """Compare the errors of a variant with the errors of the default, pair by pair.
 
-    A NaN error means that the variant failed on the pair. Such a pair is counted as not better.
+    A NaN error means that the variant failed on the pair. On such a pair, the variant is counted as
+    not better than the default.
     """
     succeeded = np.isfinite(errors)
     differences = (errors - reference)[succeeded & np.isfinite(reference)]
@@ -112,12 +113,12 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """Return the difference from the default, or NaN if the variant is None or was not measured."""
+        """Return the mean paired difference from the default, or NaN if there are no measurements."""
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
-        """Return the mean difference, as text, between two variants over the pairs on which neither failed.
+        """Return, as text, the mean difference between two variants over the pairs on which neither failed.
 
         The text also states the number of pairs on which at least one of the variants failed.
         """
@@ -127,7 +128,7 @@ class Study:
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """Return the mean of E(C) / E(0). This ratio makes frames of different heights comparable."""
+        """Return the mean energy ratio E(C) / E(0), which is comparable between frames of all heights."""
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")
@@ -187,8 +188,8 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             f"search, which takes {search:.0f} ms. The table states the median over several runs on one "
             "core, for one pair of each data set.",
             "**condition**: the condition number of the first least-squares problem. For the regularized "
-            "update, the problem is its wavelet term. The table states the median over the pairs. In float32, "
-            "a matrix with a condition number above 10⁵ is numerically singular.",
+            "update, the problem is its wavelet term. The table states the median over the pairs. In "
+            "float32, a matrix with a condition number above 10⁵ is numerically singular.",
             "**failed**: the number of pairs on which the update reported a failure. Means and medians leave "
             "these pairs out.",
             "`=`: the variant provably equals filtering, so it is not computed again. In the pushforward "

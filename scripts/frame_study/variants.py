@@ -78,7 +78,7 @@ def frames(number_of_filters: int) -> dict[str, FilterBank]:
     not_tight = {
         "cubic spline": CubicSpline(number_of_filters),
         "Mexican hat": MexicanHat(number_of_filters),
-        # The scales are octaves apart, as in the Meyer frame.
+        # Adjacent scales are one octave apart, as in the Meyer frame.
         "heat": Heat(jnp.asarray(2.0 ** np.arange(number_of_filters))),
         "Gabor": Gabor(number_of_filters),
     }
@@ -219,7 +219,7 @@ def refiner(
     *,
     number_of_filters: int,
 ) -> TabulatedPreservation:
-    """Return the refiner of a variant for a pair. Zero filters extend its bank to `number_of_filters`."""
+    """Return the refiner of a variant for a pair, with zero filters appended up to `number_of_filters`."""
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = NearestOrthogonal(Filtering())
@@ -249,13 +249,16 @@ _sample_bank: Callable[[FilterBank, Array], Array] = eqx.filter_jit(
 
 
 def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Float[Array, "filters k"]:
-    """Return the responses of a bank on a shape. Zero filters extend them to `number_of_filters` rows."""
+    """Return the responses of a bank on a shape, with zero rows appended up to `number_of_filters`."""
     responses = _sample_bank(bank, spectrum.eigenvalues)
     return jnp.pad(responses, ((0, number_of_filters - len(responses)), (0, 0)))
 
 
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
-    """Return the octaves, at least 0, from the edge of the Meyer scaling function to each eigenvalue."""
+    """Return the number of octaves from the edge of the Meyer scaling function to each eigenvalue.
+
+    Below the edge, the number is 0.
+    """
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
 

@@ -61,7 +61,7 @@ class CubicSpline(_LogSpacedDilates):
     lambda_max. Points and eigenvalues have the same unit, which can be any unit.
 
     The wavelet is that of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
-    theory", 2011, also known as "abspline". The MWP paper uses it as the general wavelet, which is not tight.
+    theory", 2011, also known as "abspline". The MWP paper compares this filter bank with its tight frame.
     With the default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
 
     **Arguments:**

@@ -250,8 +250,8 @@ class Regression(CoarseToFineState):
         """The mean logarithm of the standard deviation of the residuals, a scalar array; lower is better.
 
         The mean is taken over the principal components of the residuals of both predictions. It is computed
-        as half the sum of the log-determinants of both residual covariances, divided by the number of
-        features of both shapes.
+        as half the sum of the log-determinants of both residual covariances, divided by the total
+        number of features, that of X plus that of Y.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features

@@ -183,7 +183,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, spectrum: Spectrum, area: Float[Array, ""]) -> _Surface:
-        """Returns all vertices of a spectrum, scaled from the given area to area 1."""
+        """Returns the surface that belongs to a spectrum, scaled from the given area to area 1."""
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
                 "Registration needs positions and normals, but a spectrum lacks them: use compute_spectrum, "

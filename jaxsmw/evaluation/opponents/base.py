@@ -1,6 +1,6 @@
 """The interface of the compared methods: their input and their output.
 
-All methods get the same prepared pair, with the same spectra, the same initial map and the same samples.
+All methods receive the same prepared pair, with the same spectra, the same initial map and the same samples.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000
-"""The number of samples of each shape in a prepared pair, which is the largest number that a method uses.
+"""The number of samples of each shape in a prepared pair. No method uses more samples.
 
-If a shape has fewer vertices, both shapes have fewer samples.
+If a shape has fewer referenced vertices, the number of samples of both shapes is the smaller of their numbers
+of referenced vertices.
 """
 
 
@@ -36,7 +37,7 @@ class MethodInput:
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, with at least as many eigenvectors as any method
-      uses.
+      uses. Spectra and maps may be padded.
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
       iterate on samples.
@@ -44,8 +45,8 @@ class MethodInput:
       `both_directions` is True; otherwise None.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether one shape is a partial shape of the other. The two spectra are then comparable only
-      up to the smaller of the largest eigenvalue of X and the largest eigenvalue of Y.
+    - `partial`: whether one shape is a partial shape of the other. The spectra of a partial pair are
+      comparable only up to the smaller of the two shapes' largest eigenvalues.
     - `prepared`: the prepared pair as in `jaxsmw.match`, for methods that run a preset.
     """
 
@@ -107,7 +108,7 @@ class MethodInput:
         return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
-        """Returns the first `count` samples of X and of Y, or twice None if `count` is None."""
+        """Returns the first `count` samples of X and of Y; (None, None) if `count` is None."""
         samples_x, samples_y = self.samples
         return (None, None) if count is None else (samples_x[:count], samples_y[:count])
 

@@ -1,25 +1,24 @@
-"""BCICP: refines the maps X -> Y and Y -> X together, towards bijective and continuous maps.
+"""BCICP: refines the maps X -> Y and Y -> X together, to make them bijective and continuous.
 
 J. Ren, A. Poulenard, P. Wonka, M. Ovsjanikov, *Continuous and orientation-preserving correspondences via
 functional maps*, ACM Transactions on Graphics 37(6), 2018, section 5. Neither the authors' program nor the
-text of the paper was available for this reconstruction. The reconstruction has the steps of the paper. The
-docstrings of the steps mark choices that may differ from the paper as "our choice". One iteration consists of
-four steps:
+text of the paper was available for this reconstruction. The reconstruction has the steps of the paper. Where
+a step may differ from the paper, its docstring says "our choice". One iteration consists of four steps:
 
 1. `_bijective_step`: spectral ICP improves both maps together.
-2. `_improve_coverage`: vertices without a preimage get a preimage from the reverse map, where possible. Steps
+2. `_improve_coverage`: vertices without a preimage receive one from the reverse map, where possible. Steps
    1 and 2 run twice in each iteration.
 3. `_smooth`: the images of neighbouring vertices are averaged in space.
-4. `_repair`: vertices in small regions that discontinuous edges separate from the rest get new images. The
-   new images are interpolated from the images of the surrounding vertices.
+4. `_repair`: vertices in small regions that discontinuous edges separate from the rest receive new images.
+   The new images are interpolated from the images of the surrounding vertices.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
-The reconstruction has larger errors than the authors' program. Both start from the authors' initial maps of
-the 45 non-isometric TOSCA pairs, which have a mean geodesic error of 0.373. The mean geodesic error is 0.169
-for the reconstruction and 0.110 for the maps that the authors published. On 5 of the 45 pairs the
-reconstruction has the smaller error. The number of iterations, the number of smoothing rounds and the order
-of the steps were chosen on 8 of these pairs.
+The reconstruction has larger errors than the authors' program, although both start from the authors' initial
+maps. On the 45 non-isometric TOSCA pairs, the mean geodesic error is 0.373 for the initial maps, 0.169 for
+the reconstruction, and 0.110 for the maps that the authors published. The reconstruction has the smaller
+error on 5 of the 45 pairs. The number of iterations, the number of smoothing rounds and the order of the
+steps were chosen for small errors on 8 of the 45 pairs.
 
 `BCICP` has the settings of the benchmark: 50 eigenvectors and 10 iterations.
 
@@ -46,9 +45,9 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge of X is discontinuous if the distance between the images of its ends exceeds two thresholds: 0.1
-# times the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands of
-# vertices the first threshold is the length of a few edges, and is short compared with a limb. On coarse
+# An edge of X is discontinuous if the distance between the images of its ends exceeds both of two thresholds:
+# 0.1 times the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands
+# of vertices the first threshold is the length of a few edges, and is short compared with a limb. On coarse
 # meshes the second threshold is larger.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
 # A region that discontinuous edges separate from the rest of X is an outlier if its area is less than this
@@ -71,7 +70,8 @@ class _Surface:
     - `edges`: the ends of each edge (e, 2).
     - `component`: the index of the connected component that contains each vertex (n,).
     - `near`: a sparse Boolean matrix (n, n), True for two vertices whose distance along edges is at most 0.1
-      or at most twice the mean edge length. The images of the ends of a continuous edge are such vertices.
+      or at most twice the mean edge length. An edge of the other shape is continuous if the images of its
+      ends are two such vertices.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -86,7 +86,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Returns the surface of a mesh, without unreferenced vertices and vertices that the spectrum masks.
+        """Returns the surface of a mesh, without unreferenced vertices or vertices that the spectrum masks.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -152,8 +152,8 @@ def bcicp(
     """
     if iterations < 1 or smoothing < 0:
         raise InputError(
-            f"BCICP got {iterations} iterations and {smoothing} rounds of smoothing: give at least 1 "
-            "iteration and at least 0 rounds."
+            f"BCICP was called with {iterations} iterations and {smoothing} rounds of smoothing: give at "
+            "least 1 iteration and at least 0 rounds."
         )
     if spectrum_x.eigenvalues.shape != spectrum_y.eigenvalues.shape:
         raise InputError(
@@ -177,8 +177,8 @@ def bcicp(
 def _schedule(iterations: int, smoothing: int) -> list[int]:
     """Returns the number of smoothing rounds of each iteration.
 
-    The numbers decrease geometrically to one (our choice). Many rounds remove the folds of a poor initial
-    map. If every iteration had many rounds, limbs would shrink.
+    The numbers decrease geometrically to one (our choice). Many rounds in the first iterations remove the
+    folds of a poor initial map. Many rounds in every iteration would shrink limbs.
     """
     if smoothing == 0:
         return [0] * iterations
@@ -267,11 +267,11 @@ def _bijective_step(
 def _improve_coverage(
     y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
-    """Gives vertices of Y without a preimage the preimage that the reverse map assigns to them.
+    """Changes the map X -> Y such that more vertices of Y have a preimage.
 
-    An uncovered vertex y becomes the image of x = T_YX(y), provided that the current image of x keeps another
-    preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their indices (our
-    choice).
+    An uncovered vertex y (without a preimage) becomes the image of x = T_YX(y), if the current image of x has
+    another preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their
+    indices (our choice).
     """
     improved, preimages = t_xy.copy(), np.bincount(t_xy, minlength=len(y.areas))
     for uncovered in np.flatnonzero(preimages == 0):
@@ -287,8 +287,8 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
     """Averages the images of neighbouring vertices in space, then takes the nearest vertices of Y.
 
     In each round the point of every vertex becomes the mean of this point and the points of its neighbours.
-    Points are moved back to the surface only after the last round, so that displacements shorter than an edge
-    accumulate. The uniform weights are our choice.
+    Points are moved back to vertices of Y only after the last round. If they were moved back after every
+    round, displacements shorter than an edge would be lost. The uniform weights are our choice.
     """
     if rounds == 0:
         return t_xy
@@ -330,9 +330,9 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
 def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Gives outliers new images, which are interpolated from the images of the surrounding vertices.
 
-    The interpolation is harmonic, in the spectral embedding of Y (our choice). The point of every outlier in
-    this embedding is the mean of the points of its neighbours. The new image of the outlier is the vertex of
-    Y nearest to this point.
+    The interpolation is harmonic, in the spectral embedding of Y (our choice): the point of every outlier in
+    this embedding is the mean of its neighbours' points. The new image of the outlier is the vertex of Y that
+    is nearest to this point.
     """
     outlier = _outliers(x, y, t_xy)
     if not outlier.any():

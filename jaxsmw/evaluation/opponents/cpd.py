@@ -6,16 +6,24 @@ registration: Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
 A search for nearest neighbours recovers a good pointwise map if the functional map is nearly a rotation of
 one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. The
-recovery is then a non-rigid registration of two point sets in k dimensions. The embedding of Y (`Phi_Y C^T`,
-the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed. In the statistical
-model, a data point is uniform noise with probability w. Otherwise it is drawn from a mixture of isotropic
-Gaussians around the centroids with a common variance s. All vertices have equal weight; their areas are
-ignored. The displacement of the centroids is a linear combination of Gaussian kernels at the initial
-centroids `Y`, with the kernel matrix `G` (n, n). With d dimensions and moved centroids T, expectation
-maximisation (EM) alternates between the steps
+first paper then recovers the map by a non-rigid registration of two point sets in k dimensions. The embedding
+of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed.
 
-    P_ji proportional to exp(-||x_i - t_j||^2 / 2 s), the noise to (2 pi s)^(d/2) w n / ((1 - w) m)
-    (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y,    T = Y + G W
+In the statistical model, a data point is uniform noise with probability w. Otherwise it is drawn from a
+mixture of isotropic Gaussians around the centroids with a common variance s. All vertices have equal weight,
+and their areas are ignored. The displacement of the centroids is a linear combination of Gaussian kernels at
+the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d) contains the coefficients of this
+combination in d dimensions. The moved centroids are `T = Y + G W`.
+
+Expectation maximisation (EM) alternates between two steps. The E-step computes the probability `P_ji` that
+data point i was drawn from the Gaussian around centroid j:
+
+    P_ji = exp(-||x_i - t_j||^2 / 2 s) / (sum_l exp(-||x_i - t_l||^2 / 2 s) + noise),
+    noise = (2 pi s)^(d/2) w n / ((1 - w) m)
+
+The M-step solves a linear system for W, moves the centroids, and updates the variance:
+
+    (diag(P 1) G + stiffness s I) W = P X - diag(P 1) Y
     s = sum_ij P_ji ||x_i - t_j||^2 / (d sum P)
 
 EM stops when the penalised likelihood no longer changes. The match of a data point is its most probable
@@ -27,8 +35,8 @@ regression of the displacements on the columns of L,
 
     (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
 
-This system follows from Woodbury's identity, in a form that never divides by small numbers. Its solution is
-exact if L has full rank.
+This system follows from the M-step by Woodbury's identity, and contains no division by small numbers. It is
+equivalent to the M-step if `L L^T` equals G.
 
 `CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a
 functional map and recovers a pointwise map.
@@ -57,8 +65,8 @@ from jaxsmw.evaluation.opponents.presets import Refined
 
 # The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
-# EM stops when the variance s is below this threshold of Myronenko's program. For point sets of unit
-# variance, a smaller variance is a rounding error.
+# EM stops when the variance s falls below this threshold, which Myronenko's program also uses. For point sets
+# of unit variance, a smaller variance is a rounding error.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -69,8 +77,8 @@ class Drift(eqx.Module):
 
     - `centroids`: the moved centroids (n, d), in the coordinate system and unit of the data. Masked rows are
       meaningless.
-    - `variance`: the final variance s of the Gaussians, after the data have been scaled such that their root
-      mean square distance from their mean is 1.
+    - `variance`: the final variance s of the Gaussians. Its unit of length is the root mean square distance
+      of the data from their mean.
     - `iterations`: the number of EM iterations that were run.
     """
 
@@ -94,12 +102,13 @@ def coherent_point_drift(
 ) -> Drift:
     """Moves centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
 
-    Each point set is first scaled to zero mean and unit variance. The defaults are those of Myronenko's
-    program, except for the rank. His program uses the exact kernel matrix by default, and optionally the rank
-    sqrt(n). The rank was varied on a real pair with 5000 vertices. With 30 eigenvectors and ranks 70, 300 and
-    1200, the mean geodesic errors are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors and ranks 150, 600
-    and 1200, the mean geodesic errors are 17.2, 11.4 and 11.3 x 10^-3. The docstring of this module contains
-    the equations.
+    Each point set is first shifted to zero mean and scaled to unit variance: the mean squared distance of its
+    points from their mean is then 1. The docstring of this module contains the equations. The default values
+    are those of Myronenko's program, except for the rank. His program uses the exact kernel matrix by
+    default, or optionally an approximation of rank sqrt(n). Tests on a real pair with 5000 vertices show the
+    effect of the rank. With 30 eigenvectors, the mean geodesic errors for the ranks 70, 300 and 1200 are
+    22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors, the mean geodesic errors for the ranks 150, 600 and
+    1200 are 17.2, 11.4 and 11.3 x 10^-3.
 
     **Arguments:**
 
@@ -107,15 +116,15 @@ def coherent_point_drift(
       points.
     - `data_mask`, `centroids_mask`: masks (m,) and (n,), False for rows that are ignored; by default all rows
       are used.
-    - `width`: beta of the papers, a positive number: the standard deviation of the Gaussian kernel for point
-      sets of unit variance. With a wider kernel, more points move together.
-    - `stiffness`: lambda of the papers, a positive number: the weight of the smoothness of the displacement.
-    - `outliers`: w of the papers, the expected share of uniform noise in the data; at least 0 and below 1.
+    - `width`: the standard deviation of the Gaussian kernel for point sets of unit variance (beta in the
+      papers), a positive number. With a wider kernel, more points move together.
+    - `stiffness`: the weight of the smoothness of the displacement (lambda in the papers), a positive number.
+    - `outliers`: the expected share of uniform noise in the data (w in the papers), at least 0 and below 1.
     - `rank`: the number of columns of the kernel factor, at least 1; see `kernel_factor`.
     - `iterations`: the largest number of EM iterations, at least 1.
     - `tolerance`: EM stops when the relative change of the objective is at most this number.
 
-    **Returns:** A `Drift`.
+    **Returns:** A `Drift`, with the moved centroids (n, d) in its attribute `centroids`.
 
     **Raises:** `ValueError` if `width`, `stiffness`, `outliers`, `rank` or `iterations` is out of range.
     """
@@ -134,12 +143,12 @@ def coherent_point_drift(
 def kernel_factor(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float | Float[Array, ""], rank: int
 ) -> Float[Array, "n rank"]:
-    """Returns a low-rank factor L of the Gaussian kernel matrix, so that `L L^T` approximates the matrix.
+    """Returns a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
 
     Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. A pivoted Cholesky factorisation
     that stops at the given rank computes L. Each step eliminates the point with the largest residual on the
     diagonal. The result is a Nyström approximation from points that are spread over the whole set. The choice
-    of these points is deterministic. The factorisation computes `rank` rows of the kernel matrix and takes
+    of these points is deterministic. The factorisation computes `rank` rows of the kernel matrix, and needs
     about `n rank^2` operations.
 
     **Arguments:**
@@ -185,16 +194,17 @@ def recover_by_drift(
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
     with the nearest unmasked vertex of Y.
 
-    The settings are those of a published run of the method on FAUST, with 30 eigenvectors and a functional
-    map from spectral ICP (`exp_teaser` of github.com/daviddao/GPU-Programming-TUM). The run has 50
-    iterations, after which the centroids hardly move. The other settings are the defaults of
-    `coherent_point_drift`.
+    The default number of iterations, 50, is taken from a published run of the method on FAUST, with 30
+    eigenvectors and a functional map from spectral ICP (`exp_teaser` of
+    github.com/daviddao/GPU-Programming-TUM). After 50 iterations the centroids hardly move. All settings
+    except `rank` and `iterations` have the defaults of `coherent_point_drift`.
 
     **Arguments:**
 
     - `functional_map`: C (k_X, k_Y) in the pullback convention, `Phi_X^+ P Phi_Y`; C need not be orthogonal.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not.
-    - `rank`, `iterations`: the arguments of `coherent_point_drift`, each at least 1.
+    - `rank`, `iterations`: the rank of the kernel matrix and the largest number of EM iterations, each at
+      least 1; see `coherent_point_drift`.
 
     **Returns:** The pointwise map X -> Y (m,), 0-based vertices of Y.
 
@@ -218,14 +228,14 @@ class DriftRecovery(WaveletPreservation):
     By default there is no filter, and the functional map is the least-squares solution `Phi_X^+ P Phi_Y`,
     which is not orthogonal. A single iteration is the recovery of the paper (Rodolà, Moeller and Cremers
     2015). Several iterations are the refinement of the paper, which updates the functional map and the
-    pointwise map alternately. The update of the functional map in the paper was not available, so least
-    squares is our choice.
+    pointwise map alternately. The paper's formula for the functional map was not available for this
+    reconstruction, so least squares is our choice.
 
     **Arguments:** those of `WaveletPreservation`, and
 
     - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
 
-    **Raises:** `ValueError` if `convention` is `"pushforward"`.
+    **Raises:** `ValueError` if `convention` is `"pushforward"`; and the errors of `WaveletPreservation`.
     """
 
     bank: FilterBank = Identity()
@@ -294,8 +304,8 @@ def _drift(
     infinite = jnp.asarray(jnp.inf, x.dtype)
     initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The mean squared distance between data and centroids, divided by d. It is 2 / d, because both sets
-        # have zero mean and a mean squared norm of 1.
+        # The initial variance is the mean squared distance between data and centroids, divided by d. This is
+        # 2 / d, because both sets have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,
@@ -321,9 +331,9 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """The sums over the probabilities P (n, m) that the M-step needs, and the log-likelihood.
+    """The result of the E-step: the log-likelihood, and sums over the probabilities P (n, m).
 
-    The sums are `P X`, `P 1` and `P^T 1`.
+    `weighted_data` is `P X`, `per_centroid` is `P 1`, and `per_point` is `P^T 1`.
     """
 
     weighted_data: Float[Array, "n d"]
@@ -335,9 +345,9 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Shifts and scales points to zero mean and mean squared norm 1; returns them, the mean and the scale.
+    """Shifts and scales points to zero mean and mean squared norm 1. Masked points become zero.
 
-    Masked points become zero.
+    **Returns:** The new points, the mean of the given points, and the scale by which they were divided.
     """
     count = jnp.sum(mask).astype(points.dtype)
     mean = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / count

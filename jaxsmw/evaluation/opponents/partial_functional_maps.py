@@ -2,12 +2,13 @@ r"""Partial functional maps: finds a functional map and the region of Y that X c
 
 E. Rodolà, L. Cosmo, M. M. Bronstein, A. Torsello, D. Cremers, *Partial functional correspondence*, Computer
 Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper was available for this
-reconstruction. This docstring therefore gives no equation numbers. The weights W and their decay were written
+reconstruction. This docstring therefore gives no equation numbers. The formula of the weights W was written
 from memory.
 
 X is the partial shape, and Y is the full shape. Functions F on X correspond to functions G on Y, but only
-inside the region of Y that X covers. A membership function v on Y describes the region: eta(v) is 1 inside
-the region and 0 outside. The definitions are
+inside the region of Y that X covers. A membership function v on Y describes the region: eta(v) is near 1
+inside the region and near 0 outside. The function eta and the coefficients A and B(v) of the functions in the
+eigenbases Phi_X and Phi_Y are
 
     eta(t) = (tanh(6 (t - 1/2)) + 1) / 2,    A = Phi_X^+ F,    B(v) = Phi_Y^+ (eta(v) G).
 
@@ -19,44 +20,45 @@ which is the transpose of this matrix. The paper minimises the following energy 
         + mu_4 (area(X) - integral of eta(v))^2 + mu_5 integral of xi(v) ||grad v||
 
 The first line of the energy is the fidelity term. The second line regularises the functional map, and the
-third line regularises the region. The weights W grow with the distance from a slanted diagonal. Its slope is
-`r / k`, where the r-th eigenvalue of X is about as large as the k-th eigenvalue of Y. This slope is about the
-ratio of the areas of X and Y. The number d_i is 1 for i <= r and 0 for larger i.
+third line regularises the region. The weights W grow with the distance from a slanted diagonal of C. The
+slope of this diagonal is `r / k`, where the r-th eigenvalue of X is about as large as the k-th eigenvalue of
+Y. This slope is about the ratio of the areas of X and Y. The number d_i is 1 for i <= r and 0 for larger i.
 
-The reconstruction departs from the paper in the following points. Each departure gave better results, or
-replaces a detail that was not available.
+The reconstruction differs from the paper in the following points.
 
-- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. Here the first C
-  is the functional map of the initial map, because all compared methods start from the initial map.
-- **Iterations.** A few steps of spectral ICP follow each minimisation over C. In these steps the rows of C
-  are orthonormal, as in the refinement at the end of the paper. Without these steps the computed region is
-  wrong: on three real pairs, its intersection with the true region is 39, 21 and 21 % of their union. With
-  these steps, the intersection is 83, 81 and 43 % of the union.
+- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. In the
+  reconstruction, the first C is the functional map of the initial map, because all compared methods start
+  from the initial map.
+- **Iterations.** A few steps of spectral ICP follow each minimisation over C. Each step makes the rows of C
+  orthonormal, like the refinement at the end of the paper. Without these steps, the computed regions are
+  wrong. The intersection over union of the computed and the true region on three real pairs is 39, 21 and
+  21 % without the steps, and 83, 81 and 43 % with the steps.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
   [0, 1]. If a minimisation starts from v = 1 or from the previous v, wrong regions remain, because the
-  derivative of eta nearly vanishes at these values.
-- **Descriptors.** F and G are the constant function and the first principal components of the SHOT
-  descriptors of both shapes, scaled to mean square 1. The paper uses all 352 entries of the SHOT descriptors.
-  These entries are nonnegative, so their constant part is large. Here the constant function has as much
-  weight as all principal components together. Between 10 and 30 components, the number made little
-  difference. With 100 components, the true functional map and region had a higher energy than C = 0.
+  derivative of eta nearly vanishes where v is near 0 or 1.
+- **Descriptors.** The last column of F and of G is the constant function 1. The other columns are the first
+  principal components of the SHOT descriptors of both shapes, scaled to mean square 1. The paper uses all 352
+  entries of the SHOT descriptors as columns. These entries are nonnegative, so all columns of the paper have
+  a large constant part. In the reconstruction, the constant function has as much weight as all principal
+  components together. The results with 10 to 30 components differ little. With 100 components, the true
+  functional map and region have a higher energy than C = 0.
 - **Rank.** Only the r nonzero columns of the paper's C are stored.
-- **Length.** Here xi is 1, so the term of mu_5 is the total variation of v, which worked in an earlier
-  attempt. The xi of the paper is narrow: it vanishes wherever v is not near 1/2. The narrow xi was not tried
-  again.
-- **Weights.** Y has area 1, and column norms are averaged instead of summed. The weights therefore have other
-  units than the published weights. mu_1 = mu_3 = 1 and mu_2 = 100 are the published values, and the fidelity
-  term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs; mu_4 was not varied.
-- **Recovery.** The search for nearest neighbours includes all vertices of Y. A search among only the vertices
-  of the region gave the same maps, or worse maps if the region was wrong.
+- **Length.** The function xi is 1, so the term of mu_5 is the total variation of v. In the paper, xi(v)
+  vanishes unless v is near 1/2.
+- **Weights.** Y has area 1, and column norms are averaged instead of summed, so the weights have other units
+  than in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published values, and the fidelity
+  term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs. No other value of mu_4
+  was tested.
+- **Recovery.** The nearest-neighbour search includes all vertices of Y. A search among only the vertices of
+  the region gave the same maps, or worse maps if the region was wrong.
 - **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
   number of steps. The variable v is scaled by the square roots of the vertex areas. All norms are smoothed at
   zero.
 
-The reconstruction was tested on 12 other pairs of SHREC'16. On 6 pairs with cuts, the mean geodesic error is
-0.135 for the initial maps, 0.015 for the reconstruction, and 0.011 for MWP from the same initial maps. On 6
-pairs with holes, the mean geodesic error is 0.160 for the initial maps, 0.018 for the reconstruction, and
-0.017 for MWP.
+The reconstruction was tested on 12 pairs of SHREC'16 that were not used to choose weights. On 6 pairs with
+cuts, the mean geodesic error is 0.135 for the initial maps, 0.015 for the reconstruction, and 0.011 for MWP
+from the same initial maps. On 6 pairs with holes, the mean geodesic error is 0.160 for the initial maps,
+0.018 for the reconstruction, and 0.017 for MWP.
 
 `PARTIAL_FUNCTIONAL_MAPS` has the settings of the benchmark: 100 eigenvectors, 15 descriptors and 5
 iterations. Functional maps have the pullback convention of `jaxsmw.core.functional_map`.
@@ -88,7 +90,7 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""The weight of the fidelity term, with averaged column norms, relative to the terms of mu_1 to mu_3."""
+"""The factor of the fidelity term in the minimisation over C, in which column norms are averaged."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
 """The published weights mu_1, mu_2 and mu_3 of the terms that regularise the functional map."""
 REGION_WEIGHTS = (10.0, 0.01)
@@ -96,10 +98,10 @@ REGION_WEIGHTS = (10.0, 0.01)
 
 # The rate at which the slanted weights decay towards high frequencies (sigma of W in the paper).
 _DECAY = 0.03
-# The norms of columns and of gradients are smoothed below this number. The number is 0.1 % of the norm of a
+# Norms of columns and of gradients are smoothed below this threshold. The threshold is 0.1 % of the norm of a
 # descriptor, and 0.1 % of the gradient of a function that changes by 1 across Y.
 _SMOOTHING = 1e-3
-# The largest number of L-BFGS steps in a minimisation over C, and in a minimisation over v. Most
+# The largest numbers of L-BFGS steps in a minimisation over C and in a minimisation over v. Most
 # minimisations use most of these steps.
 _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
@@ -111,8 +113,9 @@ class SurfaceGradient(eqx.Module):
     **Attributes:**
 
     - `faces`: the corners of each face (f, 3), 0-based. The array is padded with faces of area zero.
-    - `hats`: for each face and each of its corners, the gradient of the corner's hat function on this face
-      (f, 3, 3). The gradient is zero on faces of area zero.
+    - `hats`: the gradients of hat functions (f, 3, 3), indexed by face, corner and coordinate. The hat
+      function of a corner is linear on the face, 1 at this corner, and 0 at the other two corners. The
+      gradient is zero on faces of area zero.
     - `areas`: the area of each face (f,).
     """
 
@@ -138,7 +141,7 @@ class SurfaceGradient(eqx.Module):
         doubled = np.linalg.norm(normals, axis=1)
         opposite = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
         # The gradient of a hat function is `n x e / (2 area)` for the unit normal n and the opposite edge e.
-        # The vectors in `normals` have the length 2 area.
+        # Each vector in `normals` has the length `2 area`.
         squared = np.where(doubled > 0, doubled, np.inf)[:, None, None] ** 2
         hats = np.cross(normals[:, None], opposite) / squared
         size = padded_size(len(mesh.faces))
@@ -150,10 +153,10 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Returns the total variation of a function (the Mumford-Shah term of the paper with xi = 1).
+        """Returns the total variation of a function, the integral of the gradient's length over the surface.
 
-        The total variation is the integral of the gradient's length over the surface. The length is smoothed
-        at zero.
+        This is the Mumford-Shah term of the paper with xi = 1. The length of the gradient is smoothed at
+        zero.
 
         **Arguments:**
 
@@ -170,8 +173,9 @@ class PartialMap(eqx.Module):
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y; -1 everywhere if the method failed.
     - `functional_map`: C (r, k_Y) with orthonormal rows, where r is the smaller of k_X and k_Y.
-    - `region`: eta(v) (n,), 1 inside the region that X covers and 0 outside; zero on masked vertices of Y.
-    - `result`: a member of `RESULTS`.
+    - `region`: eta(v) (n,), near 1 inside the region that X covers and near 0 outside; 0 at masked vertices
+      of Y.
+    - `result`: the status code, a member of `RESULTS`.
     """
 
     pointwise_map: Int32[Array, " m"]
@@ -200,7 +204,7 @@ def partial_functional_map(
       their common range of eigenvalues (`jaxsmw.pair.common_range`). The number k_X of eigenvectors of X is
       then the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors of X are used.
       Both spectra need the same number of comparable descriptors, scaled to mean square 1.
-    - `gradient_y`: the gradient of functions on Y.
+    - `gradient_y`: the gradient of functions on Y, in the same unit of length.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `iterations`: the number of iterations, at least 1. Each iteration minimises over C, then over v.
     - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
@@ -337,8 +341,9 @@ def fidelity(
 ) -> Float[Array, ""]:
     """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
 
-    The last column belongs to the constant function, and the other columns belong to descriptors. The value
-    is the mean norm of the descriptor columns plus the norm of the last column.
+    The last column of the matrix `C A - B` belongs to the constant function, and the other columns belong to
+    descriptors. The fidelity term is the mean norm of the descriptor columns of this matrix plus the norm of
+    its last column.
 
     **Arguments:**
 
@@ -352,7 +357,7 @@ def fidelity(
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
     """Returns the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
 
-    These terms keep C near the slanted diagonal, and keep its rows orthonormal.
+    These terms keep the large entries of C near the slanted diagonal, and its rows nearly orthonormal.
 
     **Arguments:**
 
@@ -406,7 +411,7 @@ def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, "
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """Refines C by some steps of spectral ICP (the refinement at the end of the paper).
+    """Refines C by `steps` steps of spectral ICP, the refinement at the end of the paper.
 
     Each step searches for nearest neighbours, encodes the matches as a functional map, and replaces this map
     by the nearest matrix with orthonormal rows.
@@ -429,7 +434,7 @@ def _minimum(
 ) -> Float[Array, " ..."]:
     """Minimises an energy by at most `steps` steps of L-BFGS, and returns the final point.
 
-    No error is raised if the final point is not yet a minimum.
+    If the steps do not suffice to reach a minimum, no error is raised.
     """
     import optimistix as optx  # optimistix is imported here because its import is slow
 

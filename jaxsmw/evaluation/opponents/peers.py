@@ -4,13 +4,13 @@ The methods need optional packages, and are available only if these packages are
 
     pip install 'jaxsmw[benchmark,peers]'
 
-The methods run in the same process and on the same number of cores as all other methods. Both have the
+The methods run in the same process and on the same number of cores as all other methods. Both methods use the
 settings of the ZoomOut paper (see `zoomout`): the number of eigenvectors k is 20, 25, ..., 120, and every
 iteration uses all vertices.
 
-- `PyFM`: the function `zoomout_refine` of pyFM (`pyfmaps` on the package index) by R. Magnet, with one
-  job.
-- `Geomfum`: the class `ZoomOut` of geomfum.
+- `PyFM` calls the function `zoomout_refine` of pyFM by R. Magnet (`pyfmaps` on the package index) with
+  `n_jobs=1`.
+- `Geomfum` uses the class `ZoomOut` of geomfum.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from jaxsmw.evaluation.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVE
 
 
 class Peer(Method):
-    """The base class of ZoomOut implementations of other libraries, with k = 20, 25, ..., 120 eigenvectors.
+    """The base class of methods that call another library's ZoomOut, with k = 20, 25, ..., 120 eigenvectors.
 
-    A subclass must define `refine`, `reference` and `package`. In the other libraries, Y is called shape 1,
-    and X is called shape 2. Functional maps take functions on shape 1 to functions on shape 2, and pointwise
-    maps take vertices of shape 2 to vertices of shape 1.
+    A subclass must define `refine`, `reference` and `package`. In both libraries, Y is shape 1 and X is
+    shape 2. Functional maps take functions on shape 1 to functions on shape 2, and pointwise maps take
+    vertices of shape 2 to vertices of shape 1.
 
     **Attributes:**
 
@@ -143,6 +143,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Returns the methods of this module whose packages are installed, by name."""
+    """Returns a dictionary from names to the methods of this module whose packages are installed."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

@@ -53,8 +53,8 @@ class PublishedMaps(Method):
         if missing:
             raise InputError(
                 f"{published_file(self.directory, missing[0].names)}: is missing ({len(missing)} of "
-                f"{len(pairs)} maps are missing): add the maps, or choose pairs that have maps with --pairs "
-                "FILE."
+                f"{len(pairs)} maps are missing): add the maps, or use --pairs FILE with a list of the pairs "
+                "that have maps."
             )
 
 

@@ -32,19 +32,19 @@ METHODS: dict[str, Method] = {
     "zoomout": ZOOMOUT,
     "zoomout-sampled": ZOOMOUT_SAMPLED,
 }
-"""The methods that need no other library, as a dictionary by name, in the order of the rows of tables."""
+"""A dictionary from names to the methods that need no other library, in the order of the rows of tables."""
 
 MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
 """The largest number of eigenvectors that any of `METHODS` uses."""
 
 
 def known_methods() -> dict[str, Method]:
-    """Returns `METHODS` and the methods of installed other libraries, as a dictionary by name."""
+    """Returns a dictionary from names to methods: `METHODS`, and the methods of other installed libraries."""
     return METHODS | installed_peers()
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Returns the known methods that can match all pairs, as a dictionary by name."""
+    """Returns a dictionary from the names of the known methods that can match all pairs to these methods."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 
@@ -53,12 +53,13 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
 
     **Arguments:**
 
-    - `names`: names of known methods, or directories with maps of other programs (files `X_Y.map`).
-      Repeated names are used once.
+    - `names`: names of known methods, or paths of directories with maps of other programs (files named
+      `X_Y.map`). Repeated names are used once.
 
-    **Returns:** A dictionary of the methods by name. Maps in a directory have the name of the directory.
+    **Returns:** A dictionary from names to methods. For a directory with maps, the name of the method is the
+    name of the directory.
 
-    **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would get
+    **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would have
     the same name.
     """
     known, found = known_methods(), {}

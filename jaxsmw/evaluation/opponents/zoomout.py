@@ -4,8 +4,9 @@ S. Melzi, J. Ren, E. Rodolà, A. Sharma, P. Wonka, M. Ovsjanikov, *ZoomOut: spec
 shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration encodes the pointwise map as a
 functional map of size k, searches for nearest neighbours, and increases k.
 
-- `ZOOMOUT` has the sizes k = 20, 25, ..., 120, and uses all vertices in every iteration.
-- `ZOOMOUT_SAMPLED` has the same sizes, and iterates on 1000 samples of each shape (section 4.3 of the paper).
+- `ZOOMOUT` uses the sizes k = 20, 25, ..., 120, and iterates on all vertices.
+- `ZOOMOUT_SAMPLED` uses the same sizes, and iterates on 1000 samples of each shape (section 4.3 of the
+  paper).
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ class ZoomOut(Method):
     **Attributes:**
 
     - `reference`: the publication and the settings, as text; see `Method`.
-    - `first`, `step`, `number_of_eigenvectors`: the first size k of the functional map, the step between
-      sizes, and the largest size.
+    - `first`: the size k of the functional map in the first iteration.
+    - `step`: the increase of k after each iteration.
+    - `number_of_eigenvectors`: the largest size k.
     - `number_of_samples`: the number of samples of each shape; None for all vertices.
     """
 
