@@ -137,8 +137,8 @@ def describe(
     **Returns:** The spectra of X and Y, with `descriptors` of shapes (m, d) and (n, d), without unit. The
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
-    **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT, or a
-    spectrum of another mesh.
+    **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT at more
+    than half of its vertices, or a spectrum of another mesh.
     """
     if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
         raise InputError(

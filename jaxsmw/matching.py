@@ -264,7 +264,7 @@ def match(
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following. Presets (the first four choices) are
       adapted to small meshes: they use at most half as many eigenvectors as vertices, and no samples if a
-      mesh does not have more vertices than samples. Given stages are not adapted.
+      mesh does not have more vertices than samples. Stages of your own are used unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.

@@ -34,7 +34,7 @@ class Stage:
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
     - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
-      refiner with levels (`FeatureRegression` or `Registration`), leave the argument out, because the number
+      refiner with levels, such as `Registration(levels=(35, 60))`, leave the argument out, because the number
       is then the largest level.
     - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
       argument out, because the number is then the number of levels.

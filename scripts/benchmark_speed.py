@@ -463,8 +463,8 @@ def split_faces(
     """
     chosen = (middles >= 0).sum(axis=1) == number
     faces, middles = faces[chosen], middles[chosen]
-    # Rotate the corners of each face, so that a single split edge is the first and a single unsplit edge is
-    # the last.
+    # Rotate the corners of each face. If only one edge is split, it becomes the first edge. If only one edge
+    # is unsplit, it becomes the last edge.
     first = (np.argmin(middles >= 0, axis=1) + 1) % 3
     if number == 1:
         first = np.argmax(middles, axis=1)

@@ -7,8 +7,8 @@ The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which
 is a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step
-of Adam (optax) uses one pair of the first five people of FAUST. Gradients pass through `refine_softly` on
-samples of both shapes. The script trains one frame with each of these losses:
+of Adam (optax) uses one pair of shapes of the first five people of FAUST. Gradients pass through
+`refine_softly` on samples of both shapes. The script trains one frame with each of these losses:
 
 - `labels`: the distance between matches and the ground truth;
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
@@ -105,7 +105,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 
 def like_meyer() -> SoftmaxFrame:
-    """Return the frame from which training starts. It is close to the Meyer frame, with positive filters."""
+    """Return a frame close to the Meyer frame, but with positive filters only, from which training starts."""
     return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 

@@ -226,7 +226,7 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --init landmarks:{x}", "x.off"),
         ("match {x} {y} --output {t}/m --report {x}", "is an input"),
         ("match {x} {y} --output {t}/m --ground-truth {t}/missing.vts {p}/y.vts", "missing.vts"),
-        ("match {x} {y} --output {t}/m --ground-truth {p}/x.vts", "half of a pair"),
+        ("match {x} {y} --output {t}/m --ground-truth {p}/x.vts", "describes only one shape"),
         ("match {x} {y} --output {t}/m --precision float16", "float16"),
         ("match {x} {y} --output {t}/m --evaluation-samples -3", "at least 1"),
         ("match {x} {y} --output {x}", "would be overwritten"),

@@ -65,7 +65,7 @@ def test_damaged_provenance_is_refused(tmp_path, contents):
     origin = {"settings": {"seed": 0}}
     (tmp_path / "provenance.json").write_text(contents)
     with (
-        pytest.raises(InputError, match=r"provenance.json: is damaged: give another --output"),
+        pytest.raises(InputError, match=r"provenance.json: the file is damaged: give another --output"),
         claimed_directory(tmp_path, origin),
     ):
         pass

@@ -224,7 +224,7 @@ class Softmax(Recovery):
 
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps.
 
     **Raises:** `ValueError` if the temperature is not a single positive, finite number.
@@ -267,7 +267,7 @@ class NearestFew(Recovery):
       area, the remaining shares are zero.
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps.
 
     **Raises:** `TypeError` if `number` is not an integer; `ValueError` if `number` is below 1, or if the
@@ -323,7 +323,7 @@ class Sinkhorn(Recovery):
 
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (the docstring of `sinkhorn` gives the limits). Lower temperatures give sharper
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps and need more iterations.
     - `iterations`: the largest number of iterations of `sinkhorn`, an integer of at least 1.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,

@@ -180,8 +180,8 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
     - `path`: the file to create or to replace. `read_ground_truth` recognises its format by the suffix
       `.baryc_gt`.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-    - `mesh_y`: the target Y, a `Mesh`. The written faces have the numbers of the mesh file of Y, counted
-      from 1. This numbering includes faces that were dropped when the mesh was read.
+    - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of
+      Y. These positions count the faces that were dropped when the mesh was read.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.

@@ -254,5 +254,5 @@ def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or not all(isinstance(group, dict) for group in found.values()):
-        raise InputError(f"{path}: is damaged: give another --output, or remove the directory.")
+        raise InputError(f"{path}: the file is damaged: give another --output, or remove its directory.")
     return found

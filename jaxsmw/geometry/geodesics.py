@@ -95,8 +95,8 @@ class _Sides(NamedTuple):
     head: Int64[np.ndarray, " s"]
     apex: Int64[np.ndarray, " s"]
     length: Float64[np.ndarray, " s"]
-    # The position of the apex in the complex plane if the side leads from 0 to 1. The apex is never below the
-    # real axis.
+    # The position of the apex in the complex plane, in which the side is the segment from 0 to 1. The apex is
+    # never below the real axis.
     shape: Complex128[np.ndarray, " s"]
     # A line that leaves a triangle by side i enters other triangles by the sides across[first[i]], …,
     # across[first[i + 1] - 1].

@@ -44,9 +44,9 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.mat`: a file with a struct that has the coordinates X, Y and Z (or a matrix VERT) and the 1-based
           faces TRIV, such as `surface` in the TOSCA data set. The struct may be a field of another struct, as
           in the files of `write_spectrum`.
-    - `weld`: if True, all vertices at exactly the same position are treated as one vertex, and faces use the
-        lowest-numbered of these vertices. Welding has no effect on an STL file, whose corners are always
-        merged.
+    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position. The other
+        vertices stay in the mesh without faces, so no vertex is renumbered. Welding has
+        no effect on an STL file, whose corners are always merged.
 
     **Returns:**
 

@@ -93,9 +93,9 @@ def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray,
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
 
-    The right side of the body is green, and the left side is red. Along the height or the length of the body,
-    whichever is larger, the hue changes from yellow to blue. The smaller of height and length only changes
-    the lightness, because shading makes differences in lightness hard to see. Each limb of people and animals
+    The right side of the body is green, and the left side is red. Along the longer of the two other axes,
+    height and length, the hue changes from yellow to blue. Along the shorter axis only the lightness changes,
+    because differences in lightness are hard to see under shading. Each limb of people and animals
     therefore has its own hue, and swapped limbs are obvious.
 
     Along each axis, the colour depends on the vertex's relative position in the bounding box and on its

@@ -77,9 +77,9 @@ def render(
 
     The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
     samples per pixel prevents cracks and wrongly sorted triangles. A strong light comes from the upper left,
-    and a weak light comes from the right. Both lights illuminate the two sides of a face equally. Where one
-    part of the body is in front of another part, the rear part is slightly darker near the outline of the
-    front part.
+    and a weak light comes from the right. Each light illuminates the front and the back of a face equally.
+    Where one part of the body is in front of another part, the rear part is slightly darker near the outline
+    of the front part.
 
     **Arguments:**
 

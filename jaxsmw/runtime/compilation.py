@@ -20,8 +20,8 @@ _OPTIONS: dict[str, str | bool] = {
     "xla_disable_hlo_passes": "tree_reduction_rewriter",
 }
 # Linux limits the number of memory maps of a process. Compiled programs are released when the process uses
-# more than this share of the limit. The programs for a pair of new sizes use up to 3 % of the limit, and
-# 250 MB of memory.
+# more than this share of the limit. A pair of shapes of new sizes adds programs that use up to 3 % of the
+# limit and up to 250 MB of memory.
 _LARGEST_SHARE = 0.25
 
 

@@ -206,8 +206,10 @@ class Prediction(NamedTuple):
 
     **Attributes:**
 
-    - `queries`: the matrix (d_out, d_out) that takes the features of a query vertex to its point.
-    - `database`: the matrix (d_in, d_out) that takes the features of a target vertex to its point.
+    - `queries`: a matrix (d_out, d_out). The features of a query vertex times this matrix are its point in
+      the nearest-neighbour search.
+    - `database`: a matrix (d_in, d_out). The features of a target vertex times this matrix are its point in
+      the search.
     - `uncertainty`: half the logarithm of the determinant of the residual covariance of the active features.
     """
 

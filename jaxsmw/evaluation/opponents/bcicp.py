@@ -237,7 +237,7 @@ def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 def _bijective_step(
     x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
-    """Computes both maps by one step of spectral ICP for both directions and both cycles (bijective ICP).
+    """Performs one step of bijective ICP: spectral ICP in both directions and along the two cycles of maps.
 
     There are four functional maps: one for each direction, and one for each of the cycles X -> Y -> X and
     Y -> X -> Y. Each functional map is replaced by the nearest orthogonal matrix. The step seeks pointwise
