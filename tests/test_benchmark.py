@@ -391,7 +391,7 @@ def test_files_of_another_kind_are_named_and_not_changed(measure, finished, tmp_
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     (tmp_path / name).write_bytes(contents)
     with pytest.raises(
-        InputError, match=f"{name}(, line 1)?: is (not the header|not a table|damaged)"
+        InputError, match=f"{name}(, line 1)?: (is not the header|is not a table|the file is damaged)"
     ) as caught:
         measure(["initial"])
     assert "\n" not in str(caught.value) and (tmp_path / name).read_bytes() == contents

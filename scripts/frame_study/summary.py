@@ -154,11 +154,16 @@ def _variant(row: Row) -> Variant:
 
 def write_summary(study: Study, invariance: Sequence[Row]) -> str:
     """Return all tables as Markdown."""
+    return "\n\n".join([*_introduction(study), *_comparisons(study), *_invariances(study, invariance)]) + "\n"
+
+
+def _introduction(study: Study) -> list[str]:
+    """Return the title, and the paragraphs that explain the columns of all tables."""
     settings = study.settings
     counts = ", ".join(f"{len(pairs)} of {name}" for name, pairs in study.pairs.items() if name != "both")
     search = study.milliseconds(SEARCH)
     start = {name: 1e3 * study.numbers(DEFAULT, name, "error_0").mean() for name in study.pairs}
-    parts = [
+    return [
         "# Frames compared",
         f"The pairs ({counts}) are evenly spread over the lists of the data sets. All variants start from "
         "the same SHOT matches (mean error "
@@ -197,6 +202,11 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
             "function of a Parseval frame is 1.",
         ),
     ]
+
+
+def _comparisons(study: Study) -> list[str]:
+    """Return the tables that compare the variants."""
+    parts = []
     for convention in CONVENTIONS:
         parts += [
             f"## Mean error and difference, {convention}, both data sets",
@@ -224,18 +234,22 @@ def write_summary(study: Study, invariance: Sequence[Row]) -> str:
                 f"## {convention.capitalize()}, {name if name != 'both' else 'both data sets'}",
                 _details(study, convention, name),
             ]
-    parts += [
+    return parts
+
+
+def _invariances(study: Study, invariance: Sequence[Row]) -> list[str]:
+    """Return the table of the invariance of wavelets, and the failures."""
+    return [
         "## Invariance of wavelets under near-isometry",
         "The table compares the values, at corresponding vertices, of wavelets around corresponding vertices "
         "of the two shapes. It states the relative difference and the correlation. The relative difference "
         "is 0 for equal wavelets and 1.41 for unrelated wavelets. Both values are medians over "
-        f"{settings.wavelet_centers} centres and over the pairs. "
+        f"{study.settings.wavelet_centers} centres and over the pairs. "
         "Scale 0 is the scaling function, and the last scale is the finest.",
         _invariance(study, invariance),
         "## Failures",
         _failures(study),
     ]
-    return "\n\n".join(parts) + "\n"
 
 
 def _overview(study: Study, convention: Convention) -> str:
