@@ -1,7 +1,7 @@
 """Deformable shape correspondence in JAX by multiscale spectral manifold wavelets preservation.
 
 `__init__.pyi` lists the public names. A name is loaded at its first use, so `jaxsmw --help` does not import
-JAX. Importing this module loads almost nothing else, so the command line handles Ctrl-C soon after it starts.
+JAX. Importing `jaxsmw` loads almost no other module, so the command line handles Ctrl-C soon after it starts.
 """
 
 from functools import cache

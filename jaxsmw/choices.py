@@ -1,7 +1,7 @@
 """The names that settings accept, and the default settings.
 
-The help of the command line shows these names. This module does not import JAX, NumPy or SciPy, because these
-imports would delay the help.
+The help text of the command line shows these names. This module does not import JAX, NumPy or SciPy, because
+these imports would delay the help text.
 """
 
 from typing import Literal
@@ -23,13 +23,13 @@ APPROXIMATE_FROM = 50_000
 """The smallest number of vertices for which the eigensolver `"auto"` chooses `"approximate"`."""
 
 Search = Literal["auto", "exhaustive", "patches"]
-"""The methods of nearest-neighbour search. They give the same result; `"auto"` chooses the faster one."""
+"""The methods of nearest-neighbour search, with equal results; `"auto"` chooses the faster method."""
 
 GeodesicMethod = Literal["strips", "exact"]
 """The methods that compute geodesic distances; see `jaxsmw.geodesic_distances`."""
 
 IndexBase = Literal[0, 1]
-"""The values that the index of the first vertex in a file can have."""
+"""The possible indices of the first vertex in a file."""
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
@@ -49,7 +49,7 @@ MethodName = Literal[
 ]
 """The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.registry.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""The names of methods of other libraries. A benchmark can measure them if these libraries are installed."""
+"""The names of methods of other libraries, which a benchmark can measure if these libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

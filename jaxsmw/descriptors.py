@@ -20,21 +20,22 @@ from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
 
 # A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors do not
-# distinguish vertices whose distance is a few hundredths of the square root of the area. For this resolution,
-# 10 000 samples are dense enough.
+# distinguish vertices at a distance of a few hundredths of the square root of the area, so 10 000 samples are
+# dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten or more
 # vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# The number of samples for descriptors with a larger radius than usual. Such descriptors vary more slowly
-# over the surface than descriptors with the usual radius.
+# Descriptors with a larger radius than usual vary slowly over the surface, so they are computed only at this
+# number of samples.
 _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
-    """A shape with its compared vertices. Descriptors are compared only at these vertices.
+    """A shape with the vertices at which its descriptors are compared (the compared vertices).
 
-    On a large mesh, the compared vertices are samples. On any other mesh, all vertices are compared vertices.
+    On a large mesh, the compared vertices are samples. On any other mesh, descriptors of all vertices are
+    compared.
 
     **Attributes:**
 
@@ -72,12 +73,12 @@ class SampledShape(NamedTuple):
 
 
 class SampledPair(NamedTuple):
-    """A pair with its compared vertices. Descriptors are compared only at these vertices.
+    """A pair of shapes, each with the vertices at which its descriptors are compared.
 
     **Attributes:**
 
     - `pair`: the source X and the target Y.
-    - `x`, `y`: X and Y with their compared vertices, each a `SampledShape`.
+    - `x`, `y`: the source X and the target Y, each a `SampledShape`.
     """
 
     pair: Pair
@@ -86,7 +87,7 @@ class SampledPair(NamedTuple):
 
     @property
     def sides(self) -> tuple[SampledShape, SampledShape]:
-        """X and Y with their compared vertices."""
+        """The sampled shapes X and Y."""
         return self.x, self.y
 
 
@@ -131,14 +132,14 @@ def describe(
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
-    - `number_of_descriptors`: the number d of components, from 1 to 352. The components of largest variance
-      are taken.
+    - `number_of_descriptors`: the number d of components, from 1 to 352. The d components of largest variance
+      are used.
 
     **Returns:** The spectra of X and Y, with `descriptors` of shapes (m, d) and (n, d), without unit. The
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
-    **Raises:** `InputError` for another number of descriptors, a mesh that is too coarse for SHOT at more
-    than half of its vertices, or a spectrum of another mesh.
+    **Raises:** `InputError` if `number_of_descriptors` is not from 1 to 352, if a mesh is too coarse for SHOT
+    at more than half of its vertices, or if a spectrum has another number of vertices than its mesh.
     """
     if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
         raise InputError(
@@ -191,7 +192,7 @@ def paired_shot(
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the sampled pair, as `sample_pair` returns it.
     - `radius`: the radius of the neighbourhoods, in `Pair.units_of_length`.
 
     **Returns:** The descriptors of X (m, 352) and of Y (n, 352), where m and n are the numbers of compared

@@ -109,10 +109,10 @@ class Correspondence:
     def surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of X as a point on a triangle of Y.
 
-        The last stage embeds X and Y in a common space. Each vertex of X is mapped to the nearest point on
-        the triangles of Y in this space, whereas `pointwise_map` contains the nearest vertex; see
-        `jaxsmw.functional_maps.decode_to_triangles`. An unreferenced vertex of X receives the point of the
-        nearest referenced vertex.
+        The last stage embeds X and Y in a common space. In this space, each vertex of X is mapped to the
+        nearest point on the triangles of Y; see `jaxsmw.functional_maps.decode_to_triangles`. In contrast,
+        `pointwise_map` contains the nearest vertex of Y. An unreferenced vertex of X receives the point of
+        the nearest referenced vertex.
 
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
@@ -126,11 +126,11 @@ class Correspondence:
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def one_to_one(self) -> Int64[np.ndarray, " m"]:
-        """Compute a map in which no two vertices of X share a match; see `jaxsmw.geometry.one_to_one_map`.
+        """Compute a map in which no two referenced vertices of X share a match.
 
-        The map is intended for shapes with the same triangulation. Between different triangulations,
-        `pointwise_map` has much smaller errors. Unreferenced vertices of X are an exception: each shares the
-        match of the nearest referenced vertex.
+        See `jaxsmw.geometry.one_to_one_map`. The map is intended for shapes with the same triangulation.
+        Between different triangulations, `pointwise_map` has much smaller errors. An unreferenced vertex of X
+        receives the match of the nearest referenced vertex.
 
         **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
@@ -157,15 +157,14 @@ class Correspondence:
 
         **Arguments:**
 
-        - `temperature`: a positive number, in units of the area-weighted mean squared distance from the
-          embedded vertices of X to their nearest embedded vertices of Y (see `jaxsmw.learning.sinkhorn`). A
-          temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A temperature of 1 gives
-          a softer map than 0.3.
+        - `temperature`: a positive number; see `jaxsmw.learning.sinkhorn`. The unit of the temperature is the
+          area-weighted mean squared distance from the embedded vertices of X to their nearest embedded
+          vertices of Y. A temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A
+          temperature of 1 gives a softer map than 0.3.
         - `iterations`: the largest number of iterations, an integer of at least 1.
         - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
           the area that vertices of Y receive in excess of their own areas. A tolerance below a few hundredths
-          leads to further iterations that only move area across the body. These iterations do not improve a
-          map between two different bodies.
+          leads to further iterations, which do not improve a map between two different bodies.
 
         **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y. Its method `pull_back` takes
         p functions on Y (n, p) to functions on X (m, p), and its method `pointwise_map` returns a map X -> Y
@@ -255,16 +254,17 @@ def match(
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
     The function issues a `UserWarning` if the map still looks wrong after repair, or if a mesh is too coarse
-    for descriptors that a preset uses.
+    for the descriptors of the preset.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement, which is one of the following. Presets (the first four choices) are
-      adapted to small meshes: they use at most half as many eigenvectors as vertices, and no samples if a
-      mesh does not have more vertices than samples. Stages of your own are used unchanged.
+    - `preset`: the method of refinement, which is one of the following. A preset (one of the first four
+      choices) uses at most half as many eigenvectors as the smaller mesh has vertices. A preset uses all
+      vertices instead of samples if a mesh does not have more vertices than samples. Stages of your own are
+      used unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -279,34 +279,36 @@ def match(
           the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative initial maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
-          with the Laplacian (section 3.2 of the MWP paper). It is smoother than the initial map `"shot"` and
-          has smaller errors. However, the map after refinement often has larger errors than with `"shot"`
+          with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
+          `"shot"` and has smaller errors. However, the refined map often has larger errors than with `"shot"`
           (docs/results.md).
         - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
-          0-based. The initial map then consists of nearest neighbours in SHOT and in geodesic distances to
-          the landmarks. Give a few landmarks on both sides of the body.
+          0-based. The initial map then sends each vertex of X to the vertex of Y with the most similar
+          features. The features are SHOT and the geodesic distances to the landmarks. Give a few landmarks on
+          the left side and on the right side of the body.
 
-    - `laplacian`: the discretization of the Laplacian: `"cotangent"`; `"robust"`, which also handles
-      non-manifold and badly shaped meshes; or `"auto"` (the default), which chooses `"robust"` only for
-      meshes that need it.
-    - `eigensolver`: `"exact"`; `"approximate"`, which takes less time on large meshes; or `"auto"` (the
-      default), which chooses `"approximate"` if one mesh has at least 50 000 referenced vertices.
+    - `laplacian`: the discretization of the Laplacian: `"cotangent"`, `"robust"` or `"auto"` (the default).
+      `"robust"` also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh
+      with degenerate triangles or edges with more than two faces, else `"cotangent"`.
+    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"` (the default). `"approximate"` takes less time on
+      large meshes. `"auto"` chooses `"approximate"` if one mesh has at least 50 000 referenced vertices, else
+      `"exact"`.
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`. False, the default, for two full shapes.
     - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
 
-    **Returns:** A `Correspondence`. Its attributes include `pointwise_map` (m,), an int64 array of 0-based
-    vertices of Y, and `functional_map`, `spectrum_x`, `spectrum_y`, `distortion` and `suspicious`. An
-    unreferenced vertex of X (in no face) receives the match of the nearest referenced vertex. Unreferenced
-    vertices of Y are never matched.
+    **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
+    vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,
+    `distortion` and `suspicious`. An unreferenced vertex of X (in no face) receives the match of the nearest
+    referenced vertex. Unreferenced vertices of Y are never matched.
 
     **Raises:** `InputError` if a mesh cannot be used or has too few vertices, if the preset or the initial
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
     computation of the initial map or the refinement fails numerically.
     """
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
-    adapts = isinstance(preset, str | Preset)  # given stages keep their sizes
+    adapts = isinstance(preset, str | Preset)  # stages of the caller are used unchanged
     chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)

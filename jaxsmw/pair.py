@@ -73,10 +73,10 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The lengths that serve as units on X and on Y, in the units of the meshes.
+        """The units of length on X and on Y, each as a length in the unit of its mesh.
 
-        For two full shapes, the units are the square roots of the areas of X and of Y. Such units compensate
-        for a difference in size. For a partial pair, both units are the square root of the larger area.
+        For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
+        a difference in size. For a partial pair, both units are the square root of the larger area.
         """
         roots = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         return (max(roots),) * 2 if self.partial else roots
@@ -139,7 +139,7 @@ def paired_spectra(
         lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
         *pair.meshes,
     )
-    # This conversion runs outside of the threads, because threads do not inherit `jax.enable_x64`.
+    # `as_spectrum` runs outside of the threads, because threads do not inherit `jax.enable_x64`.
     spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
     if not pair.partial:
         return spectrum_x, spectrum_y
@@ -156,10 +156,9 @@ def paired_spectra(
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Remove the eigenpairs whose eigenvalues are not in the range of both spectra.
+    """Remove eigenpairs above the smaller of the two shapes' largest eigenvalues.
 
-    Eigenpairs above the smaller of the two shapes' largest eigenvalues are removed. The MWP paper uses this
-    rule for partial shapes.
+    The MWP paper uses this rule for partial shapes.
 
     **Arguments:**
 

@@ -76,7 +76,7 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # Refinement returns int32 maps. If this map had another type, JAX would compile another program.
+        # Refinement returns int32 maps. For a map of another type, JAX would compile another program.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
@@ -106,16 +106,17 @@ def prepare(
       descriptors are computed.
     - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
       are computed.
-    - `init`: the initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"`; a pointwise map
-      (m,) of 0-based vertices of Y; m `SurfacePoints` on Y; or landmarks (l, 2), with a vertex of X and its
-      match on Y in each row. See `match`.
+    - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
+      `"functional"`, a pointwise map (m,) of 0-based vertices of Y, m `SurfacePoints` on Y, or an array (l,
+      2) of landmarks. Each row contains a vertex of X and its match on Y.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
       function issues a `UserWarning` instead, and the spectra contain no descriptors.
 
-    **Returns:** A `PreparedPair`. Its attributes include `spectrum_x`, `spectrum_y`, the pointwise map
-    `initial_map` (m,), and `samples`, a pair of arrays of vertices of X and of Y (None without samples).
+    **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
+    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays of vertices of
+    X and of Y; None if no samples were requested.
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required

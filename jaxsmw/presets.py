@@ -28,8 +28,8 @@ class Preset:
       repair.
 
     **Raises:** `InputError` if there is no stage, if an attribute has another type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised if the refiner of the stage at this position has no
-    levels, or if the stage has fewer samples than the largest of `repair.fallback_levels`.
+    position `repair.stage`. `InputError` is also raised if the refiner of the stage that repair repeats has
+    no levels, or if this stage has fewer samples than the largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]

@@ -1,4 +1,4 @@
-"""A stage of refinement, which is a refiner with its sizes. JAX compiles each stage as one program."""
+"""A stage of refinement, which JAX compiles as one program."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from jaxsmw.runtime.compilation import compile_ahead, compiled
 
 @dataclass(frozen=True, init=False)
 class Stage:
-    """A stage of refinement for `jaxsmw.match` or a `Preset`: a refiner, and the sizes with which it runs.
+    """A stage of refinement: a refiner with its numbers of eigenvectors, iterations, descriptors and samples.
 
-    All arguments except `refiner` are keyword arguments. All arguments become attributes of the same names.
+    `jaxsmw.match` and `Preset` accept stages. All arguments except `refiner` are keyword arguments. All
+    arguments become attributes of the same names.
 
     **Attributes:**
 
@@ -34,10 +35,10 @@ class Stage:
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
     - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
-      refiner with levels, such as `Registration(levels=(35, 60))`, leave the argument out, because the number
-      is then the largest level.
+      refiner with levels, such as `Registration(levels=(35, 60))`, leave the argument out, because the
+      largest level is used.
     - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
-      argument out, because the number is then the number of levels.
+      argument out, because each level is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates, at least the
@@ -45,8 +46,9 @@ class Stage:
       means that all iterations use all vertices.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
-    **Raises:** `InputError` if `refiner` is not a `Refiner`; if a size is not a whole number, is out of range
-    or contradicts the refiner's levels; or if there are fewer samples than eigenvectors.
+    **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
+    `InputError` is also raised if a number of eigenvectors, iterations, descriptors or samples is not an
+    integer, is out of range or contradicts the refiner's levels.
     """
 
     refiner: Refiner
@@ -245,7 +247,7 @@ class Stage:
     ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Any]]:
         """Return the positional and keyword arguments of `jaxsmw.refine` that contain arrays.
 
-        `run` and `compile_ahead` both call this method, so both use the same compiled program.
+        `run` and `compile_ahead` call this method so that they use the same compiled program.
         """
         chosen = None
         if self.number_of_samples is not None and samples is not None:
@@ -254,7 +256,7 @@ class Stage:
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """Return the size that the refiner's levels require or, without levels, the given or default size."""
+    """Return the number that the refiner's levels determine, else the given number, else the default."""
     if derived is None:
         return default if given is None else given
     if given is not None and given != derived:

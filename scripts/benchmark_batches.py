@@ -8,10 +8,10 @@ take turns in one process:
 - a Python loop over `refine`;
 - `jax.lax.map`;
 - `jax.vmap` with several batch sizes;
-- `jaxsmw.refine_pairs`. The time of this candidate includes the transfer of initial maps and results.
+- `jaxsmw.refine_pairs`. The time of `refine_pairs` includes the transfer of initial maps and results.
 
 The lower bound is the time that the matrix products of all iterations take in full float32 precision. The
-table also states the temporary memory of each compiled program. This memory excludes the program's arguments.
+table also states the temporary memory of each compiled program, without the program's arguments.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Measures the times of the parts of the library, and compares them with lower bounds or other libraries.
+"""Measures how long parts of the library take, and compares these times with lower bounds or other libraries.
 
     python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
 
-- `refinement`: the time of three iterations in float32 with 100 eigenvectors, as in the MWP paper, for
-  several sizes. The candidates are exhaustive search, search in patches, refinement on samples, and a plain
-  argmin over stored distances. The lower bound is the time of three matrix products (m x k) (k x n), in the
-  fastest of several implementations.
+- `refinement`: the time of three iterations in float32 with 100 eigenvectors (as in the MWP paper), for
+  shapes of several sizes. The candidates are exhaustive search, search in patches, refinement on samples, and
+  a plain argmin over stored distances. The lower bound is the time of three products of an (m x k) and a (k x
+  n) matrix, in the fastest of several implementations.
 - `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert
   `eigsh` with default settings. The note above the table states the errors of the approximate eigenvalues.
 - `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
@@ -16,8 +16,8 @@
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
 - `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
-  each size in a new process. The table states times, peak memory and errors. It also states the exponents of
-  power laws that are fitted to time and memory as functions of the number of vertices.
+  each size in a new process. The table states times, peak memory and errors. The table also states the
+  exponents of power laws in the number of vertices, fitted to time and memory.
 
 The candidates of a comparison take turns in one process, so other load on the machine affects all candidates.
 Each ratio is computed from median times. The shapes are procedural creatures. To obtain the large shapes, the
@@ -397,8 +397,8 @@ class Truth(NamedTuple):
     def error(self, pointwise_map: np.ndarray, target: Mesh) -> float:
         """Return the mean geodesic error in thousandths of the square root of the target's area.
 
-        The map may belong to subdivided versions of both meshes (see `finer`). In this case, `target` is the
-        subdivided target, and each match is replaced by the nearest vertex of the original target.
+        `target` may be a subdivided version of the target (see `finer`). Each match is replaced by the
+        nearest vertex of the original target.
         """
         coarse = self.meshes[1]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
@@ -455,8 +455,8 @@ def split_faces(
     **Arguments:**
 
     - `faces`: the faces of the mesh (f, 3).
-    - `middles`: for each face and corner, the new vertex on the edge from this corner to the next corner, or
-      -1 if this edge is not split (f, 3).
+    - `middles` (f, 3): the new vertex on the edge from each corner to the next corner; -1 if the edge is not
+      split.
     - `number`: the number of split edges, 0 to 3. With 3 split edges, a face becomes four similar faces.
 
     **Returns:** The subdivided faces (g, 3).
@@ -496,7 +496,7 @@ def peak_memory() -> float:
 def matched_from_files(
     files: list[str], preset: PresetName
 ) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
-    """Match two mesh files, and measure the stages.
+    """Match two mesh files, and measure the time and the memory of each stage.
 
     **Returns:** Two lists. The first list contains a tuple of name, seconds and peak memory in GiB for each
     stage. The second list contains the initial map and the refined map.
@@ -595,7 +595,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
             runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
         our_initial_map(*files)
         measured: dict[str, dict[str, Any]] = {}
-        for turn in range(2 if options.quick else 4):  # the first turn includes compilation
+        for turn in range(2 if options.quick else 4):  # the first run of each library includes compilation
             for name, run in runs.items():
                 if turn > 1 and name.startswith("geomfum"):
                     continue  # geomfum is timed only once, because each of its runs takes a minute
@@ -738,7 +738,8 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # Dotted lines show runs without our compiler options, in the colour of the run with them.
+            # A dotted line shows a run without our compiler options, in the colour of the run with these
+            # options.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

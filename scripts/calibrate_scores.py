@@ -1,4 +1,4 @@
-"""Measures how reliable expected errors and scores are, although they are computed without ground truth.
+"""Compares expected errors and scores, which need no ground truth, with true errors.
 
     python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME]
         [--output FILE.md]
@@ -12,10 +12,10 @@ The script draws pairs at random from each data set (see `docs/datasets.md`) and
 - For the second table, the script sorts the vertices of all pairs by expected error, and divides them into
   ten groups of equal size. The table states the true errors of each group.
 - The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
-  this table only for the preset `accurate`. The table covers only full shapes whose mirrored ground truth
-  consists of vertices. To compute the mirrored map, the script starts from the mirrored ground truth, and
-  runs all stages except the first without repair. To compute the uncertainty of a map, the script runs a
-  feature regression with this map as its initial map.
+  this table only for the preset `accurate`. The table covers only pairs of full shapes with a mirrored ground
+  truth that maps vertices to vertices. To compute the mirrored map, the script starts from the mirrored
+  ground truth, and runs all stages except the first without repair. To compute the uncertainty of a map, the
+  script runs a feature regression with this map as its initial map.
 """
 
 from __future__ import annotations

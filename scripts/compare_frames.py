@@ -1,4 +1,4 @@
-"""Compares frames, updates of the functional map, and conventions on remeshed FAUST and TOSCA.
+"""Compares frames, conventions and ways to compute the functional map, on remeshed FAUST and TOSCA.
 
     python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
                                      [--workers N] [--quick]
@@ -13,7 +13,7 @@ line. The script writes the figures and these files to the output directory:
 - `results.csv`: the results of each variant on each pair;
 - `parameters.csv`: the errors for each number of eigenvectors, filters and iterations;
 - `invariance.csv`: the similarity of wavelets around corresponding points;
-- `times.csv`: the time of each update of the functional map and of the nearest-neighbour search;
+- `times.csv`: the times of each way to compute the functional map, and of the nearest-neighbour search;
 - `provenance.json`: versions, machine, seeds and settings.
 
 After an interruption, the same command continues from the saved results.
@@ -185,7 +185,7 @@ def run(data: Path, journals: Journals, workers: int) -> None:
 def measured_times(
     output: Path, data: Path, pairs: list[PairName], measured: list[Variant], settings: Settings
 ) -> list[Row]:
-    """Return the time of each update of the functional map, from `times.csv` if this file exists.
+    """Return the time of each way to compute the functional map, from `times.csv` if this file exists.
 
     If the file does not exist, one process measures the times while no other part of this study runs.
     """

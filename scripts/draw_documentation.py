@@ -33,7 +33,7 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# For smoothly coloured bodies, 256 dithered colours are enough. They reduce the files to a third of the size.
+# For smoothly coloured bodies, 256 dithered colours are enough, and reduce the files to a third of the size.
 COLORS = 256
 
 
@@ -46,7 +46,7 @@ class Case(NamedTuple):
     - `source`, `target`, `truth`: the two meshes and their ground truth.
     - `failing`: options of `jaxsmw.match` with which the match fails.
     - `cure`: options with which the match succeeds; None if there are no such options.
-    - `up`: the vertical axis of both shapes. If it is None, the drawing function chooses the axis.
+    - `up`: the vertical axis of both shapes; None if the drawing function chooses the axis.
     """
 
     name: str

@@ -11,9 +11,10 @@ and a soft map from the descriptors of two shapes. Gradients pass through the la
 of Adam (optax) uses one pair of the first five people of FAUST. The script trains one network with the loss
 `labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
-The script then tests both networks on pairs of the other people and of TOSCA. The preset `paper` refines each
-pair from four initial maps. Each initial map is a nearest-neighbour search among descriptors. The descriptors
-are SHOT, or the output of the untrained network or of one of the trained networks. The script writes:
+The script then tests both networks on pairs of the other five people of FAUST and on pairs of TOSCA. The
+preset `paper` refines each pair from four initial maps. Each initial map sends each vertex of X to the vertex
+of Y with the nearest descriptors. The four kinds of descriptors are SHOT, and the outputs of the untrained
+network and of the two trained networks. The script writes:
 
 - `summary.md`: the comparison;
 - `curves.png`: the losses against the training steps;
@@ -89,7 +90,7 @@ WATCHED_PAIRS = 4
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes of a network. They determine the shapes of all arrays of the network.
+    """The sizes of a network, which determine the shapes of all its arrays.
 
     **Attributes:**
 
@@ -121,8 +122,8 @@ class WaveletBlock(eqx.Module):
 
     The block filters every channel on the surface. The filter of a channel is a weighted sum of the squared
     filters of a Meyer frame, with learned weights. At each vertex, two dense layers take the normalised and
-    the filtered features, and the block adds the output of these layers to the features. The result does not
-    depend on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
+    the filtered features. The output of the dense layers is added to the features. The result does not depend
+    on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
     """
 
     shares: Float[Array, "filters width"]
@@ -181,7 +182,7 @@ class DescriptorNetwork(eqx.Module):
                 "Spectrum.with_descriptors"
             )
         waves = wave_kernel_signature(spectrum, dimensions=self.sizes.waves) - 1
-        # Each SHOT descriptor has norm 1. This factor gives its entries a mean square of 1.
+        # This factor scales the entries of SHOT descriptors, which have norm 1, to a mean square of 1.
         inputs = jnp.concatenate([given * self.sizes.inputs**0.5, waves], axis=1)
         features = jax.vmap(self.enter)(inputs)
         for block in self.blocks:
@@ -197,7 +198,7 @@ def layer() -> WaveletPreservationLayer:
 
 
 class Shape(NamedTuple):
-    """The spectrum with SHOT descriptors, and the positions, of the s sampled vertices of a shape."""
+    """The s sampled vertices of a shape: their spectrum with SHOT descriptors, and their positions."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
@@ -212,7 +213,7 @@ class TrainingPair(NamedTuple):
 
 
 class Source(NamedTuple):
-    """A mesh, the numbers of its sampled vertices, and the shape restricted to these vertices."""
+    """A mesh, the indices of its sampled vertices, and the shape restricted to these vertices."""
 
     mesh: Mesh
     samples: Int[np.ndarray, " s"]
@@ -317,7 +318,7 @@ LOSSES: dict[str, Callable[[DescriptorNetwork, TrainingPair], Float[Array, ""]]]
 
 
 def save(network: DescriptorNetwork, path: Path) -> None:
-    """Write a network to a file. The first line is JSON with the sizes and the float type; arrays follow."""
+    """Write a network to a file, as a line of JSON (sizes and float type) followed by the arrays."""
     header = {"sizes": asdict(network.sizes), "dtype": str(network.leave.weight.dtype)}
     with atomic_write(path) as temporary, open(temporary, "wb") as stream:
         stream.write(json.dumps(header).encode() + b"\n")

@@ -14,12 +14,13 @@ of Adam (optax) uses one pair of shapes of the first five people of FAUST. Gradi
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
   This loss needs no ground truth.
 
-The distance of a point is a root mean square, weighted by the shares of the soft maps.
+Both losses measure the distance of a soft match as a root mean square, weighted by the shares of the soft
+map.
 
-The script then tests the frames on pairs of the five other people and of TOSCA. `jaxsmw.refine` refines each
-pair with the Meyer frame and with both trained frames, from the same initial map. The script writes
-`summary.md` with the errors, and `frames.png` with the filters and losses. It also writes the logits of the
-trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
+The script then tests the frames on pairs of the other five people of FAUST and on pairs of TOSCA.
+`jaxsmw.refine` refines each pair with the Meyer frame and with both trained frames, from the same initial
+map. The script writes `summary.md` with the errors, and `frames.png` with the filters and losses. The script
+also writes the logits of the trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
 `Warped(SoftmaxFrame(logits), Power())`. After an interruption, the same command continues from the saved
 state.
 """
@@ -105,7 +106,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 
 def like_meyer() -> SoftmaxFrame:
-    """Return a frame close to the Meyer frame, but with positive filters only, from which training starts."""
+    """Return the frame from which training starts: close to the Meyer frame, with positive filters only."""
     return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 

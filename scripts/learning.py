@@ -44,9 +44,9 @@ class Data(NamedTuple):
 
     **Attributes:**
 
-    - `seen`: the pairs of the training people that the pair list of FAUST contains.
-    - `seen_further`: the other pairs of the training people that have ground truth.
-    - `unseen`: the pairs of the other people that the pair list of FAUST contains, for evaluation.
+    - `seen`: the pairs of the training people in the pair list of FAUST.
+    - `seen_further`: all other pairs of the training people that have ground truth.
+    - `unseen`: the pairs of the other people in the pair list of FAUST, for evaluation.
     - `animals`: the pairs of TOSCA, for evaluation.
     """
 
@@ -57,7 +57,7 @@ class Data(NamedTuple):
 
 
 def person(shape: str) -> int:
-    """Return the number of the person of a shape. FAUST numbers the ten poses of a person consecutively."""
+    """Return the person's number for a shape. FAUST numbers the ten poses of a person consecutively."""
     return int(shape.rsplit("_", 1)[1]) // POSES
 
 
@@ -96,13 +96,14 @@ def root_mean_square(
     positions: Float[Array, "s 3"],
     wanted: Float[Array, "s 3"],
 ) -> Float[Array, ""]:
-    """Return the mean distance between the soft matches of points and the target positions of these points.
+    """Return the mean distance between the soft match of each point and its target position.
 
-    The distance of one point is a root mean square, weighted by the shares of the soft map.
+    The distance of a soft match is a root mean square, weighted by the shares of the soft map.
 
     **Arguments:**
 
-    - `carried`: a function that pulls functions back by one soft map or by several soft maps in turn.
+    - `carried`: a function that pulls functions back by one soft map, or by several soft maps one after the
+      other.
     - `positions`: the vertex positions of the shape from which `carried` pulls functions back.
     - `wanted`: the target position of each point.
     """

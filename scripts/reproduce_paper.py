@@ -6,8 +6,8 @@
 DATA_DIRECTORY contains data sets in the layouts of `docs/datasets.md`, each in its own directory. Each
 experiment uses only the data sets that suit this experiment:
 
-- `table1`: error and refinement time of all methods (Table 1), time with precomputation (Table 2) and
-  correspondence quality curves (Fig. 4), on data sets in which each pair belongs to one class;
+- `table1`: all methods, on data sets in which each pair belongs to one class. The results are errors and
+  refinement times (Table 1), times with precomputation (Table 2), and correspondence quality curves (Fig. 4);
 - `fig6`: partial shapes, separately for cuts and holes;
 - `fig7`: shapes with topological noise;
 - `fig9`: targets with other triangulations and resolutions, and other initial maps;
@@ -59,7 +59,7 @@ _MIRRORED = {"wks", "hks", "wavelet"}
 
 
 class Run(NamedTuple):
-    """One benchmark. It fills one column in the table of its experiment."""
+    """One benchmark, which fills one column in the table of its experiment."""
 
     experiment: str
     name: str
@@ -70,7 +70,7 @@ class Run(NamedTuple):
 
 
 def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
-    """Opens the data sets with the given names in a directory, or all data sets if there are no names.
+    """Opens the data sets with the given names in a directory, or all data sets if no names are given.
 
     **Raises:** `InputError` if a named data set cannot be opened, or if there is no data set.
     """
@@ -154,8 +154,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # Some directories contain published initial maps. Other directories contain results, and their names
-        # begin with the name of the directory with the initial maps of these results.
+        # The name of a directory with results begins with the name of the directory with its initial maps.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -224,7 +223,7 @@ def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = Fa
 
 
 def published(data_set: DataSet) -> list[str]:
-    """Returns the directories with maps that come with a data set."""
+    """Returns the directories of the published maps of a data set."""
     return sorted(str(path) for path in (data_set.directory / "maps").glob("*") if path.is_dir())
 
 
@@ -234,8 +233,7 @@ def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# The first item is the new mesh. For each new vertex, the second item states the old vertex at the same
-# position, or -1 if there is no such vertex.
+# A new mesh and, for each of its vertices, the old vertex at the same position (-1 if there is none).
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 

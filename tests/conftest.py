@@ -60,7 +60,7 @@ def one_thread_each() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Set one cache of compiled programs for all commands that the tests start."""
+    """Share one cache of compiled programs among all commands that the tests start."""
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:

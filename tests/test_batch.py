@@ -160,7 +160,7 @@ def test_the_estimated_memory_of_a_pair_agrees_with_the_compiler(m, n, k):
 
 
 def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
-    # Run-time type checks are disabled, because they would raise errors before the library raises its own.
+    # Run-time type checks are disabled, so the library itself raises the errors.
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     spectra, starts = make_problem()
     with pytest.raises(ValueError, match="shape 0 is a str, but a Spectrum is needed"):

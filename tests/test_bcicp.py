@@ -44,7 +44,7 @@ def permuted(mesh: Mesh, seed: int = 0) -> tuple[Mesh, Spectrum, np.ndarray]:
 
 
 def scrambled(truth: np.ndarray, mesh: Mesh, seed: int = 1) -> np.ndarray:
-    """An initial map with 10 % random matches, in which a connected cap is matched to the opposite side."""
+    """Return `truth` with 10 % random matches, and with a cap of the mesh matched to the opposite side."""
     generator = np.random.default_rng(seed)
     initial_map = np.where(generator.random(len(truth)) < 0.1, generator.permutation(truth), truth)
     cap = mesh.vertices @ [0.6, 0.0, 0.8] > 0.8

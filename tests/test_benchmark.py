@@ -98,7 +98,6 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
 
 @pytest.mark.cluster
 def test_each_result_arrives_once_although_a_dask_worker_is_killed(scape, tmp_path):
-    """A real Dask scheduler and two workers communicate over the loopback interface."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     started = [
         subprocess.Popen(
@@ -236,7 +235,6 @@ class LocalExecutor(Executor):
 
 
 def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
-    """Run a benchmark in this process."""
     data_set = open_data_set(data)
     chosen, every = choose_pairs(data_set, pairs, 0), Settings(evaluated_points=100, **settings)
     return run_benchmark(data_set, chosen, output, find_methods(names), every, LocalExecutor())
@@ -244,8 +242,6 @@ def run_here(names, output: Path, data: Path, pairs="2", **settings) -> Results:
 
 @pytest.fixture
 def measure(scape, tmp_path):
-    """`run_here` on the shapes of `scape`, with results in the temporary directory of the test."""
-
     def run(names, *, output=tmp_path, data=scape, **options):
         return run_here(names, output, data, **options)
 
@@ -254,7 +250,7 @@ def measure(scape, tmp_path):
 
 @pytest.fixture(scope="module")
 def finished(scape, tmp_path_factory) -> Path:
-    """The results of one method on two pairs."""
+    """A directory with the results of one method on two pairs."""
     directory = tmp_path_factory.mktemp("finished")
     run_here(["initial"], directory, scape)
     return directory
@@ -508,7 +504,7 @@ def test_tables_summarise_the_rows():
 
 
 class Slow(Method):
-    """A method that compiles a program in each run, sleeps for some seconds, and counts its runs."""
+    """A method that sleeps, compiles a program in each run, and counts its runs."""
 
     number_of_eigenvectors = 1
     reference = "nothing"

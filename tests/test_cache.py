@@ -198,7 +198,7 @@ def test_the_limit_removes_the_least_recently_used_entries_but_no_foreign_files(
         for file in directory.glob("test-*"):
             if file.stat().st_mtime > now + 1000:
                 os.utime(file, (now + number, now + number))
-    assert entry(0) == 0  # this use of entry 0 makes entry 1 the least recently used entry
+    assert entry(0) == 0  # entry 1 is now the least recently used entry
     assert entry(3) == 1
     assert not (directory / f".{'0' * 32}.npz").exists() and (directory / "thesis.npz").exists()
     assert [entry(number) for number in (0, 2, 3, 1)] == [0, 0, 0, 1]

@@ -296,7 +296,7 @@ def test_a_page_compares_maps(run, pair, tmp_path):
     means = [mean_error(line) for line in outcome.output.splitlines()]
     assert [name for name, _ in rows] == ["truth", "zero"]
     assert [float(mean) for _, mean in rows] == pytest.approx(means, abs=1e-4)
-    # Two maps from files with the same name are shown under their paths.
+    # If two files have the same name, the page labels their maps with their paths.
     (tmp_path / "other").mkdir()
     np.savetxt(tmp_path / "other" / "zero.txt", np.ones(642), fmt="%d")
     two = tmp_path / "zero.txt", tmp_path / "other" / "zero.txt"
@@ -308,7 +308,7 @@ def test_a_page_compares_maps(run, pair, tmp_path):
 def test_a_page_of_a_partial_shape_uses_a_common_range_of_eigenvalues(run, pair, tmp_path):
     call = ["render", pair / "x.off", pair / "y.ply", pair / "truth.txt", "--output", tmp_path / "p.html"]
     assert run(*call, "--partial").code == 0
-    # The smaller shape has fewer eigenvalues in the common range.
+    # In the common range, the smaller shape has fewer eigenvalues than the larger shape.
     functional = shown_maps(tmp_path / "p.html")[0]["functional"]
     rows = len(base64.b64decode(functional["values"])) // (4 * functional["columns"])
     assert rows < 30 < functional["columns"] == 100
@@ -351,7 +351,7 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
         assert outcome.code == 0 and "is read with indices from 1, as usual in MATLAB" in outcome.errors
     found = scipy.io.loadmat(written)["T12"]
     np.testing.assert_array_equal(found[:, 0] - 1, np.loadtxt(tmp_path / "map.txt"))
-    # The map and the ground truth are both read with indices from 1. A note reports this for each file.
+    # The command reads indices from 1 in the map and in the ground truth, and prints a note for each file.
     call = ("evaluate", *meshes, tmp_path / "truth.mat", "--ground-truth", tmp_path / "truth.mat", "--quiet")
     outcome = run(*call)
     assert outcome.code == 0 and mean_error(outcome.output) == 0
@@ -416,7 +416,7 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
     assert outcome.code == 0, outcome.errors
     initial, surface, refined = (line for line in outcome.output.splitlines() if "map:" in line)
     assert surface.startswith("surface map:")
-    # The ground truth consists of vertices, so only a map to vertices can have matches without any error.
+    # The ground truth consists of vertices, so only maps to vertices can have errors of exactly zero.
     assert mean_error(refined) < mean_error(surface) < 0.02 < mean_error(initial)
 
     mesh_y = read_mesh(y)
@@ -595,7 +595,7 @@ def test_a_closed_pipe_causes_no_error_message(pair):
 def test_the_readme_names_existing_options(run):
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     helps = "".join(run(command, "--help").output for command in COMMANDS)
-    readme = re.sub(r"^python3 .*", "", readme, flags=re.MULTILINE)  # removes options of pip and pytest
+    readme = re.sub(r"^python3 .*", "", readme, flags=re.MULTILINE)  # lines with options of pip and pytest
     for option in set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", readme)) - {"--quiet", "--help"}:
         assert option in helps, option
 

@@ -1,4 +1,4 @@
-"""After Ctrl-C, a process prints one line, is killed by the signal, and leaves no unfinished file."""
+"""After Ctrl-C, a process prints one line, leaves no unfinished file, and is killed by SIGINT."""
 
 import os
 import shlex
@@ -44,7 +44,7 @@ def started(program: str, *arguments: object, start_new_session: bool = False) -
 
 
 def assert_interrupted(process: subprocess.Popen[str], directory: Path | None, *, line: str = LINE) -> None:
-    """Check that the process prints one line, is killed by the signal, and leaves no file in the directory."""
+    """Check that the process prints one line, leaves no file in the directory, and is killed by SIGINT."""
     try:
         output, errors = process.communicate(timeout=60)
     finally:
@@ -114,7 +114,7 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--preset", "paper")
     call += ("--expected-error", tmp_path / "e") if program == IN_A_WRITE else ()
     process = started(program, *call)
-    if program == IN_A_WRITE:  # here the interruption comes after the map is complete
+    if program == IN_A_WRITE:  # this program is interrupted after it has written the map
         process.wait(timeout=60)
         (tmp_path / "m").unlink()
     assert_interrupted(process, tmp_path)
@@ -122,7 +122,7 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
 
 @pytest.mark.slow
 def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
-    """The signal ends compiled code that would run for hours."""
+    """SIGINT ends compiled code that would run for hours."""
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--iterations", "10000000")
     process = started("", *call)
     for line in process.stderr:
@@ -135,7 +135,7 @@ def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_benchmark_prints_one_line(tmp_path):
-    """A terminal also sends the signal to the workers, but only the main process prints a line."""
+    """A terminal also sends SIGINT to the worker processes, but only the main process prints a line."""
     data, output = tmp_path / "data", tmp_path / "output"
     data.mkdir()
     for number in range(3):
@@ -170,7 +170,7 @@ def test_an_ignored_signal_stays_ignored(pair):
 
 
 def test_a_shell_ends_its_loop_at_an_interruption(pair, tmp_path):
-    """A shell ends its loop only if the signal kills the command, and not if the command exits by itself."""
+    """A shell ends its loop only if SIGINT kills the command, and not if the command exits by itself."""
     call = (
         sys.executable,
         "-m",

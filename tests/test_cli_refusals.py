@@ -260,7 +260,7 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --up z", "--page"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --page {t}/no/e.html", "no/e.html"),
         ("render {x} --output {t}/a.nonsense", "a.nonsense"),
-        ("demo --output {x}", "cannot be made a directory"),
+        ("demo --output {x}", "cannot be created as a directory"),
         ("demo --kind unicorn --output {t}/d", "unicorn"),
         ("demo --vertices 3 --output {t}/d", "3"),
         ("demo --vertices -5 --output {t}/d", "at least 1"),
@@ -300,7 +300,7 @@ def test_two_outputs_of_evaluate_in_one_file_are_refused(run, pair, tmp_path, ou
     ("arguments", "fault"),
     [
         ("spectrum {x} --output {t}/s.npz --figure {t}/../{t.name}/s.npz", "two outputs have this name"),
-        ("match {x} {y} --output {t}/m --report {t}/m/r", "is a path in {t}/m, which is an output file"),
+        ("match {x} {y} --output {t}/m --report {t}/m/r", "is inside {t}/m, which is an output file"),
         ("demo --output {t}/d --init map:{t}/d/map.txt", "d/map.txt: is an input and would be overwritten"),
         ("benchmark {t} --pairs {t} --output {t}", "cannot be read as text"),
     ],

@@ -168,7 +168,7 @@ def test_only_missing_measurements_run_after_a_kill(tmp_path):
     while any(is_alive(int(pid)) for pid, *_ in begun):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    # Remove the last row of the file, and cut off the end of the row before.
+    # Remove the last row of the file, and truncate the second-to-last row.
     lines = results.read_bytes().splitlines(keepends=True)
     kept = [*lines[:-2], lines[-2][:-4]]
     results.write_bytes(b"".join(kept))
@@ -266,7 +266,6 @@ def test_band_mask_is_as_wide_as_the_kernel_but_belongs_to_no_frame():
     mask = variants.band_mask(octaves, octaves, 0.8)
     np.testing.assert_array_equal(mask, mask.T)
     np.testing.assert_allclose(mask[0, [0, 4, 8, 12, 13]], [1, 1, 0.5, 0, 0], atol=1e-12)
-    # The octave is 0 for all eigenvalues up to the edge of the scaling function.
     np.testing.assert_allclose(variants.octaves(np.array([0, 1, 2, 4, 32.0]), 5), [0, 0, 0, 1, 4])
 
 
@@ -344,7 +343,6 @@ def test_measurements_of_a_real_pair_are_consistent(shared):
     assert float(found["error_2"]) < 0.3 * expected
     assert 0 < float(found["moved_2"]) < float(found["changed_2"]) < 1
     assert 0 < float(found["energy"]) < float(found["energy_of_zero"]) == pytest.approx(30, rel=1e-5)
-    # `measure_parameters` and `measure_variants` give nearly the same error.
     parameters = measurement.measure_parameters(pair, name, [(30, 6), (20, 6)], settings)
     assert float(parameters[0]["error_2"]) == pytest.approx(float(found["error_2"]), rel=0.02)
     assert parameters[1]["error_2"] != parameters[0]["error_2"]

@@ -1,4 +1,4 @@
-"""Coherent Point Drift agrees with a dense NumPy implementation and solves cases with a known result."""
+"""Coherent Point Drift agrees with a dense NumPy implementation and recovers known matches."""
 
 import dataclasses
 
@@ -47,7 +47,7 @@ ORDER = np.random.default_rng(1).permutation(N)[:M]
 def deformed(d=3, noise=0.0, seed=0):
     """Return data (M, d) and centroids (N, d).
 
-    The data are a subset of M centroids after a smooth deformation, in another coordinate frame and unit.
+    The data are M of the N centroids after a smooth deformation, a scaling and a translation.
     """
     generator = np.random.default_rng(seed)
     y = generator.uniform(-1, 1, size=(N, d))

@@ -1,4 +1,4 @@
-"""Data sets are recognised by their published layouts, and missing files are named."""
+"""Data sets are recognised by their published layouts, and error messages name missing files."""
 
 import re
 import shutil

@@ -28,7 +28,7 @@ PAGES = sorted(
     path.relative_to(ROOT).as_posix()
     for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
 )
-# The code of each of these pages must compute at least this number of refinements.
+# The smallest number of refinements that the code of each page must compute.
 REFINEMENTS = {
     "README.md": 1,
     "docs/frames.md": 3,
@@ -61,7 +61,7 @@ def commands(page: str) -> list[str]:
 
 
 def mentioned_commands(page: str) -> list[str]:
-    """Return the commands, with their options, in the inline code of a page."""
+    """Return the commands in the inline code of a page, with their options."""
     return re.findall(r"`(jaxsmw [a-z]+ [^`]+)`", (ROOT / page).read_text("utf-8"))
 
 

@@ -1,4 +1,4 @@
-"""Eigenbases agree with known eigenvalues and an independent program, for good and bad meshes."""
+"""Eigenbases agree with known eigenvalues and with an independent program, for good and bad meshes."""
 
 import warnings
 
@@ -84,7 +84,7 @@ def test_results_are_reproducible_with_canonical_signs():
 
 
 def test_components_keep_all_multiplicities():
-    """The spectrum of two spheres and a triangle contains each eigenvalue of a sphere twice, and zero thrice."""
+    """The spectrum of two spheres and a triangle contains each sphere eigenvalue twice, and 0 three times."""
     sphere = make_mesh(*sphere_mesh(3))
     triangle = make_mesh(np.eye(3) + 5, [[0, 1, 2]])
     mesh = joined(sphere, triangle, make_mesh(sphere.vertices + 9, sphere.faces))
@@ -318,7 +318,7 @@ def test_where_the_approximation_fails_the_exact_solver_takes_over(shape):
 
 
 def falls_back(mesh, k):
-    """Return whether the exact solver takes over. Otherwise check that the approximation is accurate."""
+    """Return whether the exact solver takes over. If not, check that the approximation is accurate."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.filterwarnings("always", ".*cannot be approximated", RuntimeWarning)
         approximate, *_ = eigenpairs(mesh, k, eigensolver="approximate")
@@ -327,8 +327,7 @@ def falls_back(mesh, k):
     return bool(caught)
 
 
-# The approximate solver uses subspace cells with a radius of one edge for (60, 40), and of three edges for
-# (120, 10).
+# The cells of the subspace have a radius of one edge for (60, 40), and of three edges for (120, 10).
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])

@@ -1,4 +1,4 @@
-"""Ground truth in all formats, bad files, and the errors and curves computed from ground truth."""
+"""Ground truth is read in all formats, bad files are refused, and geodesic errors and curves are correct."""
 
 import json
 
@@ -198,7 +198,7 @@ class TestBadFiles:
             ("\n1\n2\n3\n4\n", "begins with an empty line"),
             (b"\x00\x01\x02\x03", "is not a text file"),
             (b"\x89PNG\r\n\x1a\n\xff\xfe", "is not a text file"),
-            ("1\n2\n3\n", "has 3 lines, but one is needed for each of the 4 vertices"),
+            ("1\n2\n3\n", "has 3 lines, but needs one for each of the 4 vertices"),
             ("1\n2\n3\n4\n5\n", "has 5 lines"),
             ("1\n\n3\n4\n", "line 2: has 0 numbers instead of 1"),
             ("1\n2 3\n3\n4\n", "line 2: has 2 numbers instead of 1"),
@@ -240,7 +240,7 @@ class TestBadFiles:
             ),
             ("t.txt", "1 9\n4 10\n", "line 2: 10 is not one of the vertices of mesh_y, .* 1 to 9: correct"),
             ("t.txt", "0 8\n3 1\n", "line 1: 0 is not one of .*looks 0-based: pass index_base=0"),
-            ("t.baryc_gt", "1 1 0 0\n" * 3, "has 3 lines, but one is needed for each of the 4 .*of mesh_x"),
+            ("t.baryc_gt", "1 1 0 0\n" * 3, "has 3 lines, but needs one for each of the 4 .*of mesh_x"),
             ("t.baryc_gt", "1 1 0\n" * 4, "line 1: has 3 numbers instead of 4"),
             ("t.baryc_gt", "1 1 0 0\n" * 3 + "9 1 0 0\n", "line 4: 9 is not one of the faces of mesh_y"),
             (
@@ -377,7 +377,7 @@ class TestGeodesicError:
         ("pointwise_map", "truth", "message"),
         [
             ([0, 1, 9], ([0], [0]), "pointwise map on mesh_y: vertex indices must lie between 0 and 8"),
-            ([0, 1, -1], ([0], [0]), "pointwise map on mesh_y: .*number 2 is -1"),
+            ([0, 1, -1], ([0], [0]), "pointwise map on mesh_y: .*entry 2 is -1"),
             ([0.0, 1.0], ([0], [0]), "pointwise map on mesh_y: .*a list of integers"),
             ([], ([0], [0]), "pointwise map on mesh_y: .*a list of integers"),
             ([0, 1, 2], ([0], [9]), "ground truth on mesh_y: vertex indices must lie between 0 and 8"),

@@ -1,4 +1,4 @@
-"""Spectra and maps keep their meaning in other libraries and in MATLAB, and bad input is refused.
+"""Other libraries and MATLAB can use our spectra and maps, and bad input is refused.
 
 Tests of packages that are not installed are skipped. Stand-ins for pyvista and geomfum are always tested.
 `pip install '.[peers]' pyvista` installs all packages.
@@ -165,7 +165,7 @@ def test_an_eigenbasis_in_any_unit_is_scaled_to_area_1(spectra, unit, form):
 def test_vertices_without_area_are_masked(spectra):
     padded = spectra[0].pad(spectra[0].mask.shape[0] + 3)
     vectors = np.asarray(padded.eigenvectors).copy()
-    vectors[-1] = 7  # an eigensolver may return any value for such a vertex
+    vectors[-1] = 7  # an eigensolver may return any value for a vertex without area
     found = make_spectrum(padded.eigenvalues, vectors, padded.vertex_areas)
     same_spectrum(found, padded, tolerance=1e-12)
 
@@ -370,7 +370,7 @@ def test_maps_are_written_and_read_as_npy_files(tmp_path, bodies):
         (np.array(["a", "b"]), "contains an array of type <U1 and shape"),
         (np.array([None, 1]), "is not an array saved by NumPy"),
         (np.zeros(3, complex), "contains an array of type complex128 and shape"),
-        (np.zeros(3), "has 3 rows, but one is needed"),
+        (np.zeros(3), "has 3 rows, but needs one"),
         (None, "is not an array saved by NumPy"),
     ],
 )
@@ -421,7 +421,7 @@ def test_a_shape_for_matlab_has_consistent_fields(bodies, spectra, tmp_path):
     surface = shape["surface"][0, 0]
     assert surface["X"].shape == (n, 1) and surface["TRIV"].dtype == np.float64
     np.testing.assert_array_equal(surface["TRIV"], body.faces + 1)
-    # Like the spectrum, all fields describe the surface after scaling to area 1.
+    # All fields describe the surface after scaling to area 1.
     mesh = jaxsmw.read_mesh(tmp_path / "x.mat")
     np.testing.assert_allclose(mesh.area, shape["area"].item(), rtol=1e-12)
     np.testing.assert_allclose(mesh.vertex_areas, shape["A"].diagonal(), rtol=1e-9)
@@ -542,7 +542,7 @@ BASIS = {"evals": np.arange(3.0), "evecs": np.eye(8, 3)}
 BAD_VARIABLES = {
     "map counted from 0": ("pointwise map", {"T12": np.arange(M) % N}, r"row 1: 0 is not .* numbered 1 to 162.*--index-base 0"),
     "map out of range": ("pointwise map", {"T12": np.arange(M) % N + 2}, "row 162: 163 is not one of the vertices of y"),
-    "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but one is needed for each of the 642"),
+    "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but needs one for each of the 642"),
     "map of fractions": ("pointwise map", {"T12": np.full(M, 1.5)}, "row 1: 1.5 is not one of"),
     "map of NaN": ("pointwise map", {"T12": np.full(M, np.nan)}, "row 1: nan is not one of"),
     "map as a matrix": ("pointwise map", {"T12": np.ones((M, 2))}, "contains 'T12', but no list of numbers"),

@@ -177,10 +177,10 @@ def test_vmap_equals_a_loop(pair):
 def test_arrays_with_a_wrong_number_of_rows_are_refused(pair):
     x, _, _, _ = pair
     with pytest.raises(
-        ValueError, match=rf"descriptors have shape \(3, 2\); one row per vertex .*\({M}, d\)"
+        ValueError, match=rf"descriptors have shape \(3, 2\), but \({M}, d\) .* one row for each vertex"
     ):
         x.with_descriptors(jnp.zeros((3, 2)))
-    with pytest.raises(ValueError, match=rf"positions have shape .*; one row per vertex .*\({M}, 3\)"):
+    with pytest.raises(ValueError, match=rf"positions have shape .*, but \({M}, 3\) .* one row for each"):
         x.with_positions(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
 
 

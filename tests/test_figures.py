@@ -56,7 +56,7 @@ def test_correspondence_transfers_colors() -> None:
     assert np.abs(wrong["Source"].astype(int) - shown["Source"]).max() > 50
     covered = np.mean(shown["Source"][..., 3] == 255)
     assert 0.15 < covered < 0.5
-    # The figure shows the rendered panel without resampling.
+    # The figure contains the rendered picture without resampling.
     image = pixels(figure)
     target = shown["Target"]
     inside = target[..., 3] == 255

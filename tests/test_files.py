@@ -162,5 +162,5 @@ def test_check_directory_creates_nothing_and_refuses_impossible_paths(tmp_path):
     check_directory(tmp_path / "new" / "one")
     check_directory(tmp_path / "kept")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "kept"]
-    with pytest.raises(InputError, match="cannot be made a directory"):
+    with pytest.raises(InputError, match="cannot be created as a directory"):
         check_directory(tmp_path / "file" / "one")

@@ -38,7 +38,7 @@ WARPS = {
     "power": Power(),
     "distribution": SpectralDistribution(),
 }
-# These banks are Parseval frames for every number of filters from 5.
+# These banks are Parseval frames if they have at least 5 filters.
 PARSEVAL_OF_ANY_SIZE = {
     "meyer": Meyer,
     "simple tight": SimpleTight,
@@ -72,14 +72,14 @@ BANKS = PARSEVAL | {
 
 
 def spectrum(seed=0, k=30, lambda_max=50.0):
-    """Returns simple, unevenly spaced eigenvalues that start from zero."""
+    """Returns k distinct, unevenly spaced eigenvalues from 0 to lambda_max."""
     steps = np.random.default_rng(seed).uniform(0.1, 2, k - 1)
     return jnp.asarray(np.concatenate([[0], np.cumsum(steps)]) * (lambda_max / steps.sum()))
 
 
 @jax.jit
 def sample(bank, points, eigenvalues):
-    """Samples a bank. The program is compiled once per bank, which keeps the tests fast."""
+    """Samples a bank with a program that JAX compiles only once per bank."""
     return bank(points, eigenvalues)
 
 
@@ -217,7 +217,7 @@ def test_a_softmax_frame_resembles_another_bank_at_its_knots():
     for bank in (Meyer(5), Itersine(4)):
         similar = SoftmaxFrame.like(bank, 33, floor=1e-6)
         np.testing.assert_allclose(sample(similar, knots, knots), sample(bank, knots, knots), atol=1e-5)
-    # `SoftmaxFrame.like` preserves only the ratios between the filters of a bank that is not tight.
+    # If a bank is not tight, `SoftmaxFrame.like` preserves only the ratios between its filters.
     squares = sample(Heat([1.0, 10.0]), knots, knots) ** 2
     similar = sample(SoftmaxFrame.like(Heat([1.0, 10.0]), 33), knots, knots) ** 2
     np.testing.assert_allclose(similar[0], squares[0] / squares.sum(axis=0), atol=1e-3)
@@ -277,7 +277,7 @@ def test_some_banks_follow_closed_forms():
     centres = np.asarray([0, 1 / 3, 2 / 3, 1])
     gaussians = np.exp(-((relative - centres[:, None]) ** 2) / (2 * (0.4 / 3) ** 2))
     np.testing.assert_allclose(respond(Gabor(4, 0.4)), gaussians)
-    # The transition between the filters of a Meyer frame with two filters begins at lambda_max / 2.
+    # In a Meyer frame with two filters, the scaling function begins to fall at lambda_max / 2.
     np.testing.assert_allclose(respond(LowPass(0.5)), respond(Meyer(2))[:1], atol=1e-15)
     window = respond(ExponentialWindow(0.8, 2.0))[0]
     assert window[16] == pytest.approx(0.5) and (window[32:] == 0).all()
@@ -312,7 +312,7 @@ def test_the_spectral_distribution_gives_bands_equal_numbers_of_eigenvalues():
 
 
 def test_repeated_eigenvalues_have_equal_responses():
-    # The eigenvalues of a sphere with multiplicities, and zero eigenvalues of two more components.
+    # The eigenvalues of a sphere with their multiplicities, and two further eigenvalues of zero.
     degrees = np.arange(8)
     exact = np.concatenate([[0, 0], np.repeat(degrees * (degrees + 1.0), 2 * degrees + 1)])
     noisy = np.sort(exact + 1e-9 * np.random.default_rng(0).uniform(size=exact.size))
@@ -377,14 +377,14 @@ def test_banks_accept_traced_parameters():
     assert jnp.isfinite(eqx.filter_jit(lambda e: Warped(Gabor(), Power())(e, e))(eigenvalues)).all()
 
 
-# The next tests compare banks with an independent toolbox. Their tables convert between the conventions.
+# The following tests compare the banks with an independent toolbox.
 
 PARSEVAL_FACTOR = np.sqrt(9 / 8)  # the squared half cosines of the toolbox sum to 9/8
 
 
 def as_in_the_toolbox(lambda_max):
-    """Returns a dictionary from toolbox names to our banks and to factors that convert our responses."""
-    # The toolbox normalises filters by a scale in units of 1 / lambda.
+    """Returns, for each filter name in the toolbox, our bank and the factors that convert its responses."""
+    # With `normalize`, the toolbox uses absolute scales, but we use scales in units of 1 / lambda_max.
     scale_units = np.r_[1, np.full(5, 1 / np.sqrt(lambda_max))]
     logarithm = Logarithm(10 * lambda_max)
     half_cosines = {
@@ -433,7 +433,7 @@ def test_the_logarithm_and_regular_equal_the_independent_toolbox(shared, lambda_
     warped = Logarithm(10 * lambda_max)(grid, grid)
     np.testing.assert_allclose(warped, reference["warped_log_wf"], atol=1e-10)
     # The toolbox returns the high-pass filter first. Its low-pass filter is computed as sqrt(1 - high²),
-    # which has only half of the correct digits near zero.
+    # which is accurate to only half of the digits near zero.
     low, high = Regular()(grid, grid)
     np.testing.assert_allclose(high, reference["regular"][:, 0], atol=1e-10)
     np.testing.assert_allclose(low**2, reference["regular"][:, 1] ** 2, atol=1e-10)
@@ -463,8 +463,8 @@ def test_values_equal_pygsp(lambda_max, filters):
         (Itersine(filters), 1, pygsp_filters.Itersine(graph, filters)),
         (HalfCosine(filters), PARSEVAL_FACTOR, pygsp_filters.HalfCosine(graph, filters)),
         (Heat(np.arange(1.0, filters)), 1, pygsp_filters.Heat(graph, np.arange(1, filters))),
-        # PyGSP scales the spectrum to [0, 2], so its edges are twice as large. The width of its exponential
-        # window is the whole interval.
+        # PyGSP scales the spectrum to [0, 2], so its edges are twice as large. PyGSP's exponential window
+        # falls over an interval as wide as the spectrum.
         (Held(edge), 1, pygsp_filters.Held(graph, 2 * edge)),
         (Simoncelli(edge), 1, pygsp_filters.Simoncelli(graph, 2 * edge)),
         (Papadakis(edge), 1, pygsp_filters.Papadakis(graph, 2 * edge)),

@@ -1,4 +1,4 @@
-"""The formulas of functional maps agree with the sums over scales and vertices that they replace."""
+"""The formulas of functional maps agree with explicit sums over scales and vertices."""
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ def test_kernel_is_the_sum_over_scales(pair):
 
 
 def stacked(pair, pointwise_map, convention, norm):
-    """Returns the inputs, outputs and weights of all vertices of X in the definition of the energy."""
+    """Returns the inputs, outputs and weights of all vertices of X, which define the energy."""
     x, y = pair
     p = permutation_matrix(pointwise_map)
     areas_x = np.asarray(x.vertex_areas)
@@ -204,7 +204,7 @@ def test_energies_add_and_scale():
 
 
 def test_tight_update_minimises_the_energy_where_the_inputs_are_orthonormal(pair, pointwise_map):
-    """Remark 4.1 of the MWP paper holds for any T in the pushforward convention, as Phi_X is orthonormal."""
+    """Remark 4.1 of the MWP paper holds for any T in the pushforward convention."""
     x, y = pair
     g_x, g_y = responses(x), responses(y)
     update = encode(pointwise_map, x, y, convention="pushforward") * multiscale_kernel(g_y, g_x)

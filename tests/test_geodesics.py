@@ -47,7 +47,7 @@ def blob(subdivisions: int = 3, seed: int = 0) -> Mesh:
 
 
 def book(pages: int, n: int = 7) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """Return a mesh of flat pages that meet in one spine, and the page and position of each vertex.
+    """Return a mesh of flat pages that meet in one spine, and each vertex's page and position.
 
     A position consists of the distance x from the spine and the coordinate y along the spine.
     """
@@ -90,7 +90,7 @@ def exact_distances(mesh: Mesh, sources) -> np.ndarray:
 
 
 def with_points_as_vertices(mesh: Mesh, points: SurfacePoints) -> Mesh:
-    """The same surface, with points on different faces added as the last vertices."""
+    """Return the surface with additional last vertices at the points, which are on different faces."""
     assert len(np.unique(points.faces)) == len(points)
     number = len(mesh.vertices) + np.arange(len(points))
     a, b, c = mesh.faces[points.faces].T
@@ -143,7 +143,7 @@ def test_distances_on_a_cube_are_exact():
     distances = geodesic_distances(CUBE, np.arange(8))
     np.testing.assert_allclose(distances[0], np.sqrt([0, 1, 2, 1, 1, 2, 5, 2]), rtol=1e-14)
     assert sorted(np.round(distances.ravel() ** 2).astype(int)) == [0] * 8 + [1] * 24 + [2] * 24 + [5] * 8
-    # These points are the centres of the bottom, top and front sides of the cube. They are on diagonal edges.
+    # The centres of the bottom, top and front sides of the cube are on diagonal edges.
     centres = SurfacePoints(np.array([0, 2, 4]), np.array([[0.5, 0.5, 0], [0.5, 0, 0.5], [0.5, 0, 0.5]]))
     np.testing.assert_allclose(centres.positions(CUBE), [[0.5, 0.5, 0], [0.5, 0.5, 1], [0.5, 0, 0.5]])
     first, second = np.array([0, 0, 1, 0]), np.array([1, 2, 2, 0])
@@ -274,7 +274,7 @@ def test_components_and_unreferenced_vertices_are_infinitely_far_apart():
 
 
 def test_edges_without_length_and_faces_without_area_have_no_effect():
-    # A square that is cut along its diagonal and closed again with faces of zero width.
+    # The mesh is a square, cut along its diagonal and closed again with faces of zero width.
     vertices = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]]
     mesh = make_mesh(vertices, [[0, 1, 2], [4, 5, 3], [0, 2, 5], [0, 5, 4]])
     assert mesh.degenerate_faces.sum() == 2
@@ -374,7 +374,7 @@ def test_distances_between_points_on_a_flat_sheet_are_euclidean():
     expected = np.linalg.norm(points.positions(mesh) - others.positions(mesh), axis=1)
     distances = geodesic_distances_between(mesh, points, others)
     assert (distances - expected).min() > -1e-12
-    assert (distances - expected)[300:900].max() < 1e-12  # straight paths: the faces share a vertex
+    assert (distances - expected)[300:900].max() < 1e-12  # exact if the faces share a vertex
     assert (distances / np.maximum(expected, 0.05) - 1).max() < 0.02
     np.testing.assert_allclose(geodesic_distances_between(mesh, others, points), distances, atol=1e-12)
     to_vertices = np.linalg.norm(points.positions(mesh)[:, None] - mesh.vertices, axis=2)
@@ -453,16 +453,16 @@ def test_graphs_are_read_from_the_cache(tmp_path, monkeypatch):
     assert geodesic_graph(mesh, depth=2).nnz < geodesic_graph(mesh).nnz
     assert len(list(tmp_path.glob("geodesic-graph-*.npz"))) == 2
     geodesic_graph.cache_clear()
-    monkeypatch.setattr(geodesics, "_unfold", None)  # makes a new computation fail
+    monkeypatch.setattr(geodesics, "_unfold", None)  # a new computation would fail
     np.testing.assert_array_equal(geodesic_distances(mesh, [0, 1]), first)
 
 
 @pytest.mark.parametrize(
     ("sources", "message"),
     [
-        ([0, 642], r"vertex indices must lie between 0 and 641, but number 1 is 642: subtract 1"),
-        ([0, 7, 10**18], r"number 2 is 1000000000000000000: correct it"),
-        ([-1], r"number 0 is -1"),
+        ([0, 642], r"vertex indices must lie between 0 and 641, but entry 1 is 642: subtract 1"),
+        ([0, 7, 10**18], r"entry 2 is 1000000000000000000: correct it"),
+        ([-1], r"entry 0 is -1"),
         ([0.0, 1.0], r"a list of integers, but are float64 of shape \(2,\)"),
         ([[0, 1]], r"a list of integers, but are int64 of shape \(1, 2\)"),
         ([True], "bool"),

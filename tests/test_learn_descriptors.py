@@ -101,7 +101,8 @@ def learn(network, pair, directory, *, loss="labels", prepare=None):
 def test_learning_lowers_the_loss(network, pair, tmp_path, loss):
     trained = learn(network, pair, tmp_path, loss=loss)
     assert trained.losses.shape == (STEPS,) and trained.losses[-1] < trained.losses[0]
-    # The watched pair is the training pair. Its loss is measured before the first and after the last step.
+    # The loss on the watched pair, here the training pair, is measured before the first and after the last
+    # step.
     np.testing.assert_array_equal(trained.steps, [0, STEPS])
     np.testing.assert_allclose(trained.watched[0], trained.losses[0], rtol=1e-9)
     assert trained.watched[1] < trained.losses[0]
@@ -122,8 +123,8 @@ def test_descriptors_do_not_depend_on_numbering_units_or_padding(network, creatu
     expected = np.asarray(network(spectra[0]))[:n]
     order = np.random.default_rng(0).permutation(n)
     renumbered = make_mesh(7 * mesh.vertices[order], np.argsort(order)[mesh.faces])
-    # Rounding errors are large, because the eigensolver has another initial vector and SHOT sums in another
-    # order.
+    # Rounding errors are large, because renumbering changes the initial vector of the eigensolver and the
+    # order of the sums in SHOT.
     np.testing.assert_allclose(np.asarray(network(described(renumbered)))[:n], expected[order], atol=1e-5)
     np.testing.assert_allclose(np.asarray(network(spectra[0].pad(2000)))[:n], expected, atol=1e-12)
 

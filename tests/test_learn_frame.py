@@ -23,7 +23,7 @@ N, K = 60, 12
 
 
 def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
-    """Return the names of a pair, and a training pair of a random spectrum and a disturbed copy."""
+    """Return the names of a pair, and a training pair: a random spectrum and a perturbed copy."""
     generator = np.random.default_rng(seed)
     x = random_spectrum(N, K, seed=seed)
     y = Spectrum(x.eigenvalues, x.eigenvectors + 0.3 * generator.normal(size=(N, K)), x.vertex_areas, x.mask)

@@ -21,7 +21,7 @@ NUMERIC, CELL, STRUCT = 6, 1, 2
 
 
 def element(kind: int, data: bytes, size: int | None = None) -> bytes:
-    """Return an element with the declared size `size`, which is the true size by default."""
+    """Return a data element that declares `size` bytes, by default its true size."""
     return struct.pack("<II", kind, len(data) if size is None else size) + data + bytes(-len(data) % 8)
 
 
@@ -39,7 +39,7 @@ def compressed(data: bytes) -> bytes:
 ZEROS = element(9, bytes(8 * 1000))
 HUGE = 3 << 30
 BOMBS = {
-    # name: (variables, what the message says)
+    # name: (variables, part of the message)
     "a compressed variable": (compressed(array(NUMERIC, (1000, 1), ZEROS, size=HUGE)), "more than 1 GiB"),
     "four smaller variables": (4 * compressed(array(NUMERIC, (6250, 8), element(2, bytes(50_000_000)))), "more than 1 GiB"),
     "a cell array that declares too many elements": (array(CELL, (2**31 - 1, 2**10), 10 * element(14, b"")), "damaged"),

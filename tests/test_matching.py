@@ -155,7 +155,7 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
 
 @pytest.mark.slow
 def test_the_reverse_map_of_registration_compares_all_columns():
-    """Above 15 000 vertices the search uses patches, even if an embedding has more columns than eigenvectors."""
+    """Above 15 000 vertices, the search in patches also compares columns that are not eigenvectors."""
     creature = creature_pair(vertices=15_600)
     truth = creature.truth.nearest_corners(creature.target)
     stage = Stage(Registration((20, 30)), number_of_samples=400)
@@ -406,7 +406,7 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
         monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
     starts = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *spectra))
     assert len(starts) == 3
-    # If spectra have descriptors, pairings of extremities give further initial maps. This body has one.
+    # For spectra with descriptors, pairings of extremities give further initial maps, on this body only one.
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
     without = RepairSettings(alternatives=())
@@ -418,7 +418,7 @@ def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair,
         assert start.dtype == np.int64 and start.shape == truth.shape
         # A filtered functional map gives a smoother map than nearest neighbours.
         assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, usual, truth)
-    if thinned:  # otherwise all maps are nearly exact
+    if thinned:  # on the full mesh, all maps are nearly exact
         assert all(np.any(a != b) for a, b in combinations(starts, 2))
 
 
@@ -479,8 +479,7 @@ def test_presets_match_a_copy_accurately(pair):
 
 def test_presets_fit_small_meshes(monkeypatch):
     """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
-    # Beartype, which only tests use, captures warnings. In a compilation thread, it would also capture our
-    # warnings.
+    # In a compilation thread, Beartype, which only tests use, would capture our warnings.
     monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):

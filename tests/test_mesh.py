@@ -81,7 +81,6 @@ def test_arrays_are_copied_and_stored_row_by_row():
     assert mesh.vertices.flags.c_contiguous and mesh.faces.flags.c_contiguous
 
 
-# A sheet with more edges than the square.
 BUMPS = bumpy_grid(4).vertices.tolist()
 BUMP_FACES = (bumpy_grid(4).faces + 4).tolist()
 
@@ -520,7 +519,7 @@ def test_stl_corners_are_merged_in_order_of_appearance(saved, form):
 
 
 def test_welding_reports_that_it_changed_nothing(saved):
-    """One case is an STL file, whose corners the reader already merges."""
+    """The reader already merges equal corners of an STL file."""
     path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
     plain, welded = read_mesh(path), read_mesh(path, weld=True)
     assert same_mesh(plain, welded) and diagnose(plain).components == 1
@@ -537,7 +536,7 @@ def test_files_written_by_trimesh_are_read(tmp_path, suffix):
     mesh = bumpy_grid(9)
     path = tmp_path / f"m.{suffix}"
     exporter = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert len(exporter.vertex_normals) == len(mesh.vertices)  # computes the normals for the export
+    assert len(exporter.vertex_normals) == len(mesh.vertices)  # computes the normals to export
     exporter.export(path)
     again = read_mesh(path)
     if suffix == "stl":
@@ -596,7 +595,7 @@ HOSTILE = {
     "too many vertices declared.off": (f"OFF\n4 1 0\n{T}3 0 1 2\n", "declares 4 vertices"),
     "too few vertices declared.off": (f"OFF\n2 1 0\n{T}3 0 1 2\n", "declares 2 vertices"),
     "vertices for faces.off": (f"OFF\n2 2 0\n{T}3 0 1 2\n", "0 corners"),
-    "fractional vertices for faces.off": ("OFF\n2 2 0\n0 0 0\n1 0 0\n0.5 1 0\n3 0 1 2\n", "where a face with its number of corners"),
+    "fractional vertices for faces.off": ("OFF\n2 2 0\n0 0 0\n1 0 0\n0.5 1 0\n3 0 1 2\n", "does not begin with the number of corners of a face"),
     "faces for vertices.off": (f"OFF\n4 0 0\n{T}3 0\n", "'3 0' is written where 3 numbers"),
     "too many faces declared.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n", "2 faces"),
     "too few faces declared.off": (f"OFF\n3 1 0\n{T}3 0 1 2\n3 0 1 2\n", "and 1 face"),
@@ -739,7 +738,7 @@ HOSTILE = {
 def test_hostile_files_are_refused_in_one_sentence(saved, name):
     content, fault = HOSTILE[name]
     path = saved(name, content)
-    if fault is None:  # the file is strange but complete
+    if fault is None:  # the file is unusual but valid
         assert read_mesh(path).faces.tolist() == [[0, 1, 2]]
         return
     tracemalloc.start()

@@ -94,7 +94,7 @@ def test_all_methods_repair_a_noisy_initial_map():
     pair = MethodInput.of(prepared, ("X", "Y"))
     for name, method in METHODS.items():
         if method.both_directions or method.partial_only:
-            continue  # tests/test_bcicp.py and tests/test_partial_functional_maps.py test these methods
+            continue  # tested in tests/test_bcicp.py and tests/test_partial_functional_maps.py
         if isinstance(method, ZoomOut):
             # JAX compiles the program anew for each size, so large steps save time.
             method = replace(method, step=50)

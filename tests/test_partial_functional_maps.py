@@ -35,7 +35,7 @@ K, D = 40, 8
 
 
 class Case:
-    """A full shape Y, the part X of Y above a plane in another vertex order, and a noisy initial map."""
+    """A full shape Y, the part X of Y above a plane with permuted vertices, and a noisy initial map."""
 
     def __init__(self) -> None:
         generator = np.random.default_rng(0)
@@ -89,7 +89,7 @@ def test_fidelity_and_map_energy_are_those_of_the_paper():
 def test_weights_are_distances_from_a_slanted_diagonal():
     k_x, k_y = 4, 10
     weights = np.asarray(steps.slanted_weights(k_x, k_y))
-    # The matrix of the paper is the transpose of our matrix.
+    # The paper's matrix of weights is the transpose of `weights`.
     normal = np.array([1, k_x / k_y, 0]) / np.hypot(1, k_x / k_y)
     for row in range(k_x):
         for column in range(k_y):

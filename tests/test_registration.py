@@ -23,7 +23,7 @@ K = 60
 
 
 def changed(mesh, order, motion):
-    """Return the mesh with its vertices in another order and moved by `motion`."""
+    """Return the mesh with reordered vertices that are moved by `motion`."""
     place = np.argsort(order)
     return make_mesh(motion(mesh.vertices[order]), place[mesh.faces])
 
@@ -120,7 +120,7 @@ def test_refinement_agrees_with_the_definition(pair, number_of_descriptors):
 
 
 def test_nearest_rotations_agree_with_singular_value_decompositions():
-    """The test includes rotations by 180 degrees, and matrices whose nearest orthogonal matrix is a reflection."""
+    """Some matrices are rotations by 180 degrees, or have a reflection as the nearest orthogonal matrix."""
     generator = np.random.default_rng(0)
     turns = Rotation.random(40, rng=generator).as_matrix()
     covariances = np.concatenate(
@@ -149,7 +149,7 @@ def test_a_moved_copy_is_matched_exactly(pair):
     found = refine(x, y, initial_map, refiner=Registration((20, 40)), iterations=4)
     assert found.result == RESULTS.successful
     np.testing.assert_array_equal(found.pointwise_map, truth)
-    # In both embeddings, the rows of matched vertices coincide.
+    # The embeddings of matched vertices are equal.
     queries, database = Registration().embeddings(Registration().prepare(Problem(x, y)), found.state)
     np.testing.assert_allclose(queries, np.asarray(database)[truth], atol=1e-6)
 
@@ -175,7 +175,7 @@ def test_the_orientation_of_faces_does_not_matter(pair):
 
 
 def test_is_more_accurate_than_refiners_that_use_only_eigenfunctions():
-    """The target has another pose and another triangulation."""
+    """The target has another pose and another triangulation than the source."""
     pair = creature_pair(vertices=1200, seed=3)
     x, y = (compute_spectrum(mesh, 100) for mesh in (pair.source, pair.target))
     target, place = pair.target.vertices, pair.truth.positions(pair.target)
@@ -240,7 +240,7 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
 
 
 def test_a_partial_shape_keeps_its_size(pair):
-    """A partial shape keeps the unit of the full shape, whereas full shapes are scaled to area 1."""
+    """A partial pair is scaled by one common factor, whereas two full shapes are each scaled to area 1."""
     x, *_, mesh = pair
     kept = mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0.3
     used, faces = np.unique(mesh.faces[kept], return_inverse=True)

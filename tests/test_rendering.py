@@ -91,6 +91,6 @@ def test_bodies_larger_than_the_picture_are_cut_off() -> None:
     color = uniform(SPHERE, 0, 1, 0)
     large = render(SPHERE, color, azimuth=0.0, scale=400.0, width=300, height=300)
     small = render(SPHERE, color, azimuth=0.0, scale=400.0, width=100, height=60)
-    # Only ambient occlusion may differ, and a convex body has occlusion only near its outline.
+    # The pictures may differ only in ambient occlusion, which a convex body has only near its outline.
     assert np.abs(large[120:180, 100:200].astype(int) - small).max() <= 12
     assert np.all(small[..., 3] == 255)

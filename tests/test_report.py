@@ -95,7 +95,7 @@ def test_the_summary_states_the_results_of_the_match(
         replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {}, expected
     )
     assert judged["distortion (1 is none)"] == "1.30; above 1.12 limbs may be swapped"
-    # Both maps are shown in the convention of the refiner.
+    # The page shows the refined and the initial map in the convention of the refiner.
     refined, initial = embedded(page)["maps"]
     assert (refined["name"], initial["name"]) == ("refined", "initial")
     assert refined["functional"]["pushforward"] and initial["functional"]["pushforward"]

@@ -22,7 +22,8 @@ def descriptors(bumpy):
 
 
 def agree(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether 99 % of the descriptors are equal. Rounding may flip other local axes."""
+    """Return whether 99 % of the descriptors are equal. Rounding may flip the local axes of a few
+    descriptors."""
     return np.mean(np.abs(a - b).max(axis=1) < 1e-6) > 0.99
 
 
@@ -79,7 +80,7 @@ def test_the_size_of_blocks_has_no_effect(bumpy, descriptors, monkeypatch):
 
 
 def test_a_flat_square_fills_one_bin_of_the_cosine():
-    """On a plane, all normals equal z or -z, so only one bin of the cosine is not empty."""
+    """On a plane, all normals equal z or -z, so only one of the cosine bins is not empty."""
     descriptors = shot_descriptors(make_mesh(*grid_mesh(40, 40)), radius=0.2)
     bins = descriptors.reshape(-1, 32, 11).sum(axis=1)
     extreme = np.maximum(bins[:, 0], bins[:, 10])

@@ -59,7 +59,7 @@ def test_signatures_follow_their_definitions():
         heat_kernel_signature(spectrum, dimensions=8), squares @ (weights / weights.sum(1, keepdims=True)).T
     )
     low, high = np.log(values[1]), np.log(values[-1])
-    # The centres are at least two widths from the ends of the range. A width is seven steps between centres.
+    # The centres of the Gaussians are at least two standard deviations (14 steps) from the ends of the range.
     step = (high - low) / (7 + 28)
     energies = low + 14 * step + np.arange(8) * step
     weights = np.exp(-((energies[:, None] - np.log(values[1:])) ** 2) / (2 * (7 * step) ** 2))

@@ -194,7 +194,7 @@ def test_distant_rows_get_their_share():
     )
     assert soft.potentials.dtype == jnp.float32
     assert soft.converged, float(soft.residual)
-    assert soft.potentials[0] > 200  # its exponential overflows in float32
+    assert soft.potentials[0] > 200  # exp(200) overflows in float32
 
 
 def test_nan_is_not_reported_as_convergence():

@@ -55,7 +55,7 @@ def test_softmax_follows_its_definition():
     expected = b_ * np.exp(-distances / temperature)
     expected /= expected.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(Softmax(0.7), queries, database, a, b), expected, atol=1e-12)
-    # NearestFew gives the same shares if all database rows except the nearest rows are removed.
+    # NearestFew gives the shares that Softmax would give if the database contained only the nearest rows.
     few = np.where(distances <= np.sort(distances, axis=1)[:, 4:5], expected, 0)
     few /= few.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(dense(NearestFew(5, 0.7), queries, database, a, b), few, atol=1e-12)
@@ -63,7 +63,7 @@ def test_softmax_follows_its_definition():
     np.testing.assert_array_equal(found.pointwise_map(), distances.argmin(axis=1))
     np.testing.assert_allclose(
         dense(NearestFew(1000, 0.7), queries, database, a, b), expected, atol=1e-12
-    )  # more rows than the database has
+    )  # 1000 is more than the number of database rows
 
 
 @pytest.mark.parametrize("recovery", RECOVERIES.values(), ids=RECOVERIES)
@@ -390,7 +390,7 @@ def test_failures_are_reported(pair):
     x, y, initial_map = pair
     damaged = eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors.at[3, 2].set(jnp.nan))
     assert refine_softly(x, damaged, initial_map).result == RESULTS.nonfinite_spectrum
-    # A failed refinement returns -1 everywhere.
+    # All entries of a map are -1 if its refinement failed.
     for nowhere in (initial_map.at[0].set(M), -jnp.ones_like(initial_map)):
         assert refine_softly(x, y, nowhere).result == RESULTS.invalid_initial_map
     few = NearestFew(3)(x.eigenvectors, y.eigenvectors, x.vertex_areas, y.vertex_areas)
@@ -486,7 +486,7 @@ def test_derivatives_exist_at_the_lowest_temperatures(pair, kind, dtype):
 
     differentiate = jax.jit(jax.value_and_grad(size, (0, 1)))
     one = jnp.asarray(1, dtype)
-    # At these temperatures, all soft maps equal nearest neighbours, so the temperature has no effect.
+    # At these low temperatures, every soft map is a nearest-neighbour map, so the temperature has no effect.
     value, (_, expected) = differentiate(jnp.asarray(1e-5), one)
     for temperature in (1e-12, 1e-30, 1e-37):
         found, (in_temperature, in_factor) = differentiate(jnp.asarray(temperature), one)

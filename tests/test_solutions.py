@@ -480,7 +480,7 @@ def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
 
 
 def test_minimize_accepts_another_energy(pair):
-    """`minimize` accepts any sum of squares. The minimum of the energy in this test is known."""
+    """`minimize` finds the known minimum of a sum of squares."""
     generator = np.random.default_rng(0)
     a, target = generator.normal(size=(K_Y, 20)), generator.normal(size=(K_X, K_Y))
     b = target @ a
@@ -497,7 +497,7 @@ def test_minimize_accepts_another_energy(pair):
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
 @pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])
 def test_normal_equations_hold_on_real_shapes(shared, bank, convention, norm):
-    """The residual of the stacked system of all scales and vertices is orthogonal to the inputs of C."""
+    """The least-squares residual of all scales and vertices is orthogonal to the inputs of C."""
     reference = np.load(shared / "oracle" / "faust_r_002_007.npz")
     x, y = (
         Spectrum(

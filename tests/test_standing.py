@@ -76,7 +76,7 @@ def test_up_is_guessed_for_bodies_without_limbs() -> None:
 @pytest.mark.parametrize(
     ("name", "up"),
     [
-        *((f"faust_r/off/tr_reg_{number}.off", "y") for number in ("002", "057", "069")),  # 057 is on one leg
+        *((f"faust_r/off/tr_reg_{number}.off", "y") for number in ("002", "057", "069")),  # 057 stands on one leg
         *((f"tosca_r/off/{name}.off", "z") for name in ("cat0", "cat6", "dog2", "centaur3", "michael8", "horse5")),
         *((f"smal_r/off/{name}.off", "-y") for name in ("cow_alph", "fox-05", "hippo5", "lion6", "cougar")),
         ("shrec19_r/off/10.off", "y"),

@@ -139,7 +139,7 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean(np.abs(a - b).max(axis=2) > 8)) if a.shape == b.shape else 1.0
 
 
-# This shape is lumpy, so its views and vertices differ clearly.
+# This shape is irregular, so its views and vertices differ clearly.
 SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.vertices[:, [1]])), name="X.off")
 TARGET, NUMBER = renumbered(replace(TALL, name="Y.off"), seed=1)
 
@@ -366,7 +366,7 @@ def test_hostile_texts_are_shown_as_plain_text(browser: Any, tmp_path: Path) -> 
     assert page.find("tbody th").text == page.find("tbody td").text == HOSTILE
     assert not browser.find_elements("css selector", "input[value^=error]")
     assert browser.get_log("browser") == []
-    # Even if a text became HTML, the page would run no script other than its own.
+    # Even if text were parsed as HTML, the page would run only its own script.
     page.run("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hacked=1\">')")
     page.settle()
     assert page.run("return window.hacked") is None
@@ -456,8 +456,8 @@ def test_wavelets_are_shown_on_both_bodies(comparison: OpenPage, spectra: tuple[
             exact, bound = (array[scale] for array in expected[side])
             error = np.abs(np.array(shown[side]) - exact)
             assert np.all(error <= bound)
-            # Errors are invisible if they are everywhere below 5 % of the colour scale, and their root mean
-            # square is below 1 % of the scale.
+            # Errors are invisible if all are below 5 % of the colour scale and their root mean square is
+            # below 1 %.
             assert error.max() < 0.05 * limit and np.sqrt(np.mean(error**2)) < 0.01 * limit
             color = np.reshape(comparison.run("return jaxsmw.colors(arguments[0])", side), (-1, 3))
             expected_color = 255 * colors.signed_colors(np.array(shown[side]), limit)
@@ -563,7 +563,7 @@ def test_entries_of_the_functional_map_show_their_eigenfunctions(
 
 
 def check_mode(page: OpenPage, mode: str) -> None:
-    """Checks that buttons, explanation and legend belong to the colours of the bodies."""
+    """Checks that buttons, explanation and legend match the mode."""
     checked = "return [...document.querySelectorAll('input[name=mode]:checked')].map(e => e.value)"
     explained = (
         "return [...document.querySelectorAll('[data-for]')].filter(e => "
@@ -648,13 +648,13 @@ def test_switching_between_maps_changes_everything_that_depends_on_the_map(compa
     check("bad", 9)
     assert np.abs(matrix_colors(comparison) - good).max() > 50
     assert differ(picture, comparison.view("x")) > 0.1
-    # If an error is unknown for a map, this error cannot be chosen, and an earlier choice of it is undone.
+    # An error that is unknown for a map cannot be chosen, and an earlier choice of this error is undone.
     assert [comparison.find(f"input[value=error-{i}]").is_enabled() for i in (0, 1)] == [False, True]
     comparison.choose("error-1")
     comparison.find("input[name=map][value='0']").click()
     assert comparison.state["mode"] == "transfer" and comparison.find("input[value=transfer]").is_selected()
     check("good", 1)
-    # The wavelets also change with the map.
+    # A change of the map also changes the wavelets.
     comparison.choose("wavelets")
     similarities = []
     for position in (0, 1):

@@ -13,8 +13,8 @@ def main() -> NoReturn:
     The exit code is 0 for success, 2 for bad input and 1 for any other failure. After an interruption
     (Ctrl-C), the signal SIGINT terminates the process.
     """
-    # The handler of interruptions is installed before all other imports, because Ctrl-C during an import
-    # prints a traceback.
+    # The signal handler is installed before all other imports. Without the handler, Ctrl-C during an import
+    # would print a traceback.
     from jaxsmw.cli.interruption import end_when_interrupted
 
     end_when_interrupted()

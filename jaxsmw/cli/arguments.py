@@ -10,7 +10,7 @@ from typing import get_args
 from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian
 from jaxsmw.errors import InputError
 
-# The largest 32-bit integer, because JAX uses 32-bit integers by default.
+# Larger numbers are refused, because JAX uses 32-bit integers by default.
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
@@ -38,9 +38,9 @@ def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int
 
 
 def path(text: str) -> str:
-    """Return the name of a file or directory, which need not exist, if it can be used as a name.
+    """Return `text` if a file or directory could have this name. The file or directory need not exist.
 
-    **Raises:** `argparse.ArgumentTypeError` if the name is empty, or no file can have this name.
+    **Raises:** `argparse.ArgumentTypeError` if `text` is empty, or no file can have this name.
     """
     if not text:
         raise argparse.ArgumentTypeError("the name is empty: give the name of a file or directory")
@@ -91,9 +91,9 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         "--eigensolver",
         choices=get_args(Eigensolver),
         default="auto",
-        help="method that computes eigenvectors: approximate is fast on large meshes, and its eigenvalues "
-        "have errors of a few tenths of a per cent if triangles have similar sizes and shapes; if "
-        "approximate would be inaccurate, a warning is printed and exact is used instead; auto chooses "
+        help="method that computes eigenvectors. approximate is fast on large meshes. If triangles have "
+        "similar sizes and shapes, the eigenvalues of approximate have errors of a few tenths of a per cent. "
+        "If approximate would be inaccurate, a warning is printed and exact is used instead. auto chooses "
         "approximate for meshes with at least "
         f"{APPROXIMATE_FROM} vertices and exact for smaller meshes (default: %(default)s)",
     )
@@ -141,11 +141,11 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
     **Arguments:**
 
     - `options`: the parsed options.
-    - `needed`: the option that may be missing, as it is named in the message.
-    - `is_given`: whether the option `needed` is given.
-    - `names`: the options that have no effect without `needed`, as attribute names of `options`.
+    - `needed`: the name of the required option, for the message.
+    - `is_given`: whether the user gave the option `needed`.
+    - `names`: the attributes of `options` that have no effect without `needed`.
 
-    **Raises:** `InputError` that names the first option without effect.
+    **Raises:** `InputError` that names the first given option that has no effect.
     """
     for name in names:
         value = getattr(options, name)

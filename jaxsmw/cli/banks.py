@@ -1,4 +1,4 @@
-"""The filter banks of the command line, by name."""
+"""The filter banks that the command line offers."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ BANKS = {
 _PAPER_BANK = next(iter(BANKS))
 # A filter bank whose name has this prefix is warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# The largest accepted number of filters. More filters than eigenvalues are useless, and spectra contain fewer
-# eigenvalues than this number.
+# The largest accepted number of filters. Filter banks need at most as many filters as there are eigenvalues,
+# and spectra contain fewer than 10 000 eigenvalues.
 _MOST_FILTERS = 10_000
 
 
 def add_bank(parser: argparse._ActionsContainer) -> None:
-    """Add `--bank` and `--filters`. The value of an omitted option is None."""
+    """Add `--bank` and `--filters`. If the user omits an option, its value is None."""
     parser.add_argument(
         "--bank",
         choices=tuple(BANKS),

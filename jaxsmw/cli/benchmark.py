@@ -31,9 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         nargs="+",
         help=f"methods to measure: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if "
-        "these libraries are installed; or directories with maps X_Y.map of other programs (default: all "
-        "methods that suit the pairs). cpd takes 30 seconds per pair, and bcicp takes 15 seconds per pair. "
-        "pfm matches partial shapes only",
+        "these libraries are installed; or directories of maps that other programs computed, in files named "
+        "X_Y.map (default: all methods that suit the pairs). cpd takes 30 seconds per pair, and bcicp takes "
+        "15 seconds per pair. pfm matches partial shapes only",
     )
     parser.add_argument(
         "--pairs",
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         default=DEFAULT_INITIAL_MAP,
         help=f"initial map of all methods: {', '.join(get_args(InitialMap))}, or a directory with maps "
-        "X_Y.map (default: %(default)s)",
+        "in files named X_Y.map (default: %(default)s)",
     )
     parser.add_argument(
         "--mirrored",
@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "process (default: %(default)s, the number of cores)",
     )
     processes.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler; use the workers of its cluster"
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers match the pairs"
     )
 
 

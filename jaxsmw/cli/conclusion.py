@@ -1,4 +1,4 @@
-"""The final steps of a command that matches: the measurement of errors, the report and the printed times."""
+"""The final steps of `match` and `demo`: measure errors, write the report and print the times."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ def measure_match(
 
     **Arguments:**
 
-    - `correspondence`: the result of `match`.
     - `truth`: the ground truth, or None.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
-    - `stopwatch`: the stopwatch of the command.
-    - `others`: a dictionary from names to maps. These maps are measured in addition to the initial map and
-      the refined map.
+    - `stopwatch`: the stopwatch to which the time of the measurement is added.
+    - `others`: a dictionary from names to further maps. The initial map and the refined map are always
+      measured.
 
     **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
     `others`, and `refined`. The dictionary is empty if there is no ground truth.
@@ -58,15 +57,11 @@ def write_match_report(
     *,
     up: Any,
 ) -> None:
-    """Write the report of a match. The report's summary contains the options of the command.
+    """Write the report of a match to a directory. The report's summary contains the options of the command.
 
     **Arguments:**
 
-    - `directory`: the directory to write to.
-    - `correspondence`: the result of `match`.
-    - `errors`: a dictionary from the name of each map to its errors; see `measure_match`.
-    - `options`: the parsed options of the command.
-    - `stopwatch`: the stopwatch of the command.
+    - `errors`: the dictionary that `measure_match` returns.
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     """
     from jaxsmw.report.summary import write_report

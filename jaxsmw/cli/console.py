@@ -1,4 +1,4 @@
-"""The output of commands, which print results on standard output and all messages on standard error."""
+"""Commands print results on standard output, and messages on standard error."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _logger = logging.getLogger("jaxsmw")
 def show(text: str) -> None:
     """Print a result on standard output.
 
-    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if its reader has closed
-    the pipe.
+    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if the program that
+    reads the pipe has closed it.
     """
     with _writing_output():
         print(text, flush=True)
@@ -27,8 +27,8 @@ def show(text: str) -> None:
 def flush_output() -> None:
     """Flush the buffer of standard output.
 
-    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if its reader has closed
-    the pipe.
+    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if the program that
+    reads the pipe has closed it.
     """
     with _writing_output():
         if sys.stdout is not None:
@@ -40,8 +40,8 @@ def _writing_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Python flushes standard output again at exit. Without the redirection to the null device, Python
-        # would then report the same error again.
+        # At exit, Python flushes standard output again. Standard output is redirected to the null device, so
+        # Python does not report the same error twice.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise
@@ -92,7 +92,7 @@ class Stopwatch:
         self.add({name: time.perf_counter() - began})
 
     def add(self, seconds: dict[str, float]) -> None:
-        """Add times that were measured elsewhere.
+        """Add the times of further steps.
 
         **Arguments:**
 

@@ -32,7 +32,7 @@ def read_mesh_file(file: str, *, weld: bool) -> Mesh:
 
 
 def describe_mesh(mesh: Mesh) -> list[str]:
-    """Return sentences that describe a mesh: notes on its file, its size, and its defects."""
+    """Return sentences that describe a mesh: its notes, its size and its defects."""
     from jaxsmw.geometry.mesh import diagnose
 
     return [*mesh.notes, *diagnose(mesh).sentences()]
@@ -71,7 +71,9 @@ def read_maps(
 
 
 def initial_map(text: str) -> str:
-    """Return a value of `--init` if it is the name of an initial map, `landmarks:FILE` or `map:FILE`.
+    """Return `text` if the option `--init` accepts this value.
+
+    The option accepts the names of initial maps, `landmarks:FILE` and `map:FILE`.
 
     **Raises:** `argparse.ArgumentTypeError` for any other text.
     """
@@ -93,7 +95,7 @@ def initial_map_file(init: str) -> str | None:
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
-    """Return the argument `init` of `jaxsmw.match` for a value of `--init`.
+    """Convert a value of `--init` to the argument `init` of `jaxsmw.match`.
 
     **Returns:** The name of an initial map, landmarks (l, 2), or a pointwise map (m,). Vertices are 0-based.
 
@@ -110,7 +112,7 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
-    """If a `.mat` file is read without `--index-base`, print a note that its indices are read as 1-based."""
+    """For a `.mat` file without `--index-base`, print a note that indices are read as 1-based."""
     from jaxsmw.io.mat_files import is_mat_file
 
     if index_base is None and is_mat_file(file):

@@ -1,9 +1,10 @@
 """Termination on Ctrl-C: the process ends immediately, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
-code returns to Python. Python discards the exception if it occurs during garbage collection, and imports of
-extension modules turn it into other errors. Therefore this module raises no exception. A signal handler in
-the main thread ends the process. If the main thread is in compiled code, a second thread ends the process.
+code returns to Python. During garbage collection, Python discards the exception. During the import of an
+extension module, the exception becomes another error. Therefore this module raises no exception. A signal
+handler in the main thread ends the process. If the main thread is in compiled code, a second thread ends the
+process.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import time
 from _thread import allocate_lock
 from contextlib import contextmanager, suppress
 
-# The imports are few and fast, because Ctrl-C causes a traceback until the signal handler is installed.
+# Until the signal handler is installed, Ctrl-C prints a traceback. Therefore this module imports only a few
+# fast modules.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,9 +32,10 @@ _ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
-    """Install a handler that ends this process on SIGINT, unless the process was started with SIGINT ignored.
+    """Install a handler that ends this process on SIGINT.
 
-    The function must be called in the main thread.
+    If the process was started with SIGINT ignored, no handler is installed. The function must be called in
+    the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         return
@@ -46,11 +49,11 @@ def end_when_interrupted() -> None:
 
 
 def announce_consequence(consequence: str) -> None:
-    """Set the message that an interruption prints, for a command with a progress bar.
+    """Replace the message that an interruption prints. Commands with a progress bar call this function.
 
     **Arguments:**
 
-    - `consequence`: the consequence of an interruption for the results, as a clause without a period.
+    - `consequence`: a clause, without a period, that says which results an interruption leaves.
     """
     global _message
     # The message begins with a newline because the cursor is at the end of the progress bar.
@@ -64,7 +67,7 @@ def quiet_children() -> Iterator[None]:
     The context manager applies to processes that this thread starts in the block. On Ctrl-C, a terminal also
     sends SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the child processes
     inherit this setting. Another thread of this process still receives the signal. The context manager also
-    silences the warning with which Python's resource tracker reports leaked semaphores.
+    silences the warning of Python's resource tracker about leaked semaphores.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
@@ -80,8 +83,8 @@ def _wait_for_signal(reading: int) -> None:
         pass  # ignore other signals
     time.sleep(_PATIENCE)
     _end()
-    # The main thread has begun to end the process but is stuck, for example because no process reads its
-    # message from a pipe.
+    # The main thread is ending the process. If the main thread is stuck, for example because nobody reads its
+    # message from a pipe, this thread ends the process.
     time.sleep(1)
     _die()
 
@@ -113,7 +116,7 @@ def _remove_unfinished_files() -> None:
 
 
 def _die() -> None:
-    """End the process by SIGINT, because a shell ends a loop only if the signal terminated the command."""
+    """End the process by SIGINT. A shell ends a loop only if SIGINT terminated the command in the loop."""
     with suppress(Exception):
         try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -146,7 +146,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the requested directories, each with the names of the files that are written to it."""
+    """Return each requested directory with the names of the files that the command writes to it."""
     directories: list[tuple[str, tuple[str, ...]]] = []
     if options.report or options.texture:
         from jaxsmw.report.figures import check_drawable
@@ -168,8 +168,8 @@ def _write_files(
 ) -> dict[str, Any]:
     """Write all files except the report.
 
-    **Returns:** A dictionary from the names `one-to-one` and `surface` to these maps. Maps that were not
-    requested are left out.
+    **Returns:** A dictionary from names to the requested maps. The names are `one-to-one` (a pointwise map)
+    and `surface` (points on the surface of Y).
     """
     from jaxsmw.io.map_files import write_pointwise_map
 

@@ -1,4 +1,4 @@
-"""The measurement of the geodesic errors of maps against the ground truth, and its options."""
+"""Measures the geodesic errors of maps, and defines the options of this measurement."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
 
     **Arguments:**
 
-    - `parser`: the parser.
     - `required`: whether the command requires the option.
     - `purpose`: the beginning of the help text, before the list of accepted files.
     """
@@ -38,7 +37,7 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
 
 
 def add_evaluation(parser: argparse.ArgumentParser) -> None:
-    """Add `--evaluation-samples`, `--seed` and `--geodesics`. The value of an omitted option is None."""
+    """Add `--evaluation-samples`, `--seed` and `--geodesics`. Omitted options are None."""
     parser.add_argument(
         "--evaluation-samples",
         metavar="N",
@@ -61,7 +60,7 @@ def add_evaluation(parser: argparse.ArgumentParser) -> None:
 def check_evaluation(options: argparse.Namespace) -> None:
     """Refuse options of `add_evaluation` that have no effect because another option is missing.
 
-    **Raises:** `InputError` that names the first option without effect.
+    **Raises:** `InputError` that names the first given option that has no effect.
     """
     measured = bool(options.ground_truth)
     refuse_without(options, "--ground-truth", measured, "evaluation_samples", "geodesics")
@@ -85,10 +84,8 @@ def measure_errors(
 
     **Arguments:**
 
-    - `mesh_y`: the target Y.
-    - `maps`: a dictionary from the name of each map X -> Y to the map, either an array (m,) of 0-based
-      vertices of Y or m `SurfacePoints` on Y.
-    - `truth`: the ground truth.
+    - `maps`: a dictionary from names to maps X -> Y. A map is an array (m,) of 0-based vertices of Y, or m
+      `SurfacePoints` on Y.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
 
     **Returns:** A dictionary from the name of each map to its geodesic errors.

@@ -1,4 +1,4 @@
-"""The options of the matching method, and the call of `jaxsmw.match` with these options."""
+"""Defines the options of the matching method, and calls `jaxsmw.match` with these options."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         type=initial_map,
         default=DEFAULT_INITIAL_MAP,
         help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE or map:FILE (default: "
-        "%(default)s). shot, wks, hks and wavelet match each source vertex to the target vertex with the "
-        "most similar descriptor of this kind. functional computes a functional map that preserves SHOT "
+        "%(default)s). With shot, wks, hks and wavelet, each source vertex is matched to the target vertex "
+        "with the most similar descriptor. functional computes a functional map that preserves SHOT "
         "descriptors. A landmarks file has a source and a target vertex per line. Of these initial maps, "
         "only shot, functional and landmarks distinguish left from right",
     )
@@ -70,8 +70,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=get_args(PresetName),
         help="method of refinement: paper is the method of the MWP paper; fast is the same method on "
-        "samples; accurate has more stages and repairs maps, and its refinement takes three to four times as "
-        f"long as that of paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
+        "samples; accurate has more stages and repairs maps, so refinement takes three to four times as long "
+        f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
         "given)",
     )
     group.add_argument(
@@ -85,7 +85,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_changes(group: argparse._ActionsContainer) -> None:
-    """Add the options in `_CHANGES`. The value of an omitted option is None."""
+    """Add the options in `_CHANGES`. If the user omits an option, its value is None."""
     group.add_argument(
         "--eigenvectors",
         metavar="N",
@@ -97,9 +97,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "--solution",
         choices=tuple(_SOLUTIONS),
         help="computation of the functional map: filtering is meant for banks that are tight frames; "
-        "least-squares computes the exact minimiser for all banks; least-squares-frobenius does the same "
-        "with equal weights for all vertices; regularized is least-squares with additional terms for "
-        f"commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
+        "least-squares computes the exact minimiser for all banks; least-squares-frobenius is "
+        "least-squares with equal weights for all vertices; regularized is least-squares with additional "
+        f"terms for commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
         "--iterations",
@@ -144,8 +144,8 @@ def check_preset(options: argparse.Namespace) -> None:
 def preset_name(options: argparse.Namespace) -> PresetName:
     """Return the name of the preset to use.
 
-    If `--preset` is not given, the preset is `paper` when the user sets an option of the paper's method.
-    Otherwise it is the default preset.
+    Without `--preset`, the preset is `paper` if the user sets an option that changes the paper's method.
+    Otherwise, the default preset is used.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
@@ -170,7 +170,7 @@ def match_meshes(
 
     - `options`: the parsed options.
     - `mesh_x`, `mesh_y`: the source X and the target Y.
-    - `stopwatch`: the stopwatch of the command, to which the times of the match are added.
+    - `stopwatch`: the stopwatch to which the times of the match are added.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
     - `index_base`: the index of the first vertex in a file of `--init`, 0 or 1; None for the default of the
       file's format.
@@ -202,7 +202,7 @@ def match_meshes(
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
-    """Return a stage with the MWP paper's method, changed by the given options."""
+    """Return a stage with the MWP paper's method and the changes that the options request."""
     from jaxsmw.stage import Stage
 
     settings: dict[str, Any] = {
@@ -240,5 +240,5 @@ def _note_loose_frame(name: str, bounds: tuple[float, float] | None) -> None:
 
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that are not None. The library has defaults for the omitted settings."""
+    """Return the settings that are not None. For all other settings, the library uses its defaults."""
     return {name: value for name, value in settings.items() if value is not None}

@@ -35,8 +35,8 @@ def check_outputs(
     - `files`: the files that the command writes, except figures and pages.
     - `figures`: the pictures that the command writes (PNG, PDF or SVG).
     - `pages`: the interactive HTML pages that the command writes.
-    - `directories`: the directories that the command creates, each with the names of the files in it. A
-      directory may occur several times.
+    - `directories`: each directory that the command creates, with the names of the files in it. A directory
+      may occur several times.
 
     **Raises:** `InputError` that names the first path that cannot be written.
     """
@@ -68,8 +68,8 @@ def _refuse_clashes(inputs: Iterable[str], files: Iterable[str], directories: It
         _refuse_place(path, read, taken)
         if parents := taken.intersection(map(str, Path(os.path.realpath(path)).parents)):
             raise InputError(
-                f"{path}: is a path in {parents.pop()}, which is an output file: choose another path for one "
-                "of the two outputs."
+                f"{path}: is inside {parents.pop()}, which is an output file and not a directory: choose "
+                "another path for one of the two outputs."
             )
 
 
@@ -117,14 +117,13 @@ def write_comparison_page(
     partial: bool,
     up: Axis | None,
 ) -> None:
-    """Write an interactive page that compares maps with `jaxsmw.report.summary.write_comparison`.
+    """Write an interactive page that shows several maps and their errors.
 
     The page labels each map with its file name without suffix. If two of these labels are equal, the page
     uses the file names with suffix instead. If two file names are equal, the page uses the full paths.
 
     **Arguments:**
 
-    - `path`: the page to write.
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
     - `maps`: a dictionary from the path of each file to its map X -> Y (m,).
     - `errors`: a dictionary from the same paths to the geodesic errors; empty if errors are unknown.

@@ -11,7 +11,7 @@ from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum
 from jaxsmw.cli.arguments import add_quiet
 from jaxsmw.cli.console import say, show
 
-# The commands in the order in which the help lists them.
+# The help lists the commands in this order.
 _COMMANDS = {
     "demo": demo,
     "match": match,
@@ -62,7 +62,7 @@ def make_parser() -> Parser:
 
 
 class _Version(argparse.Action):
-    """An action that prints the version. The slow look-up runs only if the version is requested."""
+    """Prints the version. The version is looked up only on request, because the look-up is slow."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(

@@ -13,9 +13,7 @@ from jaxsmw.errors import InputError
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command, and print one sentence on standard error if it fails.
 
-    **Arguments:**
-
-    - `arguments`: the words of the command line after `jaxsmw`.
+    `arguments` are the words of the command line after `jaxsmw`.
 
     **Returns:** The exit code: 0 for success, 2 for bad input, 1 for any other failure.
     """
@@ -24,7 +22,7 @@ def run_command(arguments: Sequence[str]) -> int:
             _run(arguments)
         finally:
             flush_output()
-    except SystemExit as ending:  # The parser raises it after the help, and for bad arguments.
+    except SystemExit as ending:  # raised by the parser after the help and for bad arguments
         return int(ending.code or 0)
     except InputError as error:
         say(f"jaxsmw: {error}")
@@ -39,7 +37,7 @@ def run_command(arguments: Sequence[str]) -> int:
             "numbers of vertices, eigenvectors or samples."
         )
         return 1
-    except BrokenPipeError:  # the reader of standard output, for example `head`, has closed the pipe
+    except BrokenPipeError:  # the program that reads the pipe, such as `head`, has closed it
         return 1
     return 0
 

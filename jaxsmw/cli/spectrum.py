@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _lines(eigenvalues: np.ndarray) -> list[str]:
-    """Return lines of eigenvalues. Each line begins with the index (0-based) of its first eigenvalue."""
+    """Return lines of eigenvalues. Each line begins with the 0-based index of its first eigenvalue."""
     lines = []
     for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
         row = " ".join(f"{value:9.2f}" for value in eigenvalues[first : first + _EIGENVALUES_PER_LINE])

@@ -34,19 +34,15 @@ def all_finite(tree: PyTree) -> Bool[Array, ""]:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Checks that the value of an option is one of the choices.
-
-    **Raises:** `ValueError` if the value is not one of the choices.
-    """
+    """Raises `ValueError` if the value of an option is not one of the choices."""
     if value not in choices:
         raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
-    """Checks the type of an argument.
+    """Raises `TypeError` if the value is not an instance of one of the types `kinds`.
 
-    **Raises:** `TypeError` if the value is not an instance of one of the types `kinds`. The message names
-    only the first type.
+    The error message names only the first type.
     """
     if isinstance(value, kinds):
         return
@@ -63,8 +59,8 @@ def check_between(
 
     If the parameter is traced, only its number of dimensions is checked.
 
-    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if a number in it is not
-    finite or not strictly between `low` and `high`.
+    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if its numbers are not all
+    finite and strictly between `low` and `high`.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
@@ -97,7 +93,7 @@ def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Para
 
 
 def _whole_number(caller: str, iterations: object) -> int:
-    """Returns the number of iterations as a Python integer; see `counts_iterations` for the errors."""
+    """Returns the number of iterations as a Python integer."""
     try:
         number = operator.index(iterations)  # type: ignore[arg-type]
     except TypeError:

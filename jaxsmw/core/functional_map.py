@@ -1,4 +1,4 @@
-r"""Functional maps: the matrix form of a pointwise map, and the energy of wavelet preservation.
+r"""The functional map of a pointwise map, and the wavelet-preservation energy.
 
 T: X -> Y is a pointwise map, and P (m, n) is its matrix, with a one at (x, T(x)) in each row x. Phi_X and
 Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering. There are two
@@ -9,10 +9,10 @@ conventions for the direction of a functional map C:
 - **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
   equations of the MWP paper use this convention.
 
-This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions
-every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x, and C should map a_x to
-b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which eq. (5) of the MWP
-paper uses, all vertices have the same weight. The following table defines the weights and the vectors:
+This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions,
+every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C maps a_x to
+b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation (5) of the
+MWP paper uses, all vertices have the same weight. The following table defines the weights and the vectors:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -21,26 +21,27 @@ paper uses, all vertices have the same weight. The following table defines the w
 | pushforward | area      | area_X(x)  | Phi_X(x)           | area_Y(T(x)) Phi_Y(T(x)) / area_X(x) |
 | pushforward | frobenius | 1          | area_X(x) Phi_X(x) | area_Y(T(x)) Phi_Y(T(x))             |
 
-In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in
-the paper. The energy of eq. (5) of the paper, with the filters g_l of a bank, is
+In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the
+MWP paper. For a bank with filters g_l, equation (5) of the MWP paper defines the energy
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
-The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of both shapes. The matrices G_out and
-G_in contain the responses of the filters at these eigenvalues, one row per filter. For every matrix M, the
-sum over filters equals an elementwise product (`*`):
+The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the two shapes. The matrices G_out
+and G_in contain the responses of the filters at these eigenvalues, one row per filter. For every matrix M,
+the sum over filters equals an elementwise product (`*`):
 `sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on a matrix `gram`,
-a matrix `cross` and a constant. This computation needs no loop over filters and no array of size m x n:
+a matrix `cross` and a constant. Computing `gram` and `cross` needs no loop over filters and no array of size
+m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
 The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
-called orthonormal if `sum_x w a a^T` is the identity. Then the gram matrix is diagonal, its diagonal is the
+called orthonormal if `sum_x w a a^T` is the identity. Then `gram` is a diagonal matrix that contains the
 frame function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval
-frame this minimiser is the filtered map of eq. (8) of the paper. In the area norm, the inputs are always
-orthonormal in the pushforward convention. In the pullback convention they are orthonormal if T preserves
-area. `docs/frames.md` derives these results.
+frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward convention with
+the area norm, the inputs are always orthonormal. In the pullback convention with the area norm, the inputs
+are orthonormal if T preserves area. `docs/frames.md` derives these results.
 """
 
 from __future__ import annotations
@@ -86,10 +87,10 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
 
     - `spectrum`: the `Spectrum` of a shape with n vertices and k eigenvectors.
     - `pseudo_inverse`: `"area"` computes `Phi^+ = Phi^T A`, where the diagonal matrix A contains the vertex
-      areas. This matrix is the projection in the inner product of the surface, which the MWP paper uses.
+      areas. The MWP paper uses this matrix, which is the projection in the inner product of the surface.
       `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
-      authors' program uses this form. Both matrices are nearly equal if the vertices are spread evenly. If
-      the spectrum contains only samples, only `"least_squares"` gives a pseudo-inverse.
+      authors' program uses `"least_squares"`. The two forms are nearly equal if the vertices are spread
+      evenly. If the spectrum contains only samples, only `"least_squares"` gives a pseudo-inverse.
 
     **Raises:** `ValueError` for an unknown pseudo-inverse.
     """
@@ -153,11 +154,12 @@ def _encode(
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the multiscale kernel K (k_out, k_in), with which filtering becomes an elementwise product.
+    """Returns the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
 
-    For every functional map C (k_out, k_in) and the filters g_l of a bank, the filtered map
+    For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map
     `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrices
-    Lambda_out and Lambda_in contain the eigenvalues of the shapes that C maps to and maps from.
+    Lambda_out and Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps
+    from.
 
     **Arguments:**
 
@@ -171,7 +173,7 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here `<A, B>` is the sum of the elementwise products of two matrices. Every sum of squares
+    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
     `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
     energy of C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy.
     `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of shape ().
@@ -220,15 +222,15 @@ class QuadraticEnergy(eqx.Module):
 
     def is_regular(self) -> Bool[Array, ""]:
         """Returns whether the gram matrix is non-singular to working precision."""
-        # If the gram matrix is singular, a pivot of its Cholesky factorisation is as small as the rounding
-        # error or negative. All pivots from the first negative pivot on are NaN, so the comparison is False.
+        # If the gram matrix is singular, one of its Cholesky pivots is negative or as small as the rounding
+        # error. A negative pivot and all later pivots become NaN, so the comparison is False.
         pivots = jnp.diagonal(self.cholesky()) ** 2
         return jnp.min(pivots) > self.rounding()
 
     def rounding(self) -> Float[Array, ""]:
         """Returns an estimate of the rounding error of the gram matrix.
 
-        The estimate is the product of the largest diagonal entry, k_in, and the precision of the float type.
+        The estimate is k_in times the largest diagonal entry times the machine epsilon.
         """
         relative = self.gram.shape[0] * jnp.finfo(self.gram.dtype).eps
         return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
@@ -245,9 +247,8 @@ class QuadraticEnergy(eqx.Module):
 class WaveletProblem(eqx.Module):
     """The data from which a `Solution` computes the functional map C of a pointwise map from X to Y.
 
-    The code of a solution is the same for both conventions. The methods of this class return the quantities
-    of both shapes in the order (out, in): first the shape that C maps to ("out"), then the shape that C maps
-    from ("in").
+    The properties `spectra` and `responses` are pairs in the order (out, in): first the shape that C maps to,
+    then the shape that C maps from. A solution can therefore use the same code for both conventions.
 
     **Attributes:**
 
@@ -256,8 +257,8 @@ class WaveletProblem(eqx.Module):
       and of Y, (filters, k_y).
     - `convention`: `"pullback"` (the default) if C maps functions on Y to functions on X; `"pushforward"` if
       C maps functions on X to functions on Y.
-    - `sampled`: whether the spectra contain samples only, by default False. On samples the eigenvectors are
-      not orthonormal.
+    - `sampled`: whether the spectra contain only samples of the vertices, by default False. On samples, the
+      eigenvectors are not orthonormal.
     """
 
     spectrum_x: Spectrum
@@ -295,12 +296,12 @@ class WaveletProblem(eqx.Module):
         return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
 
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
-        """Returns the wavelet-preservation energy, eq. (5) of the MWP paper, as a function of C.
+        """Returns the wavelet-preservation energy (equation (5) of the MWP paper) as a function of C.
 
         For each functional map C, the energy is a weighted sum of squared distances over all filters and all
-        vertices x of X. In the pullback convention, each distance is between the wavelet at x and the image
-        under C of the wavelet at the match of x. The docstring of the module `jaxsmw.core.functional_map`
-        states the formula, which holds for every filter bank.
+        vertices x of X. In the pullback convention, C maps the wavelet at the match of x to a function on X.
+        The distance is measured from this function to the wavelet at x. The docstring of the module
+        `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
 
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
         also for frames that are not tight. `problem.energy(T).constant` is the energy of C = 0. In the
@@ -311,7 +312,7 @@ class WaveletProblem(eqx.Module):
 
         - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
         - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
-          vertices the same weight, as in eq. (5) of the MWP paper.
+          vertices the same weight, as in equation (5) of the MWP paper.
 
         **Returns:** A `QuadraticEnergy` with the attributes `gram` (k_in, k_in), `cross` (k_out, k_in) and
         `constant` ().
@@ -327,7 +328,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns w_x, a_x and b_x of all vertices x of X, which the docstring of this module defines."""
+        """Returns the weights w_x, inputs a_x and outputs b_x that the module docstring defines."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

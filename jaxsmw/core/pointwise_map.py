@@ -20,28 +20,30 @@ def spectral_embeddings(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns one point for each vertex of X and Y, such that matched vertices have nearby points.
+    """Returns spectral embeddings of X and Y: point sets in which matched vertices are close to each other.
 
     The matrices Phi_X and Phi_Y contain the eigenvectors as columns. In the pullback convention, the points
     of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
     convention, the points of X are the rows of `Phi_X C^T`, and the points of Y are the rows of `Phi_Y`.
 
-    The convention matters because a filtered C shrinks the vectors that it maps. In the pushforward
-    convention C shrinks the *queries*. The nearest points of most queries are then the few database points of
-    small norm, which become hubs. In the pullback convention C shrinks the *database*, which hardly changes
-    the order of the distances from a query. With filtering, refinement succeeds on real shapes in the
-    pullback convention and fails in the pushforward convention.
+    The convention matters because filtering makes C shrink vectors. In the pushforward convention, C shrinks
+    the queries. A few database points of small norm are then nearest to most queries. In the pullback
+    convention, C shrinks the database, which hardly changes the order of the distances from a query. With
+    filtering, refinement therefore succeeds on real shapes in the pullback convention and fails in the
+    pushforward convention.
 
     **Arguments:**
 
     - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
-    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
-      `"pushforward"` if C maps functions on X to functions on Y.
+    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
+      X. With `"pushforward"`, C maps functions on X to functions on Y.
 
-    **Returns:** The queries (m, d), one row per vertex of X, and the database (n, d), one row per vertex of
-    Y. d is the number of rows of C. The points are in the unit of the eigenvectors.
+    **Returns:** The queries (m, d), one point per vertex of X, and the database (n, d), one point per vertex
+    of Y. The dimension d is the number of rows of C. The coordinates have the unit of the eigenvectors.
+
+    **Raises:** `ValueError` for an unknown convention.
     """
     rows_out, rows_in = out_and_in(convention, spectrum_x.eigenvectors, spectrum_y.eigenvectors)
     return out_and_in(convention, rows_out, product(rows_in, functional_map.T))
@@ -55,7 +57,7 @@ def decode(
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
 ) -> Int32[Array, " m"]:
-    """Returns the pointwise map T: X -> Y of a functional map C, by a nearest-neighbour search.
+    """Recovers the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
 
     This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
     of Y that is nearest in spectral space. Phi_X and Phi_Y contain the eigenvectors as columns. In the
@@ -68,12 +70,14 @@ def decode(
     - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
-    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
-      `"pushforward"` if C maps functions on X to functions on Y.
+    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
+      X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
-      large shapes. None (the default) compares all vertices of X with all vertices of Y.
+      large shapes. With None (the default), the search compares all vertices of X with all vertices of Y.
 
     **Returns:** T, one vertex of Y per vertex of X, as an int32 array (m,) of indices from 0 to n - 1.
+
+    **Raises:** `ValueError` for an unknown convention.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_vertices(queries, database, spectrum_y.mask, patches)
@@ -92,27 +96,27 @@ def decode_to_triangles(
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
     vertices of both shapes become points in spectral space. The matrices Phi_X and Phi_Y contain the
     eigenvectors as columns. In the pullback convention, the points are the rows of `Phi_X` and `Phi_Y C^T`.
-    In the pushforward convention, they are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span a
-    surface in this space. Each vertex of X is mapped to the nearest point of this surface.
+    In the pushforward convention, the points are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span
+    a surface in this space. Each vertex of X is mapped to the nearest point of this surface.
 
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
-    `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions
-    therefore stay smooth when this map transfers them. `decode_to_triangles` takes about ten times as long as
-    `decode` without patches: one second for shapes of 5000 vertices. The time grows with the product of the
-    numbers of vertices of X and Y.
+    `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions on Y
+    therefore stay smooth when they are transferred to X. For shapes of 5000 vertices, `decode_to_triangles`
+    takes about one second, ten times as long as `decode` without patches. The time grows with the product of
+    the numbers of vertices of X and Y.
 
     **Arguments:**
 
     - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
-    - `convention`: the direction of C. `"pullback"` (the default) if C maps functions on Y to functions on X;
-      `"pushforward"` if C maps functions on X to functions on Y.
+    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
+      X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
 
-    **Returns:** A pair of arrays: for each vertex of X, the index of a triangle of Y, int32 (m,), and the
-    barycentric weights of the three corners of this triangle (m, 3). The weights are not negative and sum to
-    1.
+    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains the index of a
+    triangle of Y. The second array (m, 3) contains the barycentric weights of the triangle's corners, which
+    are not negative and sum to 1.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -127,15 +131,14 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
     Y.
 
-    The number of vertices per patch of Y grows with the square root of Y's number of vertices. This size
-    balances the work per patch and the work per vertex. The time of a search therefore grows with the number
-    of vertices to the power 1.5.
+    The number of vertices per patch of Y grows with the square root of Y's number of vertices. With patches
+    of this size, the time of a search grows with the number of vertices to the power 1.5.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
 
-    **Returns:** A pair: the patches of X, for the queries, and the patches of Y, for the database.
+    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database).
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
@@ -148,7 +151,7 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 def chosen_patches(
     search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Patches, Patches] | None:
-    """Returns the `search_patches` of both shapes if the setting `search` needs them, and None otherwise.
+    """Returns the result of `search_patches` if the setting `search` needs patches, and None otherwise.
 
     `"patches"` always uses patches, and `"exhaustive"` never uses patches. `"auto"` uses patches if the
     default backend is a CPU and the geometric mean of the two numbers of vertices is at least 15 000.
@@ -160,11 +163,11 @@ def chosen_patches(
     return None
 
 
-# If the geometric mean of the two numbers of vertices is at least this number, patches save more time than
-# the additional compilation takes.
+# `"auto"` uses patches if the geometric mean of the numbers of vertices of X and Y is at least this number.
+# For smaller shapes, the compilation of the search in patches takes more time than the search saves.
 _PATCHES_FROM = 15_000
-# These values were the fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices per patch of
-# X. _RANK is the argument `rank` of `make_patches` for Y. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a
-# patch of Y has _SMALLEST_PATCH vertices.
+# With these values, the search was fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices
+# per patch of X. _RANK is the argument `rank` of `make_patches` for Y. If Y has _VERTICES_OF_SMALLEST
+# vertices or fewer, a patch of Y has _SMALLEST_PATCH vertices.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

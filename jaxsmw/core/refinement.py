@@ -30,16 +30,17 @@ class History(eqx.Module):
     **Attributes:**
 
     - `changed`: (iterations,), the share, from 0 to 1, of the vertices of X whose match changed in each
-      iteration. If the refinement uses samples, `changed` is the share of the samples of X. Its first and
-      last entries are then NaN, because these iterations have no earlier map of the same vertices.
+      iteration. If the refinement uses samples, `changed` is computed from the samples of X only, and its
+      first and last entries are NaN.
     - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
-      the pointwise map that led to this state. For `WaveletPreservation`, this is the energy of eq. (5) of
-      the MWP paper.
+      from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
+      equation (5) of the MWP paper.
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
-      and the pointwise map that was recovered from this state.
-    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Skipped
-      iterations repeat the final map. After a failure, all entries are -1. `pointwise_maps` is None if the
-      refinement uses samples, because the iterations then map only the samples.
+      and from the pointwise map that was recovered from this state.
+    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. The entries of
+      skipped iterations repeat the final map. After a failure, all entries of `pointwise_maps` are -1.
+      `pointwise_maps` is None if the refinement uses samples, because the iterations then map only the
+      samples.
     """
 
     changed: Float[Array, " iterations"]
@@ -55,15 +56,15 @@ class Refinement(eqx.Module):
 
     - `pointwise_map`: the refined map T: X -> Y (m,), one vertex of Y per vertex of X; all entries are -1
       after a failure.
-    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. It is a
-      property, equal to `state.functional_map`. C is a pullback (k_X, k_Y), which takes functions on Y to
-      functions on X, unless the refiner's `convention` is `"pushforward"`. A pushforward (k_Y, k_X) takes
-      functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
+    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. This
+      property returns `state.functional_map`. By default, C is a pullback (k_X, k_Y), which takes functions
+      on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y, k_X) takes functions
+      on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
     - `state`: the final `State` of the refiner, which contains the functional map.
     - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
       `RESULTS[result]` is a sentence that explains the status.
-    - `iterations`: the number of iterations that were run. It is smaller than the requested number if the
-      refinement stopped early.
+    - `iterations`: the number of iterations that were run. If the refinement stopped early, this number is
+      smaller than the requested number.
     - `history`: a `History`, or None if `refine` was called with `history=False`.
     """
 
@@ -109,30 +110,30 @@ def refine(
 ) -> Refinement:
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
-    The loop is Algorithm 1 of the MWP paper, and any refiner can be used. The function is pure and
+    The loop is Algorithm 1 of the MWP paper, generalised to any refiner. The function is pure and
     jit-compiled. JAX compiles the function again only when sizes or static settings change. For many pairs of
     equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
     `jaxsmw.refine_pairs`.
 
     If samples are given, the first functional map is computed from all vertices. The iterations then match
-    only the samples, and the final search matches all vertices. With `WaveletPreservation`, this procedure is
-    the fast variant of the MWP authors.
+    only the samples, and the final search matches all vertices. With `WaveletPreservation`, refinement on
+    samples is the fast variant of the MWP authors' method.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-    - `pointwise_map`: the initial map T, an integer array (m,) with one vertex of Y, from 0 to n - 1, per
-      vertex of X.
+    - `pointwise_map`: the initial map T, an integer array (m,). The array contains, for each vertex of X, the
+      index of a vertex of Y, from 0 to n - 1.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
     - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
       map and then a pointwise map.
-    - `samples`: a pair of integer arrays, the vertices of X (s_x,) and of Y (s_y,) on which to iterate. The
-      samples should be evenly spread and outnumber the eigenvectors. With None, all iterations use all
-      vertices.
+    - `samples`: a tuple of two integer arrays: the vertices of X (s_x,) and of Y (s_y,) on which the
+      refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
+      iterations use all vertices.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
     - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
-      every pair takes as long as the slowest pair, but the result of a pair stays the same.
+      every pair takes as long as the slowest pair, but the results are the same as without `jax.vmap`.
     - `history`: whether to record a `History`. Recording increases the run time by about 10 %.
 
     **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,), `functional_map` (k_out, k_in)
@@ -197,8 +198,8 @@ class _Record(NamedTuple):
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
         """Returns the record of a loop on samples, extended by the final search of all vertices.
 
-        The first map of the samples and the final map of all vertices have no earlier map of the same
-        vertices. The entries of `changed` for these two maps are therefore NaN.
+        The first and the last entry of `changed` become NaN, because no earlier map of the same vertices
+        exists.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -222,7 +223,7 @@ class _Loop:
 
     `init` computes the first state. Then each call of `step` runs one iteration, until `terminate` returns
     True. A step searches for the pointwise map of the current state. Every step except the last step then
-    updates the state.
+    computes the next state.
     """
 
     refiner: Refiner
@@ -265,9 +266,9 @@ class _Loop:
     def search(
         self, prepared: Prepared, state: State, before: Int32[Array, " s"]
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """Returns the pointwise map of a state, the share of changed matches, and the objective.
+        """Recovers the pointwise map from a state.
 
-        A match has changed if it differs from the map `before`.
+        Returns the map, the share of matches that differ from the map `before`, and the objective.
         """
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
@@ -334,7 +335,7 @@ def _check_arguments(
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Checks that two spectra can be refined together.
+    """Checks that both arguments are spectra and have the same float type.
 
     **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the spectra have different
     float types.
@@ -350,11 +351,10 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Returns the status code of an update.
+    """Returns the status code of an update after a check of the new state.
 
-    If the update reports a failure, this failure is returned. If the state contains NaN or infinity, or all
-    entries of the functional map are zero, the status code names this failure. Otherwise the status code is
-    `RESULTS.successful`.
+    A failure in `result` is returned unchanged. A state that contains NaN or infinity is a failure, and so is
+    a functional map whose entries are all zero.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -365,16 +365,16 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Returns the status code of a refinement.
+    """Returns the status code of a refinement after a check of its inputs.
 
-    If a spectrum contains numbers that are not finite, or the initial map is invalid, the status code names
-    this fault. Otherwise the status code is `result`.
+    If a spectrum contains NaN or infinity, or the initial map is invalid, the status code names this fault.
+    Otherwise the status code is `result`.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `matches`: the vertices of Y in the initial map, one or several per vertex of X (m, ...); None if the
-      initial map contains no vertex indices.
+    - `matches`: the vertices of Y in the initial map, (m, ...), one or several per vertex of X; None for a
+      dense soft map, which contains no vertex indices.
     - `result`: the status code of the refinement loop.
     """
     if matches is not None:

@@ -38,8 +38,7 @@ class Problem(eqx.Module):
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
         """Returns the spectra of X and of Y at the vertices on which the refiner iterates.
 
-        If the problem has samples, the spectra contain only the samples. Otherwise the spectra contain all
-        vertices.
+        The refiner iterates on the samples or, if the problem has no samples, on all vertices.
         """
         if self.samples is None:
             return self.spectrum_x, self.spectrum_y
@@ -121,14 +120,14 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
         **Arguments:**
 
-        - `problem`: both spectra, the samples if there are any, and whether the pair is partial.
+        - `problem`: a `Problem`, which contains both spectra, the samples or None, and the flag `partial`.
         """
 
     @abc.abstractmethod
     def update(
         self, prepared: PreparedT, pointwise_map: Int[Array, " m"], previous: StateT | None
     ) -> tuple[StateT, RESULTS]:
-        """Returns the state that follows from a pointwise map, and a status code (a member of `RESULTS`).
+        """Computes a state from a pointwise map. Returns the state and a status code (a member of `RESULTS`).
 
         **Arguments:**
 
@@ -139,15 +138,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @abc.abstractmethod
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
-        """Returns the pointwise map X -> Y that follows from a state.
+        """Recovers the pointwise map X -> Y (m,) from a state.
 
-        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. `update` must accept this map
-        together with the same `prepared`.
+        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. The map must be a valid argument
+        of `update` with the same `prepared`.
         """
 
     @abc.abstractmethod
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
-        """Returns the reverse map Y -> X that follows from a state, (n,).
+        """Recovers the reverse map Y -> X (n,) from a state.
 
         The map assigns to each vertex of Y the vertex of X that is nearest in the `embeddings`. `prepared`
         must be the result of `prepare` for a problem without samples.
@@ -182,9 +181,9 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def objective(
         self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the area-weighted mean squared distance between matched embeddings, a scalar array.
+        """Returns the area-weighted mean squared distance between matched points of the `embeddings`.
 
-        `jaxsmw.refine` stores this value in `History.objective`.
+        The result is a scalar array, which `jaxsmw.refine` stores in `History.objective`.
 
         **Arguments:**
 
@@ -197,13 +196,11 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether all iterations after a state use the same settings.
+        """Returns whether all iterations after a state use the same settings, such as the same eigenvectors.
 
-        A setting is, for example, the number of eigenvectors.
-
-        With the same settings, a map that one iteration leaves unchanged also stays unchanged in all later
-        iterations. `jaxsmw.refine` therefore stops early only if this method returns True. The default is
-        True.
+        If the settings stay the same, a map that one iteration leaves unchanged also stays unchanged in all
+        later iterations. `jaxsmw.refine` therefore stops early only if this method returns True. The default
+        is True.
         """
         return jnp.asarray(True)
 

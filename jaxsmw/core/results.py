@@ -7,13 +7,13 @@ from jaxtyping import Array, Bool
 
 
 class RESULTS(eqx.Enumeration):
-    """The status code of a refinement, which compiled code can return.
+    """The status code of a refinement.
 
-    `Refinement.result` and `SoftRefinement.result` are status codes, under `jax.vmap` one for each pair.
-    Compare a status code `result` with a member: `result == RESULTS.successful`. `RESULTS[result]` is a text
-    that explains the status and suggests remedies. The members are `successful`, `nonfinite_spectrum`,
-    `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`, `singular_system`,
-    `fixed_point_not_reached` and `solver_not_converged`.
+    `Refinement.result` and `SoftRefinement.result` are status codes. Under `jax.vmap`, `result` contains one
+    status code per pair. Compare a status code `result` with a member: `result == RESULTS.successful`.
+    `RESULTS[result]` is a text that explains the status and suggests remedies. The members are `successful`,
+    `nonfinite_spectrum`, `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`,
+    `singular_system`, `fixed_point_not_reached` and `solver_not_converged`.
     """
 
     successful = "The refinement succeeded: all numbers are finite."

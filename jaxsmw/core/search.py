@@ -26,11 +26,10 @@ from jaxsmw.core.products import product
 # argmax.
 BLOCK = 128
 _CHUNK = 64
-# `_maximum` divides an axis into parts. The axis of a chunk is divided into parts of _RUN rows, and the axis
-# of all boxes is divided into _PARTS parts.
+# `_maximum` divides the axis of a chunk into parts of _RUN rows, and the axis of all boxes into _PARTS parts.
 _RUN, _PARTS = 8, 16
-# `make_patches` divides points along their first _COORDINATES coordinates. It computes `Patches.variations`
-# by _POWER_ITERATIONS power iterations, after which the variations have nearly converged.
+# `make_patches` divides points along their first _COORDINATES coordinates. After _POWER_ITERATIONS power
+# iterations, `Patches.variations` has nearly converged.
 _COORDINATES, _POWER_ITERATIONS = 6, 4
 # One step of the search in patches compares a block of queries with _GROUP patches, by one matrix product.
 _GROUP = 4
@@ -44,21 +43,21 @@ def nearest_neighbor(
 ) -> Int32[Array, " m"]:
     """Returns, for each query, the index of the database row that is nearest in Euclidean distance.
 
-    The search compares every query with every row, and it is exact up to rounding errors. If several rows are
-    equal, the result is the lowest index. The queries are processed in blocks, so no array of size m x n is
-    stored.
+    The search compares every query with every row, and it is exact up to rounding errors. If several database
+    rows are identical, the search returns the lowest of their indices. The queries are processed in blocks,
+    so no array of size m x n is stored.
 
     The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the nearest row. The
-    search first finds the best score in every chunk of database rows. Then it finds the best row in each of
-    the two best chunks. Finally, the distances from the query decide between these two rows. If `|b|` is
-    large compared to the distance, scores have large rounding errors, so the last comparison is necessary.
-    The search takes little longer than the matrix product that computes the scores.
+    search finds the two chunks of database rows with the best scores, and the best row in each of these
+    chunks. The search then compares the distances from the query to these two rows, because scores have large
+    rounding errors if `|b|` is large compared to the distance. The search takes little longer than the matrix
+    product that computes the scores.
 
     **Arguments:**
 
     - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `database_mask`: a Boolean array (n,), False for rows that are never chosen. None allows all rows. If
-      all entries are False, the result is meaningless.
+    - `database_mask`: a Boolean array (n,), False for rows that are never chosen. With None (the default),
+      all rows can be chosen. If all entries are False, the result is meaningless.
 
     **Returns:** One index from 0 to n - 1 per query, an int32 array (m,).
 
@@ -144,11 +143,11 @@ def _nearest(
 
 
 class Patches(eqx.Module):
-    """Groups of nearby points. All groups have the same size.
+    """Groups of nearby points. All groups contain the same number of points.
 
     Patches make searches in the spectral embedding of a surface faster. In this embedding, the points of a
-    patch differ mainly along a few directions, because eigenfunctions are smooth and patches are small
-    compared to their wavelengths.
+    patch differ mainly along a few directions, because patches are small compared to the wavelengths of the
+    eigenfunctions.
 
     **Attributes:**
 
@@ -165,10 +164,10 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Divides points into patches of equal size by repeatedly halving all groups of points.
+    """Divides points into patches of equal size by repeated halving.
 
-    Each group is divided along its coordinate of largest variance. For this division, only the first 6
-    coordinates of the points are used.
+    Each group of points is halved along one of the first 6 coordinates: the coordinate with the largest
+    variance.
 
     **Arguments:**
 
@@ -190,8 +189,8 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
         jnp.pad(points[:, :_COORDINATES], ((0, total - n), (0, 0))), jnp.pad(mask, (0, total - n)), levels
     )
     valid = jnp.pad(mask, (0, total - n))[rows]
-    # The rows of a patch are sorted, so that the first of several equally near candidates has the lowest
-    # index. Padding is at the end.
+    # The rows of a patch are sorted, so the first of several equally near candidates has the lowest index.
+    # Padding has the highest indices, so it comes last.
     rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     if rank == 0:
@@ -227,7 +226,7 @@ def _halved(
 
 
 def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: int) -> Float[Array, "p r s"]:
-    """Returns the `variations` (p, r, s) of patches, by power iteration."""
+    """Computes the `variations` (p, r, s) of patches by power iteration."""
     _, deviations = _centered(points, mask)
     products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 
@@ -254,7 +253,7 @@ def _centered(
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """Returns orthonormal vectors for each group. Their span contains the given vectors of the group."""
+    """Returns orthonormal vectors for each group. Their span contains the group's given vectors."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -270,8 +269,8 @@ def nearest_neighbor_in_patches(
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
     gives a lower bound on the distances from a query to the points of the patch. The computation of this
     bound needs only r + 1 scalar products. For each query, the patch with the nearest box gives a first
-    candidate. The queries are also divided into patches. For all queries of such a patch together, the search
-    skips every database patch that cannot contain a nearer point for any of these queries. The bounds allow
+    candidate. The queries are also divided into patches. The search skips a database patch for a whole patch
+    of queries if the database patch cannot contain a nearer point for any of these queries. The bounds allow
     for rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions,
     the search skips no patch, and `nearest_neighbor` is faster.
 
@@ -331,8 +330,9 @@ def nearest_vertices(
     """Returns the index of the database row that is nearest to each query, (m,).
 
     `patches` contains the patches of the queries and the patches of the database, as returned by
-    `make_patches`. If `patches` is None, the search is exhaustive. It then never chooses rows for which
-    `database_mask` (n,) is False. A search in patches ignores `database_mask`, because patches contain masks.
+    `make_patches`. If `patches` is None, the search is exhaustive. The exhaustive search never chooses rows
+    for which `database_mask` (n,) is False. A search in patches ignores `database_mask`, because patches
+    contain masks.
     """
     if patches is None:
         return nearest_neighbor(queries, database, database_mask=database_mask)
@@ -374,8 +374,8 @@ def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
 class _BoundTables(NamedTuple):
     """The boxes of all patches, arranged so that one matrix product gives all bounds.
 
-    `axes` contains the first axes of all patches, then the second axes of all patches, and so on. Its last
-    rows are the centres of the patches.
+    `axes` contains the first axes of all patches, then the second axes of all patches, and so on. The last
+    rows of `axes` are the centres of the patches.
     """
 
     axes: Float[Array, "rows d"]
@@ -394,8 +394,8 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
     center_norms = jnp.sum(boxes.center**2, axis=1)
     low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # `precision` limits the relative rounding error of a bound, whose computation contains sums of d products
-    # and about 12 further operations.
+    # `precision` is an upper limit on the relative rounding error of a bound. The computation of a bound
+    # contains sums of d products and about 12 further operations.
     precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
     return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
 
@@ -403,19 +403,19 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
 def _bounds(
     tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Returns squared distances to boxes, lower bounds on distances to points, and coordinates of queries.
+    """Computes lower bounds on the distances from queries to the points of patches.
 
     **Returns:** Three values for all patches and all queries of a block. The first value is an array of the
-    squared distances from the queries to the boxes, as if all radii were zero. The second value is an array
+    squared distances from the queries to the boxes, with all radii set to zero. The second value is an array
     of lower bounds on the distances from the queries to the points of the patches. The third value is a list
-    of the coordinates of the queries along each axis.
+    with one array per axis, which contains the coordinates of the queries along this axis of each patch.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
     norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
     squared = norms - 2 * products[rank * patches :]
     along = []
-    for i in range(rank):  # XLA would not vectorise a sum over an axis of an array
+    for i in range(rank):  # a loop, because XLA would not vectorise a sum over an axis
         along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
         outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
         squared = squared + (outside**2 - along[i] ** 2)
@@ -432,11 +432,10 @@ def _distance_to_promising_patch(
 ) -> Float[Array, " block"]:
     """Returns the distance from each query to one point of the patch with the nearest box.
 
-    Among the points of this patch, the function chooses the point that is nearest in the coordinates along
-    the axes of the box.
+    This point is nearest to the query in the coordinates along the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
-    # Finding the smallest value first and its position second takes a third of the time that argmin takes.
+    # A minimum, followed by a search for its position, takes a third of the time of argmin.
     smallest = -_maximum(-squared, 0, _PARTS)
     is_smallest = squared == smallest[None, :]
     promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)
@@ -451,7 +450,7 @@ class _Found(NamedTuple):
     """The two best candidates found so far for each query.
 
     The two candidates are in different patches. `rows` contains the indices of the candidates in the
-    flattened points of all patches. `scores` contains their scores.
+    flattened array of all patches' points. `scores` contains their scores.
     """
 
     step: Int32[Array, ""]
@@ -462,12 +461,12 @@ class _Found(NamedTuple):
 def _two_best_rows(
     boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
-    """Searches the needed patches for the two best candidates of each query, in different patches.
+    """Finds the two best candidates of each query, in two different patches, among the needed patches.
 
     Each step of the search compares the queries with _GROUP patches.
 
-    **Returns:** The indices of the candidates in the flattened points of all patches, and a Boolean array
-    that is True for masked or missing candidates.
+    **Returns:** The indices of the candidates in the flattened array of all patches' points, and a Boolean
+    array that is True for masked or missing candidates.
     """
     patches, size, d = boxes.points.shape
     each = jnp.arange(block.shape[0])

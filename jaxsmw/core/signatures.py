@@ -39,10 +39,10 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
     """Returns the wave kernel signature at evenly spaced logarithmic energies.
 
-    The signature is that of Aubry, Schlickewei, Cremers 2011. The weights are Gaussians in the logarithm of
-    the eigenvalue. Their centres run in even steps from `log lambda_min + 2 width` to
-    `log lambda_max - 2 width`, and their width (standard deviation) is 7 steps. Here lambda_max is the
-    largest eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
+    Aubry, Schlickewei, Cremers 2011 define this signature. The weights are Gaussians in the logarithm of the
+    eigenvalue. The centres of the Gaussians run in even steps from `log lambda_min + 2 width` to
+    `log lambda_max - 2 width`. The `width` (standard deviation) of each Gaussian is 7 steps. Here lambda_max
+    is the largest eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
 
     **Arguments:**
 
@@ -54,8 +54,8 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
-    # The distance from each end of the range to the nearest centre is 2 widths, which is 14 steps. These two
-    # distances sum to 28 steps, and there are `dimensions - 1` steps between the centres.
+    # The outermost centres are `dimensions - 1` steps apart. The distance from each end of the range to the
+    # nearest centre is 2 widths, which are 14 steps.
     width = 7 * (high - low) / (dimensions - 1 + 28)
     energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
     positive = spectrum.eigenvalues >= smallest
@@ -68,9 +68,9 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
     """Returns the wavelet signature: the scaled squared norm of the Meyer wavelet at each vertex and scale.
 
     This signature is a spectral wavelet signature in the sense of Li and Ben Hamza 2013, but with the
-    band-pass filter of the Meyer frame from the MWP paper. The filter of each scale passes the eigenvalues
-    from `peak / 2` to `2 peak`. The peaks are log-spaced from lambda_min, the smallest positive eigenvalue,
-    to `lambda_max / 2`, half the largest eigenvalue.
+    band-pass filter of the Meyer frame from the MWP paper. The filter of each scale is largest at an
+    eigenvalue `peak` and passes the eigenvalues from `peak / 2` to `2 peak`. The peaks are log-spaced from
+    lambda_min, the smallest positive eigenvalue, to `lambda_max / 2`, half the largest eigenvalue.
 
     **Arguments:**
 

@@ -21,8 +21,8 @@ from jaxsmw.core.checks import as_parameter, check_between, check_kind
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
-# Queries are processed in blocks of this size. At any time, memory contains the distances from one block to
-# all database rows.
+# The number of queries per block. Memory contains the distances from all queries of one block to all database
+# rows.
 _BLOCK = 128
 
 
@@ -40,10 +40,10 @@ class SoftMap(eqx.Module):
 
     **Attributes:**
 
-    - `queries`, `database`: the points q (m, d) and y (n, d). Both point sets are shifted by the same vector.
-    - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. The area is zero for
-      ignored points. The shares of a query of zero area are computed from its position, like those of all
-      other queries.
+    - `queries`, `database`: the points q (m, d) and y (n, d). The points are shifted so that the
+      area-weighted mean of the database is the origin.
+    - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
+      zero. The shares of a query of area zero are still computed from its position.
     - `potentials`: g (n,), without unit. A higher potential increases the share of a row. The potential is
       zero for rows of zero area, and for all rows of a map that `Softmax` computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
@@ -108,14 +108,14 @@ class SoftMap(eqx.Module):
 
 
 class SparseSoftMap(eqx.Module):
-    """A soft map from m query points to n database points, with t database rows per query.
+    """A soft map from m query points to n database points, in which each query has at most t nonzero shares.
 
-    All other database rows have share zero. `NearestFew` computes such maps.
+    `NearestFew` returns maps of this type.
 
     **Attributes:**
 
     - `rows`: (m, t), the indices of the t database rows of each query, nearest first.
-    - `shares`: (m, t), the shares of these database rows. The shares of each query sum to 1.
+    - `shares`: (m, t), the share of each database row in `rows`. The shares of each query sum to 1.
     """
 
     rows: Int32[Array, "m t"]
@@ -140,8 +140,7 @@ class SparseSoftMap(eqx.Module):
                 f"functions on Y have shape {functions.shape}, but (n, p) is needed: give one row for each "
                 "vertex of Y"
             )
-        # The t rows of a query are processed one after another, because all t rows together would need t
-        # times the memory.
+        # This loop over the t rows of each query needs less memory than an array with all t rows.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
@@ -157,8 +156,9 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
     """Transfers functions on Y to X along a pointwise map or a soft map from X to Y.
 
-    With a pointwise map, each vertex of X receives the value at its match. With a soft map, it receives the
-    mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is stored.
+    With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
+    receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
+    stored.
 
     **Arguments:**
 
@@ -169,8 +169,8 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
     **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
 
     Entries of a pointwise map are not checked: JAX replaces an index above n - 1 by n - 1, and counts a
-    negative index from the end. In particular, check `Refinement.result` first, because the map of a failed
-    refinement is -1 everywhere.
+    negative index from the end. Check `Refinement.result` before the transfer, because all entries of the map
+    are -1 if the refinement failed.
 
     **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
     """
@@ -183,13 +183,13 @@ class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
     This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
-    `refine_softly` or `WaveletPreservationLayer`. The queries are then the m vertices of X in the spectral
-    embedding, and the database rows are the n vertices of Y. Ready subclasses are `Softmax`, `NearestFew` and
-    `Sinkhorn`.
+    `refine_softly` or `WaveletPreservationLayer`. `refine_softly` passes the m vertices of X in the spectral
+    embedding as queries, and the n vertices of Y as database rows. Ready subclasses are `Softmax`,
+    `NearestFew` and `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
-    The arguments are query points (m, d), database points (n, d), and the areas of both, (m,) and (n,). The
-    result is a `SoftMap` or a `SparseSoftMap` from the queries to the database.
+    The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
+    The result is a `SoftMap` or a `SparseSoftMap` from the queries to the database.
     """
 
     @abc.abstractmethod
@@ -213,8 +213,9 @@ class Recovery(eqx.Module):
 class Softmax(Recovery):
     """A recovery that gives shares to all database rows, and larger shares to nearer rows.
 
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
-    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
+    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
+    as database rows.
 
     The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
     `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
@@ -252,19 +253,20 @@ class Softmax(Recovery):
 class NearestFew(Recovery):
     """A recovery that gives shares only to the nearest database rows of each query.
 
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
-    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
+    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
+    as database rows.
 
-    The share of each of these rows is proportional to its area times `exp(-distance² / temperature)`, where
-    `distance` is the distance between the query and the row. The shares are differentiable, but derivatives
-    treat the choice of the rows as constant. The result is a `SparseSoftMap`, whose attributes `rows` and
-    `shares` have shape (m, t), where t is the smaller of `number` and n. On CPUs, `NearestFew` is slow in
-    float64, because sorting then takes most of the time.
+    The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
+    where `distance` is the distance between the query and the row. The shares are differentiable, but
+    derivatives treat the choice of the rows as constant. The result is a `SparseSoftMap`, whose attributes
+    `rows` and `shares` have shape (m, t), where t is the smaller of `number` and n. On CPUs, `NearestFew` is
+    slow in float64, because sorting then takes most of the time.
 
     **Arguments:**
 
-    - `number`: the number of database rows per query, an integer of at least 1. If fewer rows have positive
-      area, the remaining shares are zero.
+    - `number`: the number of database rows per query, an integer of at least 1. If fewer than `number` rows
+      have positive area, the remaining shares are zero.
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
       nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
@@ -301,8 +303,7 @@ class NearestFew(Recovery):
             return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
 
         rows = in_blocks(nearest, settled_queries, _BLOCK)
-        # The t rows of a query are processed one after another, because all differences together would need t
-        # times the memory.
+        # This loop over the t rows of each query needs less memory than an array with all differences.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
         exponents = -jnp.stack(squares, axis=1) / temperature
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
@@ -311,13 +312,14 @@ class NearestFew(Recovery):
 class Sinkhorn(Recovery):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`. The queries
-    are then the m vertices of X in the spectral embedding, and the database rows are the n vertices of Y.
+    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
+    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
+    as database rows.
 
     The function `sinkhorn` computes the shares. The area that all queries together send to a database row
     equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
-    functions (n, p) on Y to X (m, p). If the iterations end before they reach the tolerance, the result is
-    the map of the last iteration. No error is raised then, and `SoftMap.converged` is False.
+    functions (n, p) on Y to X (m, p). If the iterations end before they reach the tolerance, no error is
+    raised. The result is then the map of the last iteration, and its attribute `converged` is False.
 
     **Arguments:**
 
@@ -377,15 +379,15 @@ def sinkhorn(
 ) -> SoftMap:
     """Returns the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
 
-    The method is that of Cuturi, "Sinkhorn distances: lightspeed computation of optimal transport", NeurIPS
-    2013. A transport plan distributes the areas of the queries over the areas of the database rows. The
-    returned plan minimises the mean squared distance minus `temperature` times the entropy of the plan. A
-    nearest-neighbour map can send many queries to one row and no query to another row. The returned plan
-    instead sends to every row an area equal to the row's own area.
+    The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
+    transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
+    minimises the mean squared distance minus `temperature` times the entropy of the plan. A nearest-neighbour
+    map can send many queries to one row and no query to another row. The returned plan instead sends to every
+    row an area equal to the row's own area.
 
     The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
-    distances in blocks of queries, so no array of size m x n is stored. Derivatives are computed through all
-    iterations, and this computation stores no such array either.
+    distances in blocks of queries, so no array of size m x n is stored. Derivatives through all iterations
+    are also computed without an array of size m x n.
 
     **Arguments:**
 
@@ -397,10 +399,11 @@ def sinkhorn(
       squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
       area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
       temperatures give sharper maps and need more iterations. The rounding error of squared distances is eps
-      times the variance. A temperature below this error is raised to this error, and derivatives with respect
-      to the temperature are then zero. If the temperature is not positive, the result is NaN.
+      times the variance. If the temperature is below this error, the temperature is raised to the error, and
+      derivatives with respect to the temperature are zero. If the temperature is not positive, the result is
+      NaN.
     - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
-      are skipped. Under `jax.vmap`, they run but change nothing.
+      are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
 
@@ -483,13 +486,13 @@ def _log_kernel(
     """Returns `-distance² / temperature` up to an additive constant for each query.
 
     The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
-    at once. This layout halves the time.
+    at once. This layout halves the run time.
     """
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
 
 class _Transport(NamedTuple):
-    """Two point sets with areas, and a temperature, scaled for all recoveries.
+    """The scaled inputs of a recovery: two point sets with areas, and a temperature.
 
     The origin is the centre of the database. The areas of each point set sum to 1. The temperature is in
     squared units of the points.
@@ -520,13 +523,12 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Returns the `_Transport` between two point sets, from a temperature in the unit of `sinkhorn`.
+    """Returns the scaled inputs of a recovery, from a temperature in the unit that `sinkhorn` describes.
 
-    The centre of the database becomes the origin, because rounding would falsify distances between points far
-    from the origin. A training step can produce a temperature that is not positive. Such a temperature is
-    replaced by NaN, so all results are NaN. A temperature below the rounding error of squared distances is
-    raised to this error. A lower temperature would give exponents that consist of rounding errors, and
-    derivatives that overflow.
+    The centre of the database becomes the origin, because distances between points far from the origin have
+    large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A
+    temperature below the rounding error of squared distances is raised to this error. At lower temperatures,
+    exponents would consist of rounding errors, and derivatives would overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))

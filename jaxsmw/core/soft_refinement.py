@@ -30,10 +30,9 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: the final functional map C (k_out, k_in). C is a pullback (k_X, k_Y), which takes
-      functions on Y to functions on X, unless the refiner's `convention` is `"pushforward"`. A pushforward
-      (k_Y, k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless
-      numbers.
+    - `functional_map`: the final functional map C (k_out, k_in). By default, C is a pullback (k_X, k_Y),
+      which takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y,
+      k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
     - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C. Its
       `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()` returns an integer
       array (m,).
@@ -76,24 +75,25 @@ def refine_softly(
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
     - `pointwise_map`: the initial map X -> Y: an integer array (m,) with one vertex of Y per vertex of X, or
       a `SoftMap`, or a `SparseSoftMap`.
-    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. Its attribute
-      `search` has no effect.
+    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. The attribute
+      `search` of the refiner has no effect.
     - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
       `Sinkhorn()`. At lower temperatures, the results are closer to the results of `jaxsmw.refine`, but the
       derivatives are larger and less informative.
     - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
-      With `"implicit"`, this is the largest number of these maps.
+      With `"implicit"`, `iterations` is an upper limit.
     - `differentiation`: how derivatives are computed.
         - `"unrolled"`: automatic differentiation through all iterations.
-        - `"checkpointed"` (the default): the same derivatives with less memory. The backward pass computes
-          the intermediate values of each iteration again instead of storing them.
+        - `"checkpointed"` (the default): the same derivatives as `"unrolled"`, with less memory. The backward
+          pass computes the intermediate values of each iteration again instead of storing them.
         - `"implicit"`: the iterations run up to a fixed point C = F(C, θ), where F is one iteration and θ are
-          its parameters. The derivatives follow from the implicit function theorem: `dC = (I - dF/dC)^-1
-          dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the linear system of this
-          formula, which contains only derivatives of one iteration. The memory does not grow with the number
-          of iterations. The outcome has no derivative with respect to the initial map.
-    - `tolerance`: a positive number, which only `"implicit"` uses. It limits the error of the fixed point
-      relative to the largest entry of the first functional map, and it is also the tolerance of GMRES.
+          its parameters. The derivatives follow from the implicit function theorem:
+          `dC = (I - dF/dC)^-1 dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the
+          linear system in this formula. The system contains only derivatives of one iteration, so the memory
+          does not grow with the number of iterations. The outcome has no derivative with respect to the
+          initial map.
+    - `tolerance`: a positive number, which only `"implicit"` uses. The tolerance limits the error of the
+      fixed point, relative to the largest entry of the first functional map. GMRES uses the same tolerance.
 
     **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map` (a
     soft map from X to Y) and `result`. Numerical failures raise no error, so compare `result` with
@@ -102,9 +102,9 @@ def refine_softly(
 
     **Raises:** `ValueError` if `iterations` is below 1, `tolerance` is not positive, `differentiation` is
     unknown, the initial map has the wrong size, or the spectra have different float types. `TypeError` if an
-    argument has the wrong type. With `"implicit"`, reverse-mode derivatives raise equinox's runtime error if
-    there were too few iterations, or if GMRES does not reach its tolerance. In these cases, forward-mode
-    derivatives are NaN.
+    argument has the wrong type. With `"implicit"`, derivatives fail if there are too few iterations or if
+    GMRES does not reach its tolerance. Reverse-mode derivatives then raise equinox's runtime error, and
+    forward-mode derivatives are NaN.
     """
     check_choice("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
@@ -142,8 +142,8 @@ def refine_softly(
 def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
     """Returns the vertices of Y that an initial map contains, or None for a dense soft map.
 
-    **Raises:** `ValueError` if the map does not fit shapes with m and n vertices; `TypeError` if it is not a
-    map.
+    **Raises:** `ValueError` if the map has the wrong size; `TypeError` if the argument is neither an array
+    nor a soft map.
     """
     if isinstance(pointwise_map, SoftMap):
         sizes = pointwise_map.queries.shape[0], pointwise_map.database.shape[0]
@@ -168,14 +168,15 @@ class WaveletPreservationLayer(eqx.Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
     `layer(features_x, features_y, spectrum_x, spectrum_y)` computes a soft map from the distances between the
-    features of X (m, d) and the features of Y (n, d). It refines this soft map by `refine_softly` and returns
-    a `SoftRefinement`. The attribute `soft_map` of the result is a soft map from X to Y. The attribute
-    `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions on X, unless the
-    refiner's `convention` is `"pushforward"`.
+    features of X (m, d) and the features of Y (n, d). The layer refines this soft map by `refine_softly` and
+    returns a `SoftRefinement`. The attribute `soft_map` of the result is a soft map from X to Y. By default,
+    the attribute `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions on X. If
+    the refiner's `convention` is `"pushforward"`, the functional map (k_Y, k_X) takes functions on X to
+    functions on Y.
 
     The layer is an equinox module. Its trainable parameters are its array leaves, such as the parameters of
     the filter bank and the temperatures of both recoveries. Train all parameters, or freeze some of them with
-    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can also use it.
+    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can also call it.
 
     **Arguments:**
 
@@ -185,10 +186,10 @@ class WaveletPreservationLayer(eqx.Module):
     - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
       `Sinkhorn()`. The default is `Softmax()`, with temperature 0.1.
     - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
-      With `"implicit"`, this is the largest number of these maps.
+      With `"implicit"`, `iterations` is an upper limit.
     - `differentiation`: how derivatives are computed. `"unrolled"` differentiates through all iterations.
-      `"checkpointed"` (the default) gives the same derivatives with less memory. `"implicit"` iterates up to
-      a fixed point and uses the implicit function theorem.
+      `"checkpointed"` (the default) gives the same derivatives as `"unrolled"` with less memory. `"implicit"`
+      iterates up to a fixed point and uses the implicit function theorem.
     - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES. Only `"implicit"` uses
       it.
 
@@ -289,8 +290,8 @@ def _to_the_fixed_point(
 ) -> _Loop:
     """Iterates up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # The solver of the fixed point returns neither the status code of an update nor the last change of the
-    # functional map. One more iteration gives both.
+    # One more iteration gives the status code of an update and the last change of the functional map, which
+    # the fixed-point solver does not return.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
@@ -307,9 +308,9 @@ def _fixed_point(
     import lineax as lx
     import optimistix as optx
 
-    # The unit is the largest entry of the first functional map, because the tolerance is relative to C as a
-    # whole. The solver works in the default float type, because optimistix does not accept float32 while
-    # jax_enable_x64 is set.
+    # Division by the largest entry of the first functional map makes the tolerance relative. The solver
+    # computes in the default float type, because optimistix does not accept float32 while jax_enable_x64 is
+    # set.
     unit = lax.stop_gradient(jnp.max(jnp.abs(first)))
 
     def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
@@ -334,7 +335,7 @@ def _differentiable_if(
 ) -> Float[Array, "k_out k_in"]:
     """Returns the functional map, with NaN derivatives if the iterations have not converged.
 
-    The formula for implicit derivatives holds only at fixed points.
+    The implicit function theorem holds only at fixed points.
     """
     return functional_map
 

@@ -1,4 +1,4 @@
-"""The spectrum of a shape: eigenpairs of the Laplacian and further arrays of one row per vertex."""
+"""The spectrum of a shape: eigenpairs of the Laplacian, vertex areas, and further data of the vertices."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Spectrum(eqx.Module):
     diagonal matrix A contains the vertex areas. The eigenvectors Phi are orthonormal with respect to A:
     `Phi^T A Phi = I`.
 
-    A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks several shapes, which gives every
-    array a leading axis. Smaller shapes are padded with masked vertices, which have zero area and zero
+    A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks the arrays of several shapes along
+    a new leading axis. `stack` pads smaller shapes with masked vertices, which have zero area and zero
     eigenvectors. Unreferenced vertices (vertices that no face references) are also masked.
 
     **Attributes:**
@@ -45,7 +45,7 @@ class Spectrum(eqx.Module):
     normals: Float[Array, "n 3"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
-        """Returns the shape with only the first `number_of_eigenvectors` eigenpairs."""
+        """Returns the spectrum with only the first `number_of_eigenvectors` eigenpairs."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues[:number_of_eigenvectors],
@@ -53,8 +53,9 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Returns the shape with all areas scaled by a factor, and all lengths by the square root of this
-        factor.
+        """Returns the spectrum of the scaled shape.
+
+        Areas are multiplied by `factor`, and lengths are multiplied by the square root of `factor`.
 
         **Arguments:**
 
@@ -69,7 +70,7 @@ class Spectrum(eqx.Module):
         )
 
     def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """Returns the shape with the given descriptors (n, d), or without descriptors if they are None.
+        """Returns the spectrum with the given descriptors (n, d), or without descriptors if they are None.
 
         **Raises:** `ValueError` if the descriptors do not have one row per vertex.
         """
@@ -77,9 +78,9 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, descriptors=descriptors)
 
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """Returns the shape with the given vertex positions (n, 3) and unit normals (n, 3).
+        """Returns the spectrum with the given vertex positions (n, 3) and unit normals (n, 3).
 
-        The unit of the positions must match the vertex areas, which are in units of length².
+        The positions must have the same unit of length as the vertex areas.
 
         **Raises:** `ValueError` if an array does not have one row of 3 numbers per vertex.
         """
@@ -88,7 +89,7 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
-        """Returns the shape with masked vertices appended, up to a given number of vertices.
+        """Returns the spectrum with masked vertices appended, up to `number_of_vertices` vertices in total.
 
         **Raises:** `ValueError` if the shape already has more vertices.
         """
@@ -105,7 +106,7 @@ class Spectrum(eqx.Module):
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """Returns the shape with only some of its vertices, the samples, each with the same area.
+        """Returns the spectrum at the given vertices only (the samples). All samples receive the same area.
 
         The areas of the samples sum to the area of the shape. The eigenvectors are not orthonormal on
         samples, so the pseudo-inverse of the eigenvectors must be computed by least squares.
@@ -124,10 +125,12 @@ class Spectrum(eqx.Module):
         n, shape = self.mask.shape[0], jnp.shape(rows)
         if len(shape) != 2 or shape[0] != n or columns not in (None, shape[1]):
             needed = f"({n}, {'d' if columns is None else columns})"
-            raise ValueError(f"the {name} have shape {shape}; one row per vertex is needed: give {needed}")
+            raise ValueError(
+                f"the {name} have shape {shape}, but {needed} is needed: give one row for each vertex"
+            )
 
     def _map_vertex_arrays(self, change: Callable[[Array], Array]) -> Spectrum:
-        """Returns the shape with a function applied to all arrays that have one row per vertex."""
+        """Returns the spectrum with a function applied to all arrays that have one row per vertex."""
         names = [field.name for field in dataclasses.fields(self) if field.name != "eigenvalues"]
         present = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return dataclasses.replace(self, **{name: change(field) for name, field in present.items()})

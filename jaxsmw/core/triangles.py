@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks
 
-# The number of queries per block. For all queries of a block, the distances to all triangles are in memory at
-# the same time.
+# The number of queries per block. Memory contains the distances from all queries of one block to all
+# triangles.
 _BLOCK = 32
 
 
@@ -23,21 +23,20 @@ def nearest_point_on_triangles(
     """Finds, for each query, the nearest point on a set of triangles in a space of any dimension.
 
     The search is exact up to rounding errors, in Euclidean distance. Every query is compared with all
-    triangles, but no array of size m x f is stored. The distance to a triangle is computed from the inner
-    products of the query with the corners. If the nearest point belongs to several triangles, for example to
-    a common corner, the function returns one of these triangles.
+    triangles, but no array of size m x f is stored. If the nearest point belongs to several triangles, for
+    example to a common corner, the function returns one of these triangles.
 
     **Arguments:**
 
     - `queries`: (m, d), points in d dimensions, in any unit.
     - `points`: (n, d), the corners of the triangles, in the same unit.
     - `faces`: (f, 3), for each triangle the indices of its corners in `points`.
-    - `face_mask`: (f,), False for triangles that the search ignores. None (the default) uses all triangles.
-      If the search ignores all triangles, the result is meaningless.
+    - `face_mask`: (f,), False for triangles that the search ignores. With None (the default), the search uses
+      all triangles. If the search ignores all triangles, the result is meaningless.
 
-    **Returns:** A pair of arrays: for each query, the index of the triangle that contains the nearest point,
-    int32 (m,), and the barycentric weights of the three corners of this triangle (m, 3). The weights are not
-    negative and sum to 1.
+    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the index of the
+    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of the
+    triangle's corners, which are not negative and sum to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
@@ -58,8 +57,8 @@ def nearest_point_on_triangles(
         return jnp.argmin(squared, axis=0).astype(jnp.int32)
 
     found = in_blocks(search, queries, _BLOCK)
-    # The weights are computed from the differences `queries - corners`, because the difference of inner
-    # products would lose digits by cancellation.
+    # The weights are computed from the differences `queries - corners`, because differences of inner products
+    # would lose digits by cancellation.
     away = queries - corners[found, 0]
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
     _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
@@ -74,11 +73,9 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns the squared distances from points q to triangles, and the numbers s and t of the nearest
-    points.
+    """Returns the squared distances from points q to triangles, and the nearest points as numbers s and t.
 
-    The points of a triangle are `a + s u + t v`, where a is a corner, and u and v are the edges from this
-    corner.
+    The nearest point of a triangle is `a + s u + t v`, where u and v are the edges from the corner a.
 
     **Arguments:**
 

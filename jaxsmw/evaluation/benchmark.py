@@ -1,7 +1,7 @@
 """Measures the errors and times of several methods on the pairs of a data set, and stores the results.
 
-Finished shapes and pairs are stored on disk. If a benchmark was interrupted, a second call of `run_benchmark`
-with the same arguments measures only the remaining shapes and pairs.
+If a benchmark was interrupted, a second call of `run_benchmark` with the same arguments measures only the
+remaining shapes and pairs.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versio
 
 
 class Results(NamedTuple):
-    """The results of a benchmark. All values in the rows are text.
+    """The results of a benchmark. All values in `rows` and `shapes` are text.
 
     **Attributes:**
 
     - `rows`: a list of dictionaries, each with the keys of `RESULT_COLUMNS`. The list contains one row for
       each pair and method. A pair is left out if any method has no result for this pair.
     - `shapes`: a dictionary from the name of each measured shape to a row with the keys of `SHAPE_COLUMNS`.
-    - `failures`: a dictionary from the names of shapes and pairs that could not be measured to error
-      messages. A key is the name of a shape, or the text "SOURCE to TARGET" for a pair.
+    - `failures`: a dictionary from each shape or pair that could not be measured to its error message. A
+      shape is given by its name, and a pair by the text "SOURCE to TARGET".
     """
 
     rows: list[Row]
@@ -73,7 +73,7 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Returns the first names as text, followed by the number of names that are left out."""
+    """Returns the first three names as text, followed by the number of further names."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
@@ -92,23 +92,23 @@ def run_benchmark(
 ) -> Results:
     """Runs every method on every pair, and stores the errors and times in CSV files.
 
-    A method is not run on a pair for which `output` already contains its result. Each new result is stored
-    when it is available. If a shape or pair cannot be measured, the benchmark continues with the remaining
-    shapes and pairs.
+    If `output` already contains the result of a method on a pair, the method is not run again on this pair.
+    Each new result is stored immediately. If a shape or pair cannot be measured, the benchmark continues with
+    the remaining shapes and pairs.
 
     **Arguments:**
 
     - `data_set`: the `DataSet` that contains the pairs.
-    - `pairs`: the pairs to match, each a `DataPair` of this data set.
+    - `pairs`: the pairs to match, each a `DataPair` of `data_set`.
     - `output`: an existing directory, to which `results.csv`, `shapes.csv` and `provenance.json` are written.
-    - `methods`: a dictionary from names to methods, for example `METHODS`. The names are written to the
-      column `method` of `results.csv`.
+    - `methods`: a dictionary from the name of each method to the method, for example `METHODS`. The names are
+      written to the column `method` of `results.csv`.
     - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
       measured with the same settings.
     - `executor`: the executor that runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
 
-    **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured, no error is
-    raised, but `Results.failures` contains the error message, and `Results.check` raises an error.
+    **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured,
+    `Results.failures` contains the error message. No error is raised until `Results.check` is called.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
     data, settings or software versions; if another process is adding results to `output`; if a method
@@ -130,17 +130,16 @@ def run_benchmark(
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
-    A directory contains only results that were measured with the same number, because the time of the
-    precomputation depends on this number. The number is the same for most choices of methods, so a later run
-    can usually add methods to existing results.
+    All results in a directory must be measured with the same number of eigenvectors, because the time of the
+    precomputation depends on this number. The number is at least `MOST_EIGENVECTORS`. Most later runs have
+    the same number and can therefore add methods to the directory.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
     """Returns the contents of `provenance.json`."""
-    # Only the name of the directory with initial maps is stored, not its whole path, because a moved copy of
-    # the directory contains the same maps.
+    # Only the name of the directory with initial maps is stored, because its path may change.
     chosen = asdict(settings) | {"init": Path(settings.init).name}
     return {
         "settings": chosen | {"number_of_eigenvectors": number_of_eigenvectors},
@@ -179,10 +178,9 @@ class _Store:
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns a dictionary from the names of pairs to tasks.
+        """Returns a dictionary from the name of each unfinished pair to its task.
 
-        The task of a pair contains the methods that have no result for this pair. Pairs for which every
-        method has a result are left out.
+        The task contains the methods that have no result for this pair.
         """
         tasks = {}
         for pair in self.pairs:

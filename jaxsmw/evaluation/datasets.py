@@ -37,9 +37,10 @@ class DataPair:
       `read_ground_truth` reads. If the tuple is empty, vertex i of X corresponds to vertex i of Y.
     - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth, in which left and
       right are exchanged; None if the data set has no mirrored ground truth.
-    - `index_base`: the index of the first vertex in the ground-truth files, 0 or 1; None for the default of
-      their format.
-    - `partial`: whether X is a partial shape of Y. Both meshes then have the same unit of length.
+    - `index_base`: the index of the first vertex in the ground-truth files, 0 or 1; None selects the default
+      of the file format.
+    - `partial`: whether X is a part of the full shape Y. The meshes of a partial pair have the same unit of
+      length.
     """
 
     source: str
@@ -142,8 +143,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       contains the meshes. For each mesh, `corres/` contains a file `NAME.vts`, and optionally a file
       `NAME.sym.vts` for the mirrored ground truth.
     - **SHREC'19 humans** (Melzi et al. 2019): the meshes are `1.obj`, `2.obj`, …, and a folder `FARMgt_txt`
-      contains a file `I_J.txt` for each pair. In the remeshed version, a folder `corres` contains files
-      `I_J.map` instead.
+      contains a file `I_J.txt` for each pair. In the remeshed version, a folder `corres` contains a file
+      `I_J.map` for each pair.
     - **SHREC'16 partial** (Cosmo et al. 2016): `null/` contains the full shapes, and `cuts/` or `holes/`
       contain the partial shapes. In each pair a partial shape is the source, and its full shape is the
       target.
@@ -151,13 +152,14 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       the other meshes `kidNN`, each with a file `kidNN_ref.txt`.
     - **FAUST registrations** (`tr_reg_NNN`), **SCAPE** (`meshNNN`) and **TOSCA** (`cat0`, …): the directory
       or one of its folders contains the meshes, and there is no ground-truth file. Vertex i of one shape
-      corresponds to vertex i of every other shape. In TOSCA this holds only for shapes of the same class,
-      such as `cat0` and `cat1`.
+      corresponds to vertex i of every other shape. In TOSCA, vertices correspond only between shapes of the
+      same class, such as `cat0` and `cat1`.
 
     If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line), the
-    attribute `pairs` of the result contains the listed pairs. Otherwise `pairs` contains all ordered pairs of
-    different shapes with ground truth. In remeshed sets and in TOSCA, these are only pairs within a class.
-    The class of a shape is its name without the number at the end, for example `cat` for `cat0`.
+    attribute `pairs` of the result contains the listed pairs. Without a list of pairs, `pairs` contains all
+    ordered pairs of different shapes with ground truth. In remeshed sets and in TOSCA, only shapes of the
+    same class form pairs. The class of a shape is its name without the number at the end, for example `cat`
+    for `cat0`.
 
     **Arguments:**
 
@@ -247,10 +249,10 @@ _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Returns a dictionary from the names of meshes that match a pattern to the mesh files.
+    """Finds the meshes whose names match a pattern, and returns a dictionary from their names to their files.
 
-    All files come from the same folder: the directory itself if it contains such a mesh, or otherwise the
-    first folder below it that contains such a mesh.
+    Only the first folder that contains a mesh with a matching name is used. The directory itself is searched
+    before the folders below it.
     """
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
@@ -261,7 +263,7 @@ def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """Returns the names in the list of pairs that a data set contains; None if it contains no list."""
+    """Reads the list of pairs in a data set, and returns the names of each pair; None if there is no list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
     if not lists:
         return None
@@ -310,13 +312,14 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     **Arguments:**
 
     - `data_set`: the data set.
-    - `wanted`: a number of pairs, the path of a list of pairs, or None. If `wanted` is the text of a number,
-      this many pairs are drawn at random without replacement. If the data set has fewer pairs, all pairs are
-      chosen. If `wanted` is a path, the pairs in this text file are chosen (see `read_pairs`), and repeated
-      pairs are chosen once. If `wanted` is None, all pairs of the data set are chosen.
+    - `wanted`: a number of pairs as text, the path of a list of pairs, or None. If `wanted` is the text of a
+      number, this many pairs are drawn at random without replacement. If the data set has fewer pairs, all
+      pairs are chosen. If `wanted` is a path, the pairs in this text file are chosen (see `read_pairs`), and
+      repeated pairs are chosen once. If `wanted` is None, all pairs of the data set are chosen.
     - `seed`: the seed of the random draw.
 
-    **Returns:** The chosen pairs, in the order of the data set or, if a path is given, of the text file.
+    **Returns:** The chosen pairs. If `wanted` is a path, the pairs have the order of the text file; otherwise
+    they have the order of the data set.
 
     **Raises:** `InputError` if the number is not positive, if the list cannot be read, or if a listed pair
     has no ground truth.
@@ -354,10 +357,9 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Returns the listed pairs, and the remaining pairs with ground truth.
+    """Returns two lists: the listed pairs, and the unlisted pairs with ground truth.
 
-    If there is no list, the first result contains all pairs with ground truth, and the second result is
-    empty.
+    If `listed` is None, the first list contains all pairs with ground truth.
     """
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)

@@ -1,4 +1,4 @@
-"""Ground truth, with a reader for common file formats and a writer.
+"""Reads ground truth from common file formats, and writes ground truth.
 
 `jaxsmw.io.map_files` parses the files. By default, the format of a file determines whether its vertices are
 counted from 0 or from 1.
@@ -23,8 +23,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
-# Files contain barycentric weights with few digits. A weight may be below 0 by at most this number, and the
-# sum of the weights of a point may differ from 1 by at most this number.
+# Barycentric weights in files are rounded. A weight may be below 0 by at most this number, and a sum of three
+# weights may differ from 1 by at most this number.
 _WEIGHT_TOLERANCE = 1e-4
 
 
@@ -64,10 +64,10 @@ class GroundTruth:
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-        """Extends the ground truth to a map X -> Y (m,) of all vertices of X, as 0-based vertices of Y.
+        """Extends the ground truth to a map X -> Y (m,) for all vertices of X, with 0-based vertices of Y.
 
-        Each vertex of X receives the target of the nearest vertex that has ground truth. Nearest vertices are
-        found by the Euclidean distance between vertices of `mesh_x`.
+        Each vertex of `mesh_x` receives the target of the vertex with ground truth that is nearest in
+        Euclidean distance.
 
         **Raises:** `InputError` if the targets are `SurfacePoints` and not vertices.
         """
@@ -89,9 +89,9 @@ def read_ground_truth(
     The number of files, their suffix and their number of columns determine the format:
 
     - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
-      line contains one vertex, counted from 1. The vertices in line i of both files correspond to each other.
-      Two files with other suffixes have the same format, but their vertices are counted from 0 (from 1 in
-      `.mat` files).
+      line contains one vertex, counted from 1. The vertices in line i of the two files correspond to each
+      other. Two files with other suffixes are read like `.vts` files, but their vertices are counted from 0
+      (from 1 in `.mat` files).
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
       source, as a face of the target and three barycentric weights. Faces are counted from 1.
     - One file with two columns: each line contains a vertex of the source and its target vertex, both counted
@@ -99,7 +99,8 @@ def read_ground_truth(
     - One file with one column: line i contains the target vertex of the i-th vertex of the source. Target
       vertices are counted from 0 (from 1 in `.mat` files). `write_pointwise_map` writes this format.
 
-    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) are read in the same way.
+    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) have the same formats as files of direct
+    ground truth.
 
     **Arguments:**
 
@@ -177,11 +178,11 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. `read_ground_truth` recognises its format by the suffix
-      `.baryc_gt`.
+    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, by which `read_ground_truth`
+      recognises the format.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-    - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of
-      Y. These positions count the faces that were dropped when the mesh was read.
+    - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of Y.
+      The positions include faces that were dropped when the mesh was read.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.
@@ -203,7 +204,8 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
     """Returns a column of a table as 0-based faces of a mesh.
 
-    The numbers in the file include faces that were dropped when the mesh was read.
+    Face numbers in the file include faces that were dropped when the mesh was read. The returned face numbers
+    refer to `mesh.faces`, from which these faces are missing.
     """
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)

@@ -13,7 +13,7 @@ RESAMPLES = 9999
 
 
 class Interval(NamedTuple):
-    """A mean with the lower and upper end of its bootstrap confidence interval, in the unit of the sample.
+    """A mean and the two ends of its bootstrap confidence interval, in the unit of the sample.
 
     If the sample has fewer than three values, both ends are NaN.
     """
@@ -23,7 +23,7 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        """Text with signs and one decimal, for example `+1.8 [+0.7, +4.8]`: the mean, then the interval.
+        """The mean and the interval as text, with signs and one decimal, for example `+1.8 [+0.7, +4.8]`.
 
         If the ends of the interval are NaN, the text contains only the mean. If the mean is NaN, the text is
         a dash.

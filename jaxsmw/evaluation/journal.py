@@ -41,11 +41,11 @@ class Journal:
 
     - `path`: the file, which need not exist yet.
     - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
-    - `columns`: a mapping from the names of the columns that the file must have to the functions that check
-      their values. If None, the file may have any columns that include the key columns.
+    - `columns`: a mapping from the name of each required column to the function that checks its values. If
+      None, the file must have the key columns, and may have any other columns.
 
-    **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. The
-    file is then not changed.
+    **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. If
+    this error is raised, the file is not changed.
     """
 
     def __init__(self, path: Path, key: Sequence[str], columns: Columns | None = None):
@@ -190,10 +190,10 @@ def claimed_directory(
     **Arguments:**
 
     - `directory`: an existing directory.
-    - `provenance`: a dictionary from the names of groups, such as `"settings"`, to dictionaries from names to
+    - `provenance`: a dictionary from the name of each group, such as `"settings"`, to a dictionary of named
       values. These values must be the same for all results in the directory.
-    - `noted`: a dictionary of further information that the first call writes to the file. In later calls, it
-      may differ.
+    - `noted`: a dictionary of further information that the first call writes to the file. Later calls ignore
+      `noted`.
 
     **Raises:** `InputError` if the directory contains results with another `provenance` or without
     `provenance.json`, if `provenance.json` is damaged, if the directory cannot be locked, or if another

@@ -56,7 +56,7 @@ def read_curve(text: str) -> list[float]:
 
     - `text`: one share for each threshold in `CURVE`, separated by spaces.
 
-    **Returns:** The shares of points with an error of at most each threshold, as a list of numbers.
+    **Returns:** A list of numbers: for each threshold, the share of points with at most this error.
 
     **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """
@@ -107,12 +107,12 @@ class Settings:
     - `init`: the initial map from which all methods start. It is the name of an initial map, `"shot"`
       (default), `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see `jaxsmw.match`), or a directory with
       initial maps in files named `X_Y.map`.
-    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If so, the
-      stored errors are those with the smaller mean. Use this setting for methods and initial maps that do not
+    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
+      the errors with the smaller mean are stored. Use this setting for methods and initial maps that do not
       distinguish left from right.
-    - `evaluated_points`: the number of rows of each ground truth that are evaluated. The rows are the same
-      for all methods. If None, all rows are evaluated.
-    - `seed`: the seed of the random draw of these rows.
+    - `evaluated_points`: the number of ground-truth points at which each map is evaluated. The points are the
+      same for all methods. If None, each map is evaluated at all points.
+    - `seed`: the seed of the random draw of these points.
 
     **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
     """
@@ -136,7 +136,7 @@ class Settings:
         return self.init in INITIAL_MAPS
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Checks that the directory with initial maps, if there is one, has a map for every pair.
+        """If `init` is a directory, checks that the directory contains a map for every pair.
 
         **Raises:** `InputError` if a file with an initial map is missing.
         """
@@ -146,7 +146,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Task:
-    """A task of a benchmark: to run several methods on one pair.
+    """A task of a benchmark: several methods to run on one pair.
 
     **Attributes:**
 
@@ -172,7 +172,7 @@ def file_digest(file: Path) -> str:
 
 
 def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures both wall times.
+    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures their wall times.
 
     **Arguments:**
 
@@ -203,8 +203,8 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
     - `task`: the pair and the methods.
     - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors that are computed for each shape, at least as many
-      as any method of the task uses.
+    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. No method of the task
+      may use more eigenvectors.
 
     **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. If a method
     failed, all statistics of its map are NaN.
@@ -250,7 +250,7 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
         # The first run of a method takes longer than later runs, for example because of imports, so the
-        # method runs a second time. This difference is negligible if the first run takes long.
+        # method runs a second time. A long first run is not repeated, because the extra time is negligible.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
@@ -284,10 +284,10 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Returns the statistics of a map, computed with the ground truth for which the mean error is smallest.
+    """Returns the statistics of a map for the ground truth that gives the smallest mean error.
 
-    `truths` is a dictionary from `"direct"` and, if requested, `"mirrored"` to a ground truth. If the method
-    failed, all statistics are NaN.
+    `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
+    `"mirrored"`. If the method failed, all statistics are NaN.
     """
     if (pointwise_map < 0).any():
         return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}

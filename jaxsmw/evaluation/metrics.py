@@ -33,7 +33,7 @@ class GeodesicError:
 
     All errors and thresholds are in units of the square root of the area of Y. The properties `mean`,
     `median` and `unreachable` (the share of infinite errors) are numbers. The property `within` is a
-    dictionary from the thresholds 0.02, 0.05 and 0.1 to the shares of points with at most this error. The
+    dictionary from each threshold (0.02, 0.05 and 0.1) to the share of points with at most this error. The
     methods `correspondence_quality_curve` and `area_under_curve` compute further statistics. The method
     `as_dictionary` returns all statistics as a dictionary for JSON.
 
@@ -71,7 +71,7 @@ class GeodesicError:
 
     @property
     def within(self) -> dict[float, float]:
-        """A dictionary from the thresholds 0.02, 0.05, 0.1 to the share of points with at most this error."""
+        """A dictionary from each threshold (0.02, 0.05, 0.1) to the share of points within this error."""
         shares = self.correspondence_quality_curve(np.array(THRESHOLDS))
         return dict(zip(THRESHOLDS, shares.tolist(), strict=True))
 
@@ -122,7 +122,7 @@ class GeodesicError:
         return counts / len(self.errors)
 
     def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
-        """Returns the mean height of the correspondence quality curve between 0 and a largest threshold.
+        """Returns the mean height of the correspondence quality curve between the thresholds 0 and `largest`.
 
         The curve has a step at each error e, so its mean height is exactly the mean of
         `max(0, 1 - e/largest)` over all errors. The mean height is in [0, 1], and is 1 if all errors are
@@ -197,8 +197,8 @@ def geodesic_error(
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Returns the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
-    Each vertex of Y that is the match of a vertex of X contributes its vertex area, a third of the area of
-    the triangles around this vertex. The coverage is in [0, 1], and needs no ground truth.
+    Each matched vertex of Y contributes its vertex area, which is a third of the area of the triangles around
+    the vertex. The coverage is in [0, 1], and needs no ground truth.
 
     **Arguments:**
 

@@ -35,7 +35,7 @@ def prepare_pair(
 
     **Arguments:**
 
-    - `data`: the `DataPair`, of which only the attributes `names` and `partial` are used.
+    - `data`: the `DataPair`. The function uses only the names of the shapes and the attribute `partial`.
     - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
     - `init`: the name of an initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see
       `jaxsmw.match`); or a directory that contains initial maps in files named `X_Y.map`.

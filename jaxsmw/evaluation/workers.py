@@ -65,8 +65,8 @@ class _OneCoreProcess(SpawnProcess):
     """A process that is limited to one core.
 
     The environment variables that set this limit must exist before the process starts. NumPy and JAX read
-    these variables only once, on import, and the worker imports them early if the main module of the calling
-    program does.
+    these variables only once, when they are imported. A new process first imports the main module of the
+    calling program, which may import NumPy and JAX.
     """
 
     def start(self) -> None:
@@ -108,7 +108,8 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
                     os.environ[name] = value
 
 
-# Without the lock, two threads that start processes at the same time would restore each other's variables.
+# Without the lock, two threads that start processes at the same time would restore each other's environment
+# variables.
 _starting = threading.Lock()
 
 
@@ -175,8 +176,8 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
             "--scheduler needs Dask's package distributed: run pip install 'jaxsmw[cluster]'."
         ) from None
     try:
-        # The port is checked first, because the creation of a client for an address without a port fails and
-        # leaves threads that log errors later.
+        # An address without a port is rejected here, because `Client` would fail and leave threads that log
+        # errors later.
         if urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}").port is None:
             raise ValueError("the address has no port")
         client = Client(scheduler, timeout=5, set_as_default=False)
@@ -202,8 +203,8 @@ def run_tasks(
     - `executor`: the executor that runs the calls; see `open_executor`.
 
     **Yields:** A tuple for each task, with the name of the task and the result of `function`. If `function`
-    raised an exception, the tuple contains the exception instead of a result. The order is the order in which
-    the tasks end.
+    raised an exception, the tuple contains the exception instead of a result. Tuples are yielded in the order
+    in which the tasks end.
     """
     futures = {executor.submit(function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.errors import InputError
 
-# The largest allowed number of distances. They take 3 GiB of memory, and the computation takes 15 minutes.
+# The largest allowed product m n. A computation of this size takes 3 GiB of memory and 15 minutes.
 _LARGEST = 20_000**2
 
 
@@ -21,28 +21,28 @@ def one_to_one_map(
     """Compute the one-to-one map X -> Y with the least sum of squared distances between matched points.
 
     Each vertex of X is matched to a different vertex of Y. SciPy computes the exact optimum by shortest
-    augmenting paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). All distances
-    between points of X and of Y are stored in float64. For two real bodies of 5000 vertices, the computation
-    takes 15 seconds and 0.7 GiB. The time grows with the third power of the number of vertices.
+    augmenting paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). The function
+    stores an (m, n) matrix in float64. For two real bodies of 5000 vertices, the computation takes 15 seconds
+    and 0.7 GiB of memory. The computation time grows with the third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
-    triangulation. On other shapes, the best match of a vertex is often already taken, and the vertex is
-    assigned a distant match instead. On pairs of the remeshed FAUST data set, the restriction to one-to-one
-    maps increases the mean geodesic error from 0.022 to 0.062.
+    triangulation. On other shapes, several vertices often have the same best match, and only one of them can
+    be assigned this match. On pairs of the remeshed FAUST data set, the restriction to one-to-one maps
+    increases the mean geodesic error from 0.022 to 0.062.
 
     **Arguments:**
 
     - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex of X and of Y, in
-      the same unit. The points of a vertex and of its match should be close to each other.
-    - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. None, the
-      default, matches all vertices.
+      the same unit. The point of a vertex of X should be close to the point of its match.
+    - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. If a mask is
+      None (the default), all vertices are matched.
 
     **Returns:** An integer array (m,): the 0-based vertex of Y for each vertex of X, and -1 for each masked
     vertex of X.
 
-    **Raises:** `InputError` if Y has fewer unmasked vertices than X, the product of the numbers of unmasked
-    vertices is above 20 000², a point of an unmasked vertex is not finite, or the array shapes do not fit
-    each other.
+    **Raises:** `InputError` if Y has fewer unmasked vertices than X, or if the two numbers of unmasked
+    vertices have a product above 20 000². Also `InputError` if a point of an unmasked vertex is not finite,
+    or if array shapes do not match.
     """
     for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):
         if points.ndim != 2:
@@ -55,7 +55,7 @@ def one_to_one_map(
     if embedding_x.shape[1] != embedding_y.shape[1]:
         raise InputError(
             f"the points of X have {embedding_x.shape[1]} dimensions, but the points of Y have "
-            f"{embedding_y.shape[1]}: give both in the same space."
+            f"{embedding_y.shape[1]}: give points of equal dimension."
         )
     rows, columns = (
         np.arange(len(points)) if mask is None else np.flatnonzero(mask)
@@ -65,7 +65,8 @@ def one_to_one_map(
     x, y = embedding_x[rows].astype(np.float64), embedding_y[columns].astype(np.float64)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise InputError("an embedding for a one-to-one map contains NaN or infinity: give finite points.")
-    # The squared distance is |x - y|² = |x|² + |y|² - 2 x·y. The term |x|² has no effect on the optimum.
+    # The squared distance is |x - y|² = |x|² + |y|² - 2 x·y. The term |x|² is left out, because it is the
+    # same for every match of x.
     costs = x @ (-2 * y.T)
     costs += np.sum(y**2, axis=1)
     from scipy.optimize import linear_sum_assignment  # this import is slow and rarely needed
@@ -77,7 +78,7 @@ def one_to_one_map(
 
 
 def check_one_to_one(vertices_x: int, vertices_y: int) -> None:
-    """Check, before a long computation, that `one_to_one_map` can match these numbers of vertices.
+    """Check that `one_to_one_map` can match meshes with these numbers of vertices.
 
     **Raises:** `InputError` if Y has fewer vertices than X, or if the product of the two numbers is above
     20 000².

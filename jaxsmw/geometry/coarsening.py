@@ -1,4 +1,4 @@
-"""A smooth subspace of functions on a surface, with far fewer dimensions than the surface has vertices."""
+"""A subspace of smooth functions on a surface, with far fewer dimensions than the mesh has vertices."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Coarsening(NamedTuple):
 
     - `prolongation`: the matrix P (n, c), which takes c coefficients to values at n vertices. Each row of P
       sums to one.
-    - `stiffness`, `mass`: P^T W P and P^T A P, (c, c), where W and A are the matrices of the original
-      eigenproblem.
+    - `stiffness`, `mass`: the projected matrices P^T W P and P^T A P, each (c, c). W and A are the matrices
+      of the original eigenproblem.
     - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter keeps the
       frequencies that the subspace can represent, and slightly higher frequencies.
 
-    Prolongation and smoothing use single precision. The rounding errors of single precision are far smaller
-    than the errors that the projection onto the subspace causes.
+    Prolongation and smoothing use single precision, whose rounding errors are far smaller than the projection
+    errors.
     """
 
     prolongation: sp.csr_matrix
@@ -45,23 +45,23 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     The method follows Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and
     fourth order elliptic problems", Computing 1996.
 
-    Unlike the method of that paper, this function needs only a single coarsening step for cells of any size.
-    The indicator functions are smoothed by a Chebyshev polynomial, whose degree is 1.5 times the radius of
-    the cells in edges. (If the degree equals the radius, coarsening takes 20 % less time, but the errors of
-    the eigenvalues are ten times as large.)
+    Unlike the method of Vaněk et al., this function needs only one coarsening step for cells of any size. The
+    indicator functions are smoothed by a Chebyshev polynomial. The degree of the polynomial is 1.5 times the
+    radius of the cells, counted in edges. (If the degree were equal to the radius, coarsening would take 20 %
+    less time, but the errors of the eigenvalues would be ten times as large.)
 
     **Arguments:**
 
-    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. The entries of W off
-      the diagonal correspond to the edges of the mesh.
+    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. The off-diagonal
+      entries of W correspond to the edges of the mesh.
     - `mass`: the mass matrix A (n, n).
     - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 
     **Returns:** The projected eigenproblem as a `Coarsening`.
 
-    **Raises:** `RuntimeError` if the diagonal of W is not positive, if a vertex has so many neighbours that
-    the smoothed indicator functions would overlap everywhere, or if cells with more than four times the mean
-    area of a cell cover more than 10 % of the surface.
+    **Raises:** `RuntimeError` if the diagonal of W is not positive. Also `RuntimeError` if a vertex has 100
+    or more neighbours, because the smoothed indicator functions would then overlap everywhere. Also
+    `RuntimeError` if cells larger than four times the mean cell area cover more than 10 % of the surface.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
@@ -108,12 +108,12 @@ def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
 
 
 class _Smoother:
-    """A low-pass filter for functions on a mesh, which leaves constant functions unchanged.
+    """A low-pass filter for functions on a mesh. Constant functions pass unchanged.
 
     The filter is a Chebyshev polynomial of D^-1 W, where W is the stiffness matrix and D is the diagonal of
-    W. The filter damps the frequencies that cells of `size` vertices cannot represent. These frequencies are
-    the eigenvalues of D^-1 W above 1.5 / `size` times the largest eigenvalue. (Factors from 1 to 3 instead of
-    1.5 give about the same accuracy on bodies.)
+    W. The filter damps eigenvalues of D^-1 W above 1.5 / `size` times the largest eigenvalue, which cells of
+    `size` vertices cannot represent. (On bodies, any factor from 1 to 3 instead of 1.5 gives about the same
+    accuracy.)
     """
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):
@@ -142,7 +142,7 @@ class _Smoother:
         vectors = vectors + step
         for _ in range(degree - 1):
             previous, ratio = ratio, 1 / (2 * slope - ratio)
-            # Dense vectors are updated in place, because they take more memory than all other arrays.
+            # Dense vectors are updated in place to save memory.
             step *= ratio * previous
             change = self.operator @ vectors
             change *= 2 * ratio / self.half

@@ -2,9 +2,8 @@
 
 A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. The surface is exactly
 mirror symmetric in the rest pose. Marching cubes, decimation and relaxation on the surface give well-shaped
-triangles. The joints move each point by a smooth function of the point's position in the rest pose. Therefore
-the triangulations of one creature in two poses approximate two smooth surfaces. Two points of these surfaces
-correspond if they have the same position in the rest pose.
+triangles. The joints move each point by a smooth function of the point's position in the rest pose. Two
+points of a creature in two poses correspond if they have the same position in the rest pose.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ class CreaturePair:
     def true_map(self) -> Int64[np.ndarray, " m"]:
         """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
 
-        The match of a source vertex is the corner nearest to the true point, among the corners of the
-        triangle that contains the true point.
+        Each true point is replaced by the nearest corner of the target triangle that contains it.
         """
         return self.truth.nearest_corners(self.target)
 
@@ -67,7 +65,7 @@ class CreaturePair:
 class _Tube:
     """A chain of tapered capsules. A tapered capsule is the convex hull of two balls.
 
-    If `normal` is given, the chain is a plate, and the thickness of the capsules is limited.
+    If `normal` is given, the chain is a flat plate of limited thickness.
     """
 
     centers: np.ndarray  # (p, 3)
@@ -78,7 +76,7 @@ class _Tube:
     thickness: float  # half the thickness of a plate
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distance (p,) from points (p, 3) to the nearest link of the chain."""
+        """Return the signed distance (p,) from points (p, 3) to the nearest capsule of the chain."""
         result = np.full(len(points), np.inf)
         for i, axis in enumerate(np.diff(self.centers, axis=0)):
             relative = planar = points - self.centers[i]
@@ -103,7 +101,7 @@ class _Tube:
 
 
 def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Return the minimum, rounded by a parabola where the values differ by less than the width."""
+    """Return the minimum, smoothed by a parabola where the two values differ by less than `width`."""
     overlap = np.maximum(1 - np.abs(a - b) / width, 0)
     return np.minimum(a, b) - overlap**2 * (width / 4)
 
@@ -128,7 +126,7 @@ class _Body:
         self._amplitudes = 0.03 * random.normal(size=(4, 4))
 
     def _individual(self, balls: str) -> np.ndarray:
-        """Return the balls "x y z radius, ..." as an array (p, 4), in the proportions of this individual."""
+        """Convert balls "x y z radius, ..." to an array (p, 4), and apply the individual's proportions."""
         chain = np.array([ball.split() for ball in balls.split(",")], dtype=float)
         across, up, ahead = (
             chain[:, i, None] * self._frequencies[i] + (i > 0) * self._phases for i in range(3)
@@ -151,8 +149,8 @@ class _Body:
     ) -> None:
         """Add a tube or a plate to the body, or carve a tube out of the body.
 
-        `balls` lists the balls of the tube's chain. `joint` is the name of the joint that moves the tube. The
-        name is needed only for a tube that projects far from the body.
+        `balls` lists the balls of the tube's chain. `joint` names the joint that moves the tube; it is needed
+        only if the tube projects far from the body.
         """
         chain = self._individual(balls)
         if joint:
@@ -167,7 +165,7 @@ class _Body:
         self._tubes.append(_Tube(chain[:, :3], chain[:, 3], blend, carved, unit, thickness))
 
     def limb(self, joints: str, parent: str, balls: str, *, blend: float) -> None:
-        """Add a tube with a joint in each ball except the last ball."""
+        """Add a tube with a joint in each ball except the last."""
         for prefix, side in self._sides(self._individual(balls)):
             above = self.joints.get(prefix + parent, self.joints.get(parent, -1))
             for name, hull in zip(joints.split(), _hulls(side), strict=True):
@@ -227,9 +225,9 @@ class _Body:
         """Return the rotation vectors (j, 3) of the joints in radians, with small random changes.
 
         `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. At
-        the joint of the head, a positive x angle turns the nose down, a positive y angle turns the nose to
-        the left, and a positive z angle raises the left side. If the name of a joint lacks `left_` or
-        `right_`, the rotation applies to the joints on both sides and is mirrored on the right side.
+        the head, positive angles turn the nose down (x), turn the nose to the left (y), and raise the left
+        side (z). A joint name without `left_` or `right_` rotates the joints on both sides, mirrored on the
+        right side.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
@@ -243,8 +241,8 @@ class _Body:
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """Return the positions of points (p, 3) after the rotations of the joints.
 
-        Each joint rotates a point by the point's share of the joint's angle. Averages of rotation matrices
-        would shrink the skin around a flexed joint and collapse it around a twisted joint.
+        Each joint rotates a point by the point's share of the joint's angle. Averaging rotation matrices
+        instead of angles would shrink the skin around a flexed joint and collapse it around a twisted joint.
         """
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:
@@ -263,7 +261,7 @@ class _Body:
 
 
 def _hulls(chain: np.ndarray) -> np.ndarray:
-    """Return the consecutive pairs of balls (p - 1, 2, 4) of a chain."""
+    """Return the consecutive pairs of balls (p - 1, 2, 4) of a chain of p balls."""
     return np.stack([chain[:-1], chain[1:]], axis=1)
 
 
@@ -278,9 +276,9 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     corners = np.array([(*corner, top) for top in (0, 1) for corner in square])
-    # A cell can contain skin only if the absolute value of the implicit function at the cell's centre is less
-    # than 1.3 times the cell's width. Half the diagonal of a cell is only 0.87 times the width, but the
-    # implicit function can overestimate distances.
+    # A cell can contain skin only if the implicit function at its centre is below 1.3 cell widths in absolute
+    # value. Half the diagonal of a cell is only 0.87 cell widths, but the implicit function can overestimate
+    # distances.
     level = int(np.log2(_REACH / (1.3 * spacing)))
     extent = int(np.ceil(body.extent / spacing / 2**level)) + 1
     cells = np.stack(np.meshgrid(*[np.arange(-extent, extent)] * 3), axis=-1).reshape(-1, 3)
@@ -300,10 +298,7 @@ def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tup
 
 
 def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Flip edges whose opposite angles sum to more than 180 degrees, in several rounds.
-
-    No two edges that are flipped in the same round share a face.
-    """
+    """Flip edges whose opposite angles sum to more than 180 degrees."""
     faces = faces.copy()
     for _ in range(20):
         edges, _, sides, corners = igl.edge_flaps(faces)
@@ -335,14 +330,14 @@ def _unit_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Triangulate the body in the rest pose by well-shaped triangles with exactly `count` vertices.
+    """Make a mesh of the body in the rest pose, with exactly `count` vertices and well-shaped triangles.
 
     **Returns:** Vertices (count, 3) and faces (f, 3).
     """
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per square of the grid's spacing. With the following spacing, marching
-    # cubes give four times the wanted number of vertices.
+    # Marching cubes give 1.5 vertices per spacing² of surface area. The following spacing gives four times
+    # `count` vertices.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)
@@ -352,8 +347,8 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
         spacing *= 0.8  # a coarse grid can break thin parts, and can bridge narrow gaps between parts
     else:
         raise InputError("The creature of this seed has parts that touch each other: choose another seed.")
-    # Decimation collapses the shortest edges. The length of an edge includes the difference of the normals at
-    # its ends, with a small weight. Therefore curved regions keep more vertices.
+    # Decimation collapses the shortest edges. Edge lengths include the weighted difference of the normals at
+    # the two ends, so curved regions keep more vertices.
     features = np.hstack([vertices, 0.07 * body.project(vertices)[1]])
     features, faces, _, _ = igl.decimate(
         np.asfortranarray(features), np.asfortranarray(faces, dtype=np.int32), 2 * count - 4
@@ -593,9 +588,9 @@ CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_,
 def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest", seed: int = 0) -> Mesh:
     """Make the mesh of a creature.
 
-    The mesh is closed and has no handles. The triangles are well shaped and oriented outward. The same kind,
-    number of vertices and seed give the same triangles in every pose, so vertex i is always the same point of
-    the body. In the rest pose the body is mirror symmetric in x, but its triangulation is not symmetric.
+    The mesh is closed and has no handles. The triangles are well shaped and oriented outward. For a given
+    kind, number of vertices and seed, every pose has the same triangles, so vertex i is always the same point
+    of the body. In the rest pose, the body is mirror symmetric in x, but its triangulation is not symmetric.
 
     **Arguments:**
 
@@ -609,7 +604,7 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
     creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
-    whose body intersects itself. Such seeds are rare, and no seed below 250 is among them.
+    whose body intersects itself. No seed below 250 makes a body that intersects itself.
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:
@@ -624,9 +619,9 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
 
     The two shapes are nearly isometric and are triangulated independently. The source is in the pose
     `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
-    vertices. For the ground truth, both meshes are taken in the same rest pose, and the source vertices are
-    projected onto the triangles of the target. Therefore the ground truth is exact except for the errors of
-    this projection between two triangulations.
+    vertices. To compute the ground truth, the source vertices are projected onto the target's triangles in
+    the common rest pose. The only errors of the ground truth come from the projection between the two
+    triangulations.
 
     **Arguments:**
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import numpy as np
@@ -17,18 +17,17 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.coarsening import coarsen
 from jaxsmw.geometry.laplacian import assemble_laplacian, choose_laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import one_blas_thread
 
-# The shift for ARPACK, for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is between
-# 1 and 30.
+# The shift that ARPACK uses for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is
+# between 1 and 30.
 _SHIFT = -1e-2
-# An eigenbasis is accurate if its residuals, relative to the largest eigenvalue, and the entries of |Phi^T A
-# Phi - I| do not exceed these tolerances.
+# The largest accepted values of the two numbers that `_check` returns.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
@@ -44,19 +43,20 @@ def compute_spectrum(
 ) -> Spectrum:
     """Compute the spectrum of a mesh: the first k eigenpairs of its Laplacian, and its vertex areas.
 
-    The mesh is scaled to area 1, so the unit of the file has no effect. The computation uses float64 on the
-    CPU and fixed random seeds, so the same mesh gives the same spectrum. The sign of each eigenvector is
-    chosen so that its entry of largest absolute value is positive. The eigenpairs of each connected component
-    are computed separately and then merged.
+    The mesh is scaled to area 1, so the unit of length has no effect. The computation uses float64 on the CPU
+    and fixed random seeds, so the same mesh gives the same spectrum. The sign of each eigenvector is chosen
+    so that its entry of largest absolute value is positive. The eigenpairs of each connected component are
+    computed separately and then merged.
 
-    The exact solver is a shift-invert Lanczos method. The number of eigenvalues, the residuals and the
-    orthonormality are checked. If the Lanczos method fails, ARPACK computes the eigenpairs.
+    The exact solver is a shift-invert Lanczos method. The exact solver checks the number of eigenvalues, the
+    residuals and the orthonormality. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
     (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal, up to rounding errors.
-    The time of the approximate solver is nearly proportional to the number of vertices. The approximate
-    solver requires triangles of similar size and shape. If the triangles differ too much, the function issues
-    a `RuntimeWarning` and uses the exact solver. Results are cached on disk (`jaxsmw.runtime.cache`).
+    The computation time of the approximate solver is nearly proportional to the number of vertices. The
+    approximate solver requires triangles of similar size and shape. If the sizes or shapes of the triangles
+    differ too much, the function issues a `RuntimeWarning` and uses the exact solver. Results are cached on
+    disk (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -78,8 +78,10 @@ def compute_spectrum(
     and normals (n, 3), in units in which the area of the surface is 1. The spectrum has no descriptors. The
     float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are masked.
 
-    **Raises:** `InputError` if k is not an integer or does not fit the mesh, the Laplacian or the eigensolver
-    is unknown, or the eigenproblem cannot be solved accurately; `TypeError` if `mesh` is not a `Mesh`.
+    **Raises:** `InputError` if k is not an integer, is less than 1, or is not less than the number of
+    referenced vertices. Also `InputError` if the Laplacian or the eigensolver is unknown, if faces without
+    area make the cotangent Laplacian undefined, or if the eigenproblem cannot be solved accurately.
+    `TypeError` if `mesh` is not a `Mesh`.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return as_spectrum(mesh, *pairs)
@@ -98,7 +100,7 @@ def as_spectrum(
     **Arguments:**
 
     - `mesh`: the surface with n vertices, in any unit.
-    - `eigenvalues`, `eigenvectors`, `vertex_areas`: the result of `eigenpairs`.
+    - `eigenvalues`, `eigenvectors`, `vertex_areas`: the arrays that `eigenpairs` returns.
     """
     referenced = mesh.referenced_vertices
     # Positions are relative to the centroid. In single precision, absolute positions of a mesh far from the
@@ -135,10 +137,8 @@ def eigenpairs(
             f"{mesh.name}: cannot compute {number_of_eigenvectors} eigenvectors from {len(referenced)} "
             f"referenced vertices: choose a number from 1 to {len(referenced) - 1}, or use a finer mesh."
         )
-    if eigensolver not in get_args(Eigensolver):
-        raise InputError(f"{eigensolver!r} is not an eigensolver: choose {', '.join(get_args(Eigensolver))}.")
-    if laplacian not in get_args(Laplacian):
-        raise InputError(f"{laplacian!r} is not a Laplacian: choose {', '.join(get_args(Laplacian))}.")
+    check_choice(eigensolver, Eigensolver, "an eigensolver")
+    check_choice(laplacian, Laplacian, "a Laplacian")
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
     if eigensolver == "auto":
@@ -169,12 +169,9 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """Choose the eigensolver for the setting `"auto"`, for meshes whose spectra will be compared.
+    """Choose one eigensolver for all meshes whose spectra will be compared, for the setting `"auto"`.
 
-    The same eigensolver is used for all meshes. The choice depends on the mesh with the most referenced
-    vertices.
-
-    **Returns:** `"approximate"` if a mesh has 50 000 referenced vertices or more, else `"exact"`.
+    **Returns:** `"approximate"` if any mesh has 50 000 referenced vertices or more, else `"exact"`.
     """
     most = max(int(mesh.referenced_vertices.sum()) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
@@ -209,11 +206,11 @@ def _solve(
 def _solve_component(
     stiffness: sp.csc_matrix, areas: np.ndarray, k: int, eigensolver: Eigensolver, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k smallest eigenpairs of one connected component, after checks of their accuracy."""
+    """Compute the k smallest eigenpairs of one connected component, and check their accuracy."""
     n = len(areas)
-    # Renumbering stores neighbouring vertices close to each other, which suits the processor's cache. For
-    # some meshes, such as subdivided meshes, the fill-reducing ordering of the factorization would be several
-    # times worse without renumbering.
+    # Renumbering stores neighbouring vertices close to each other, which suits the processor's cache. Without
+    # renumbering, the factorization's fill-reducing ordering is several times worse on some meshes, such as
+    # subdivided meshes.
     order = reverse_cuthill_mckee(stiffness, symmetric_mode=True)
     stiffness, areas = stiffness[order][:, order], areas[order]
     mass = sp.diags(areas).tocsc()
@@ -257,7 +254,7 @@ def _dense(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.nd
 
 def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> SuperLU:
     """Return the LU factors of W - shift A."""
-    # Without symmetric mode, the factorization with this ordering would take orders of magnitude longer.
+    # Without symmetric mode, this ordering would make the factorization orders of magnitude slower.
     return splu(
         (stiffness - shift * mass).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -277,8 +274,8 @@ def _number_below(factors: SuperLU) -> int:
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
     """Return a shift in the middle of the first k eigenvalues, and the factors of W - shift A.
 
-    By Weyl's law, about k/2 eigenvalues are below the first trial shift. If this prediction is wrong, as on a
-    thin tube, the next trial shift is computed from the true number of eigenvalues below the previous shift.
+    By Weyl's law, about k/2 eigenvalues are below the first trial shift. If the true number of smaller
+    eigenvalues is far from k/2, as on a thin tube, another shift is tried.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -292,7 +289,7 @@ def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) ->
 
 
 def _misses_some(stiffness: sp.csc_matrix, mass: sp.csc_matrix, eigenvalues: np.ndarray) -> bool:
-    """Return whether the given eigenvalues lack an eigenvalue below the largest given eigenvalue.
+    """Return whether an eigenvalue below the largest given eigenvalue is missing.
 
     Missing copies of the largest given eigenvalue are not detected.
     """
@@ -308,13 +305,12 @@ def _lanczos(
     """Return the k smallest eigenpairs by the block Lanczos method for (W - shift A)^-1 A, without restarts.
 
     The shift is in the middle of the wanted eigenvalues, so the wanted eigenpairs are at both ends of the
-    spectrum of the inverse. Therefore two products with the inverse per eigenpair suffice. Keeping every
-    vector A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
+    spectrum of the inverse. Therefore the method needs only two products with the inverse per eigenpair.
+    Keeping every vector A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
 
-    Blocks of b vectors find at most b copies of a multiple eigenvalue. Therefore the number of eigenvalues is
-    checked. If some eigenvalues are missing, the method is repeated with larger blocks. An eigenpair has
-    converged when its residual for the inverse, relative to the inverse's eigenvalue, is at most the
-    tolerance.
+    Blocks of b vectors find at most b copies of a multiple eigenvalue. If the result lacks some eigenvalues,
+    the method is repeated with larger blocks. An eigenpair has converged when its relative residual as an
+    eigenpair of the inverse is at most `tolerance`.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """
@@ -326,19 +322,16 @@ def _lanczos(
     raise RuntimeError("not all copies of a multiple eigenvalue were found")
 
 
-# The number of vectors in a block. Solving for several vectors together saves time, because SuperLU holds
-# Python's global lock while it manages memory, and two threads then wait for each other. Larger blocks need
-# more products to converge.
+# The number of vectors in a block. SuperLU holds Python's global lock while it manages memory, so other
+# threads wait. Solving for several vectors together reduces this waiting time. Larger blocks need more
+# products to converge.
 _BLOCK = 4
 
 
 def _converged(
     inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first k eigenpairs, computed with blocks of `size` vectors.
-
-    **Raises:** `RuntimeError` if the eigenpairs do not converge.
-    """
+    """Return the first k eigenpairs, computed with blocks of `size` vectors."""
     n = mass.shape[0]
     diagonal = mass.diagonal() if mass.nnz == n else None
 
@@ -352,9 +345,8 @@ def _converged(
     vectors = np.empty((2 * k + 100 + size, n))
     # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
-    # The initial block is smoothed, because the eigenvectors are computed as linear combinations of the block
-    # vectors. With rough vectors, rounding errors in the weights would affect the derivatives of the
-    # eigenvectors.
+    # The initial block is smoothed, because rounding errors in linear combinations of rough vectors would
+    # make the eigenvectors rough.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -368,7 +360,7 @@ def _converged(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # The large overlaps with the last two blocks are removed first. Otherwise the rounding errors of the
+        # The large overlaps with the last two blocks are removed first. Otherwise rounding errors of the
         # large overlaps would hide the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
@@ -378,11 +370,10 @@ def _converged(
         if end < look:
             continue
         look = end + max(5, k // 20)
-        # SciPy's `eigh` would hold Python's global lock.
+        # NumPy's `eigh` is used, because SciPy's `eigh` would hold Python's global lock.
         inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])
         eigenvalues = shift + 1 / inverted
-        # Negative values stem from inverted values near zero, which belong to eigenvalues above all wanted
-        # eigenvalues.
+        # Very large eigenvalues, which are not wanted, can become negative by rounding.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -431,13 +422,13 @@ def _arpack(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.n
 def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k smallest eigenpairs by the Rayleigh–Ritz method in a coarse subspace.
 
-    The resulting eigenvectors are smoothed, and the Rayleigh–Ritz method is applied again in their span. A
-    few more than k eigenvectors are computed, because the last eigenvectors of a subspace are the least
+    The eigenvectors in this subspace are smoothed, and the Rayleigh–Ritz method is applied again in their
+    span. More than k eigenvectors are computed, because the last eigenvectors of a subspace are the least
     accurate.
 
     **Raises:** `RuntimeError` if the subspace is too small, or if one more smoothing step would lower an
-    eigenvalue by more than 1.5 %. (Missing eigenvalues are not detected, because a count of eigenvalues
-    requires the factors of W - shift A.)
+    eigenvalue by more than 1.5 %. Missing eigenvalues are not detected, because counting eigenvalues requires
+    the factors of W - shift A.
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -459,8 +450,8 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
     # If all triangles are badly shaped, the last eigenvectors are the least accurate. If only one region has
-    # badly shaped triangles, any eigenvectors can be the least accurate. Therefore the last eigenvectors and
-    # every third eigenvector are checked.
+    # badly shaped triangles, any eigenvector can be the least accurate. Therefore the last ten eigenvectors
+    # and every third eigenvector are checked.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
@@ -470,15 +461,15 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     return eigenvalues, eigenvectors
 
 
-# The number of dimensions of the subspace per eigenvector.
+# The number of subspace dimensions per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
-# The largest accepted relative decrease of an eigenvalue by one more smoothing step. The relative errors of
-# eigenvalues are up to three times as large as this decrease.
+# One more smoothing step may lower an eigenvalue by at most this fraction. The relative error of an
+# eigenvalue is up to three times this fraction.
 _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Return slices of at most 32 columns. Copies of more columns may not fit into memory."""
+    """Return slices of at most 32 columns. Copying more columns at a time may exceed the memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
@@ -487,8 +478,8 @@ def _check(
 ) -> tuple[float, float]:
     """Return the largest relative residual of eigenpairs, and the largest deviation from orthonormality.
 
-    The relative residual is |A^-1 W phi - lambda phi|_A / lambda_max. The deviation from orthonormality is an
-    entry of |Phi^T A Phi - I|.
+    The relative residual is |A^-1 W phi - lambda phi|_A / lambda_max. The largest deviation from
+    orthonormality is the largest entry of |Phi^T A Phi - I|.
     """
     deviation, highest = 0.0, 0.0
     for columns in _slices(len(eigenvalues)):
@@ -499,5 +490,5 @@ def _check(
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
         # Unlike `max`, `np.maximum` returns NaN if one of the numbers is NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # The divisor is at least 1, because zero may be the only eigenvalue.
+    # The divisor is at least 1, because the only eigenvalue may be zero.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

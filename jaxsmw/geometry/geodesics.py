@@ -1,14 +1,14 @@
 """Geodesic distances on piecewise flat surfaces, accurate even for short distances.
 
-Evaluation measures the distance between each match and the true point, which is short if the match is good.
-For short distances, the heat method has errors of several percent. Exact window propagation takes about 100
-times as long as the method of this module.
+In evaluation, the distances between matches and true points are often short. For short distances, the heat
+method has errors of several percent. Exact window propagation takes about 100 times as long as the method of
+this module.
 
-This module runs Dijkstra's algorithm on a graph of edges and straight shortcuts. Strips of triangles around
-each vertex are unfolded into the plane. If a straight line within a strip leads from one vertex to another,
-the graph connects these vertices by an edge with the exact length of the line. Paths in this graph are paths
-on the surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03
-to 0.07 % on average.
+This module runs Dijkstra's algorithm on a graph of mesh edges and of straight lines across faces. Strips of
+triangles around each vertex are unfolded into the plane. If a straight line within a strip joins two
+vertices, the graph contains an edge with the length of this line. Paths in this graph are paths on the
+surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03 to 0.07
+% on average.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from jaxsmw.choices import GeodesicMethod
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.cache import cached
 
@@ -34,7 +34,7 @@ from jaxsmw.runtime.cache import cached
 _DEPTH = 10
 
 # The number of sides from which strips are unfolded together, and the number of distances that are stored
-# together. With these numbers, the arrays fit into the processor's cache.
+# together. With these sizes, the arrays fit into the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
 # `geodesic_distances_between` searches within these radii one after the other, and finally on the whole
@@ -50,16 +50,16 @@ _EXACT_HEIGHT = 1e-6
 class SurfacePoints:
     """Points on the faces of a mesh, given by barycentric weights.
 
-    `len(points)` is the number p of points. For an integer array `rows`, `points[rows]` contains only the
-    points with these 0-based numbers. The method `positions(mesh)` returns the positions (p, 3) of the
-    points, and `nearest_corners(mesh)` returns vertices (p,). The constructor checks nothing. Functions that
-    receive `SurfacePoints` check them.
+    `len(points)` is the number p of points. `points[rows]` selects points by an array `rows` of 0-based
+    indices. The method `positions(mesh)` returns the positions (p, 3) of the points. The method
+    `nearest_corners(mesh)` returns for each point the nearest corner of its face, as 0-based vertex indices
+    (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check them.
 
     **Attributes:**
 
     - `faces`: the face of each point, as 0-based indices (p,) into `Mesh.faces`, int64.
     - `weights`: the barycentric weights (p, 3) of the three corners of the face, in the order of the corners,
-      float64. Weights are not negative, and each row sums to 1.
+      float64. The weights are at least 0, and each row sums to 1.
     """
 
     faces: Int64[np.ndarray, " p"]
@@ -83,12 +83,12 @@ class SurfacePoints:
 
 
 class _Sides(NamedTuple):
-    """The 6 f sides of all triangles and of their mirror images.
+    """The 6 f sides of all f triangles and of their mirror images.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. When a line crosses from one face into another
-    face, the side by which the line leaves has the opposite direction to the side by which it enters. This
-    rule holds for any orientation of the faces, and for any number of faces at an edge.
+    images: the faces 0 … f - 1 with reversed order of corners. A line that crosses an edge leaves one
+    triangle by a side and enters the next triangle by the side with opposite direction. Because of the mirror
+    images, lines can cross between faces of any orientation, and at edges with any number of faces.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -111,7 +111,7 @@ def _sides(mesh: Mesh) -> _Sides:
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
-    # No line crosses a side of length zero, so the zeros that describe such a side have no effect.
+    # No line crosses a side of length zero, so the direction and shape of this side can be set to zero.
     direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
     shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
@@ -128,17 +128,17 @@ def _sides(mesh: Mesh) -> _Sides:
 
 
 def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of i and start[i] + j with 0 <= j < count[i], as two arrays."""
+    """Return all pairs (i, start[i] + j) with 0 <= j < count[i], as two arrays."""
     row = np.repeat(np.arange(len(count)), count)
     return row, np.arange(len(row)) + np.repeat(start - (np.cumsum(count) - count), count)
 
 
 class _Beams(NamedTuple):
-    """Beams, which are cones of straight lines from a point within a strip of unfolded triangles.
+    """Beams: cones of straight lines from a point through a strip of unfolded triangles.
 
-    The triangles are unfolded into the complex plane, and the point of a beam is at 0. The side by which a
-    beam enters or leaves a triangle has its ends at `right` and `left`. The lines that pass through all sides
-    crossed so far have directions between `rightmost` and `leftmost`.
+    The triangles are unfolded into the complex plane, and each beam starts at 0. `right` and `left` are the
+    ends of the side by which the beam enters or leaves a triangle. The lines of the beam have directions
+    between `rightmost` and `leftmost`.
     """
 
     origin: Int64[np.ndarray, " b"]
@@ -158,7 +158,7 @@ def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Return for each beam whether one of its lines reaches a position in the triangle just entered."""
+    """Return for each beam whether one of its lines reaches the given position."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -173,9 +173,9 @@ def _unfold(
 
     **Arguments:**
 
-    - `origin`: the number of the point of each initial beam (b,).
-    - `side`: the side by which the beam leaves the triangle of the point (b,).
-    - `position`: the position of the point in the complex plane in which this side leads from 0 to 1 (b,).
+    - `origin`: the index of the point from which each initial beam starts (b,).
+    - `side`: the side by which each beam leaves its first triangle (b,).
+    - `position`: the complex coordinate of the point, in the frame in which `side` leads from 0 to 1 (b,).
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with one item per crossing: the beams that enter the next triangles, and the
@@ -189,8 +189,8 @@ def _unfold(
         beams = beams.at(beam)._replace(side=sides.across[entry])
         corner = beams.left + sides.shape[beams.side] * (beams.right - beams.left)
         yield beams, corner
-        # Lines to the right of the corner leave by the side from the right end to the corner. Lines to the
-        # left of the corner leave by the side from the corner to the left end.
+        # Lines that pass the corner on its right leave by the side from `right` to the corner. Lines that
+        # pass the corner on its left leave by the side from the corner to `left`.
         triangle, k = np.divmod(beams.side, 3)
         visible = _visible(beams, corner)
         to_right = beams._replace(
@@ -215,7 +215,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """Return the straight lines from points to all vertices that `_unfold` reaches."""
+    """Return the straight lines from points to vertices that `_unfold` finds."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)
@@ -247,10 +247,10 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
 
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
-    - `depth`: the number of edges that a straight line may cross, at least 1. On bodies, the shortest paths
-        in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths in a graph of depth
-        10 are too long by 0.03 to 0.07 % on average. A search in a graph of depth 10 takes 1.4 times as long
-        as a search in a graph of depth 6.
+    - `depth`: the largest number of edges that a straight line may cross, at least 1. On bodies, the shortest
+        paths in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths in a graph of
+        depth 10 are too long by 0.03 to 0.07 % on average. Searches in a graph of depth 10 take 1.4 times as
+        long as in a graph of depth 6.
 
     **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
     mesh. A stored zero is the length of a line between two vertices at the same position. All callers share
@@ -263,8 +263,7 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
         smaller, larger = mesh.edges.T
         edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
         lines = [_Lines(smaller, larger, edge_lengths)]
-        # The first half of the sides suffices, because the sides of the mirrored triangles give only the
-        # mirror images of these lines.
+        # Only the first half of the sides is used, because the mirrored triangles give the same lines again.
         for start in range(0, s, _SIDES_AT_ONCE):
             side = np.arange(start, min(start + _SIDES_AT_ONCE, s))
             origins, ends, lengths = _lines(sides, sides.apex[side], side, sides.shape[side], depth)
@@ -292,8 +291,8 @@ def geodesic_distances(
 
     - `mesh`: the surface with n vertices.
     - `sources`: the s sources, as 0-based vertex indices (s,) or as `SurfacePoints`. The result contains s
-        times n numbers, so divide very many sources into several calls. For distances between given pairs of
-        points, use `geodesic_distances_between`.
+        times n numbers, so split a large number of sources into several calls. For distances between given
+        pairs of points, use `geodesic_distances_between`.
     - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
         lines across faces. On bodies, distances computed with `"strips"` are too long by 0.03 to 0.07 % on
         average. `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl).
@@ -307,9 +306,9 @@ def geodesic_distances(
 
     **Raises:** `InputError` for sources that are not on the mesh, or an unknown method. With `"exact"`, also
     `InputError` for `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces
-    whose height is almost zero.
+    of almost zero height.
     """
-    _check_method(method)
+    check_choice(method, GeodesicMethod, "a method for geodesic distances")
     points = check_points(sources, mesh, "sources")
     if method == "exact":
         distances = np.empty((len(points), len(mesh.vertices)))
@@ -322,12 +321,6 @@ def geodesic_distances(
     return dijkstra(graph, indices=nodes, limit=limit)[:, : len(mesh.vertices)]
 
 
-def _check_method(method: str) -> None:
-    if method not in get_args(GeodesicMethod):
-        choices = ", ".join(get_args(GeodesicMethod))
-        raise InputError(f"{method!r} is not a method for geodesic distances: choose {choices}.")
-
-
 def geodesic_distances_between(
     mesh: Mesh,
     points: ArrayLike | SurfacePoints,
@@ -337,23 +330,24 @@ def geodesic_distances_between(
 ) -> Float64[np.ndarray, " p"]:
     """Compute the geodesic distance between the two points of each of p pairs.
 
-    The partner of `points[i]` is `partners[i]`. The search starts from `points` or from `partners`, whichever
-    has fewer distinct points. The radius of the search grows in steps. If the two points of each pair are
-    close together, the function is much faster than a computation of all distances. The function never stores
-    p times n numbers.
+    Pair i consists of `points[i]` and `partners[i]`. The search starts from `points` or from `partners`,
+    whichever has fewer distinct points. The radius of the search grows in steps. If the two points of each
+    pair are close together, the function is much faster than `geodesic_distances`. The function never stores
+    all p times n distances.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `points`, `partners`: p vertex indices, or p `SurfacePoints`.
+    - `points`, `partners`: p points each, as 0-based vertex indices (p,) or as `SurfacePoints`.
     - `method`: `"strips"` or `"exact"`; see `geodesic_distances`.
 
-    **Returns:** Distances (p,) in the unit of the mesh; inf where there is no path.
+    **Returns:** Distances (p,) in the unit of the mesh; inf if no path connects the two points.
 
-    **Raises:** `InputError` for points that are not on the mesh, for an unknown method, for different numbers
-    of points and partners, or if the exact method cannot be used (see `geodesic_distances`).
+    **Raises:** `InputError` for points that are not on the mesh, an unknown method, or different numbers of
+    points and partners. With `"exact"`, also `InputError` for `SurfacePoints`, and for meshes with
+    non-manifold edges, non-manifold vertices or faces of almost zero height.
     """
-    _check_method(method)
+    check_choice(method, GeodesicMethod, "a method for geodesic distances")
     starts, ends = check_points(points, mesh, "points"), check_points(partners, mesh, "partners")
     if len(starts) != len(ends):
         raise InputError(
@@ -393,10 +387,7 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return arguments of `_unfold` for three beams per point, one through each side of the point's face.
-
-    The arguments are the origins, sides and positions.
-    """
+    """Return the origins, sides and positions of three beams per point, one per side of its face."""
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]
@@ -405,7 +396,7 @@ def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray
 def _straight_distances(
     mesh: Mesh, points: SurfacePoints, partners: SurfacePoints
 ) -> Float64[np.ndarray, " p"]:
-    """Return the length of the straight line from each point to its partner; inf where none exists."""
+    """Return the length of the straight line from each point to its partner; inf if there is no such line."""
     lengths = np.linalg.norm(points.positions(mesh) - partners.positions(mesh), axis=1)
     lengths[points.faces != partners.faces] = np.inf
     sides = _sides(mesh)
@@ -428,8 +419,8 @@ def _network(
 ) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
     """Add surface points to the geodesic graph as nodes.
 
-    Lines lead from the points to vertices, and from vertices to the ends. No path leads through an added
-    node, so a distance does not depend on the other added points.
+    The added lines lead from the points to vertices, and from vertices to the ends. No path leads through an
+    added node, so a distance does not depend on the other added points.
 
     **Returns:** The graph, the nodes of the points, and the nodes of the ends.
     """
@@ -509,7 +500,7 @@ def check_points(
 
     - `points`: vertex indices (p,) or `SurfacePoints`.
     - `mesh`: the mesh.
-    - `name`: the name that error messages give to the points.
+    - `name`: the name of the points in error messages.
 
     **Returns:** The points, with indices as int64.
 
@@ -541,7 +532,7 @@ def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> Surfac
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
     """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
 
-    `name` is the name that error messages give to the indices, in the singular, such as "vertex".
+    `name` is the name of an index in error messages, in the singular, such as "vertex".
 
     **Raises:** `InputError` if the values are not a list of integers in this range, or if some values are
     masked.
@@ -559,6 +550,6 @@ def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray,
         at = int(outside.argmax())
         cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
         raise InputError(
-            f"{name} indices must lie between 0 and {count - 1}, but number {at} is {indices[at]}: {cure}."
+            f"{name} indices must lie between 0 and {count - 1}, but entry {at} is {indices[at]}: {cure}."
         )
     return indices.astype(np.int64)

@@ -32,9 +32,9 @@ def assemble_laplacian(
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas; `"robust"` for the tufted
-      intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles non-manifold and badly shaped
-      meshes; `"auto"` for the Laplacian that `choose_laplacian` returns.
+    - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas, `"robust"` for the tufted
+      intrinsic Delaunay Laplacian (Sharp and Crane 2020), or `"auto"` for the Laplacian that
+      `choose_laplacian` returns. The robust Laplacian also handles non-manifold and badly shaped meshes.
 
     **Returns:** W (n, n), symmetric and positive semi-definite, without unit, and A (n,), in the squared unit
     of the mesh. The rows of W and the entries of A are zero for unreferenced vertices.

@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 
-# A mesh of another library, as `make_mesh` describes it. Such meshes are recognised by their attributes,
-# because the other libraries are not imported.
+# A mesh of another library, in one of the forms that `make_mesh` lists. Such meshes are recognised by their
+# attributes, because the other libraries are not imported.
 MeshLike: TypeAlias = Any
 
 # A triangle whose height is at most this fraction of its longest edge is degenerate. This fraction is far
@@ -27,12 +27,12 @@ MeshLike: TypeAlias = Any
 DEGENERATE_HEIGHT = 1e-10
 
 # The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit.
-# Within the limits, squares of areas, which occur in descriptors, neither overflow nor underflow.
+# Descriptors contain squares of areas, which neither overflow nor underflow within these limits.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
 # The limits for the distances of vertices from the origin and from the middle of the mesh, in units of the
 # median edge length. At `LARGEST_COORDINATE` from the origin, float64 rounds positions by 1e-4 edge lengths.
-# At `LARGEST_DISTANCE` from the middle of a mesh, float32 rounds positions by 0.1 edge lengths. Maps are
-# refined in float32. (The meshes of the data sets extend up to 1e4 edge lengths.)
+# Maps are refined in float32, which rounds positions by 0.1 edge lengths at `LARGEST_DISTANCE` from the
+# middle of a mesh. (The meshes of the data sets extend up to 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
@@ -43,19 +43,19 @@ class Mesh:
     Vertex i of the mesh is always vertex i of the file, because cleaning drops only faces. A vertex without
     faces keeps its position and its number, and its entry in `referenced_vertices` is False.
 
-    Use `read_mesh` or `make_mesh` to make a `Mesh`. These functions check and clean their input; the
-    constructor of the class does not. Properties such as `area`, `vertex_areas` (n,), `vertex_normals` (n, 3)
-    and `edges` (e, 2) are computed when they are first used.
+    Use `read_mesh` or `make_mesh` to make a `Mesh`, because the constructor does not check or clean its
+    input. Properties such as `area`, `vertex_areas` (n,), `vertex_normals` (n, 3) and `edges` (e, 2) are
+    computed when they are first used.
 
     **Attributes:**
 
     - `vertices`: positions (n, 3), float64, in the unit of the file.
     - `faces`: vertex indices (f, 3), int64, 0-based.
     - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
-    - `notes`: a tuple of sentences about changes by cleaning, and about peculiarities of the mesh such as
+    - `notes`: a tuple of sentences about changes made by cleaning, and about unusual elements such as
       unreferenced vertices.
-    - `dropped_faces`: the 0-based numbers (d,), ascending, of the faces in the file that cleaning dropped.
-      Other files that refer to faces by number count the dropped faces too.
+    - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,). Face
+      numbers in other files, such as ground-truth files, include the dropped faces.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -102,8 +102,7 @@ class Mesh:
         """
         total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        # If the normals do not cancel, the length of their sum is about twice the area of the faces around
-        # the vertex, which is six vertex areas.
+        # `length` is about six vertex areas unless the normals of the faces cancel.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
 
@@ -128,7 +127,7 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """The undirected edges (e, 2) in lexicographic order. Each edge occurs once, smaller vertex first."""
+        """The undirected edges (e, 2), each once, lower vertex index first, in lexicographic order."""
         return self._edge_table.edges
 
     @cached_property
@@ -161,8 +160,8 @@ class Mesh:
     def _edge_table(self) -> _EdgeTable:
         """The edges, the number of faces at each edge, and the balance of each edge.
 
-        The balance of an edge is the sum of 1 or -1 for each of its faces, depending on the direction in
-        which the face traverses the edge.
+        The balance of an edge is the number of faces that traverse it in one direction, minus the number that
+        traverse it in the opposite direction.
         """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
@@ -306,7 +305,7 @@ def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -
     **Arguments:**
 
     - `mesh_x`: X with m vertices.
-    - `matches`: one row per vertex of X (m, ...): matches, points, or any other values.
+    - `matches`: an array (m, ...) with one row of values per vertex of X, such as matches or points.
 
     **Returns:** One row per vertex of X (m, ...). The rows of referenced vertices are unchanged.
     """
@@ -349,9 +348,9 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
         array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, all vertices at exactly the same position are treated as one vertex, and faces use the
-        lowest-numbered of these vertices. The other vertices at this position remain, but are unreferenced.
-        Welding closes seams along which some programs duplicate vertices.
+    - `weld`: if True, faces use only the lowest-numbered of all vertices at exactly the same position. The
+        other vertices at the same position become unreferenced. Welding closes seams along which some
+        programs duplicate vertices.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
@@ -362,10 +361,11 @@ def make_mesh(
 
     **Raises:**
 
-    `InputError` if an array has a wrong shape or type, a coordinate is not finite, an index is out of range,
-    there are no faces, all faces are degenerate, or an object is not a triangle mesh. Also `InputError` if
-    the extent of the mesh is below 1e-60 or above 1e60, a vertex is more than 1e12 median edge lengths from
-    the origin, or a vertex of a face is more than 1e6 median edge lengths from the middle of the mesh.
+    `InputError` if an array has a wrong shape or type, a coordinate is not finite, or an index is out of
+    range. Also `InputError` if there are no faces, all faces are degenerate, or an object is not a triangle
+    mesh. Also `InputError` if the extent of the mesh is below 1e-60 or above 1e60. Also `InputError` if a
+    vertex is more than 1e12 median edge lengths from the origin, or if a vertex of a face is more than 1e6
+    median edge lengths from the middle of the mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
@@ -398,7 +398,7 @@ def make_mesh(
 
 
 def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarray, " g"], list[str]]:
-    """Return the numbers of the faces to keep (g,), and notes about the dropped faces.
+    """Return the indices of the faces to keep (g,), and notes about the dropped faces.
 
     Faces that repeat a vertex, and faces with the same three vertices as an earlier face, are dropped.
     """
@@ -495,7 +495,7 @@ def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
 
 
 def to_host(values: Any) -> Any:
-    """Return values that NumPy can convert. PyTorch tensors are detached and copied to the host."""
+    """Return values that NumPy can convert: PyTorch tensors are detached and copied to the host."""
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 
@@ -528,7 +528,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
             f"{name}: triangle {at} uses vertex {faces[at][outside[at]][0]:.15g}, but the vertices are 0 to "
             f"{n - 1}: {cure}."
         )
-    # A copy would keep the type "long long" of libigl's arrays, which is not int64 but has the same size.
+    # A plain copy of libigl's arrays would keep their type "long long", which NumPy does not treat as int64.
     triangles = np.empty(faces.shape, np.int64)
     triangles[...] = faces
     if (triangles != faces).any():
@@ -537,7 +537,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 
 
 def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """Return for each row of numbers (n, 3) the index of the first row that equals it, as an array (n,)."""
+    """For each row of an array (n, 3), return the index of the first equal row, as an array (n,)."""
     order = np.lexsort(rows.T)  # a stable sort puts the first of equal rows first
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)

@@ -64,12 +64,11 @@ class SurfaceSamples(NamedTuple):
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    This is Poisson-disk sampling. No two samples are closer to each other in space than a minimum distance,
-    and no further candidate has this distance from all samples. The minimum distance follows from the area
-    and the number of samples. Each box of a grid contributes at most one vertex to the candidates. The boxes
-    are a third of the minimum distance wide. Two sheets of surface that are closer to each other than the
-    minimum distance share their samples. For many samples, the function is much faster than
-    `farthest_point_samples`.
+    This is Poisson-disk sampling. In space, all samples are farther apart than a minimum distance, and every
+    candidate is within this distance of a sample. The minimum distance follows from the area and the number
+    of samples. The candidates contain one vertex from each occupied box of a grid. The boxes are a third of
+    the minimum distance wide. Two sheets of surface that are closer to each other than the minimum distance
+    share their samples. For many samples, the function is much faster than `farthest_point_samples`.
 
     **Arguments:**
 
@@ -80,9 +79,9 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
     candidates = np.flatnonzero(mesh.referenced_vertices)
-    # With this minimum distance, a maximal set of samples has about 0.7 area / distance² samples.
+    # A maximal set of samples has about 0.7 area / distance² samples.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
-    # The candidates are thinned to one vertex, the lowest-numbered, per box of a grid around the centroid.
+    # In each box of a grid around the centroid, only the lowest-numbered vertex remains a candidate.
     positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)
     boxes = np.floor(positions[candidates] / (distance / 3)).astype(np.int64)
     _, first = np.unique(boxes, axis=0, return_index=True)
@@ -100,8 +99,8 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     """Return the edges of a coarse graph of the surface.
 
     If the mesh has at most 15 000 vertices, its edges are returned. Otherwise the nodes of the graph are
-    about 5000 evenly spread samples. Two samples are connected if an edge of the mesh connects two vertices
-    to which these samples are nearest.
+    about 5000 evenly spread samples. Two samples are connected if an edge of the mesh joins a vertex nearest
+    to the first sample and a vertex nearest to the second sample.
 
     **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
     are given as vertex indices of the mesh.

@@ -19,8 +19,8 @@ SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The radius of SHOT neighbourhoods in the MWP paper, in units of the square root of the area."""
-# A block of vertices has about this number of pairs (a vertex and a neighbour). A pair takes about 300 bytes,
-# so the histograms of a block stay in the processor's cache.
+# A block of vertices has about this number of pairs, each of a vertex and a neighbour. A pair takes about 300
+# bytes, so the histograms of a block stay in the processor's cache.
 _PAIRS_PER_BLOCK = 30_000
 
 
@@ -32,13 +32,13 @@ def shot_descriptors(
     SHOT is defined by Salti, Tombari, Di Stefano, "SHOT: Unique signatures of histograms for surface and
     texture description", CVIU 2014. The neighbours of a vertex are all vertices within the radius. The
     weighted scatter matrix of the neighbours gives the axes of a local reference frame. The x and z axes
-    point to the side on which most neighbours are.
+    point to the side with more neighbours.
 
-    The frame divides the neighbourhood into 32 sectors, by 8 ranges of azimuth, 2 of elevation and 2 of
-    distance. Each sector has a histogram of the cosine between a neighbour's normal and the z axis, with 11
-    bins. A neighbour contributes to the two nearest bins of azimuth, elevation, distance and cosine, with
-    linear weights. All neighbours have equal weights in the histograms. Each descriptor is scaled to unit
-    length.
+    The frame divides the neighbourhood into 32 sectors: 8 ranges of azimuth times 2 ranges of elevation times
+    2 ranges of distance. Each sector has an 11-bin histogram of the cosine of the angle between a neighbour's
+    normal and the z axis. A neighbour contributes to the two nearest bins of azimuth, elevation, distance and
+    cosine, with the weights of linear interpolation. All neighbours have equal total weights in the
+    histograms. Each descriptor is scaled to unit length.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
     left from right. A renumbering of the vertices only permutes the rows of the result. If the enclosed
@@ -49,14 +49,14 @@ def shot_descriptors(
 
     - `mesh`: the surface with n vertices, consistently oriented.
     - `radius`: the radius of the neighbourhoods, positive, in units of the square root of the area. The
-      default is the radius 0.06 of the MWP paper.
+      default, 0.06, is the radius in the MWP paper.
     - `samples`: the s samples of the mesh as `SurfaceSamples` (`jaxsmw.geometry.sampling`), or None. If
-      given, descriptors are computed only at the samples, and only samples are neighbours. The normal of a
-      sample is the mean normal of the vertices nearest to it. Without samples, the time grows with the square
-      of the number of vertices.
+      samples are given, descriptors are computed only at the samples, and only samples are used as
+      neighbours. The normal of a sample is the mean normal of the vertices nearest to the sample. Without
+      samples, the time grows with the square of the number of vertices.
 
-    **Returns:** Descriptors (n, 352) with one row per vertex or, with samples, (s, 352) with one row per
-    sample, float32, without unit. The row is zero for unreferenced vertices and for vertices with fewer than
+    **Returns:** Descriptors as float32, without unit: one row per vertex (n, 352), or one row per sample
+    (s, 352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than
     3 neighbours. The function issues a `UserWarning` if more than 1 % of the vertices have fewer than 3
     neighbours.
 
@@ -85,7 +85,7 @@ def shot_descriptors(
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius))
 
-        # Single precision suffices for the accuracy of descriptors.
+        # Single precision is accurate enough for descriptors.
         descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
@@ -129,8 +129,9 @@ def _describe(
     - `positions`, `normals`: the positions of all vertices, in units of the square root of the area, and
       their unit normals.
     - `block`: the vertices to describe.
-    - `center`, `neighbor`, `distance`: pairs of a vertex in the block and a neighbour. A pair consists
-      of a vertex (as an index into `block`), one of its neighbours, and the distance between the two.
+    - `center`, `neighbor`, `distance`: all pairs of a vertex in the block and one of its neighbours. `center`
+      contains indices into `block`, `neighbor` contains vertices, and `distance` contains the distances
+      between them.
     - `radius`: the radius of the neighbourhoods, in the unit of the positions.
     """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
@@ -138,15 +139,15 @@ def _describe(
     x, y, z = np.einsum("pad,pd->ap", frames, offsets)
     cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
 
-    # All coordinates are in units of bins. The centre of bin b has the coordinate b.
+    # Coordinates are in units of bins: the centre of bin b has the coordinate b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
     elevation = np.arcsin(np.clip(z / distance, -1, 1)) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
-    # A pair contributes to two bins of each quantity. Elevation and distance have only two bins, so every
-    # pair has weights for all four combinations of their bins. Azimuth and cosine select the rows of the
-    # histogram to which these weights are added.
+    # A pair contributes to two bins each of azimuth, elevation, distance and cosine. Elevation and distance
+    # have only two bins, so every pair has weights for all four combinations. Azimuth and cosine select the
+    # histogram rows to which the four weights are added.
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
     shares = np.empty((len(center), _ELEVATION * _RADIAL))
     for low, of_elevation in enumerate((1 - upper, upper)):
@@ -188,7 +189,7 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Ties occur on regular meshes. The arbitrary signs of `eigh` must not decide ties.
+        # Ties occur on regular meshes. The arbitrary signs of the eigenvectors must not decide ties.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

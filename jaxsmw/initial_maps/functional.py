@@ -12,8 +12,8 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.descriptors import SampledPair, paired_shot
 
 # The weight of commutativity with the Laplacian relative to preservation of SHOT. On eight pairs of real
-# bodies, the mean geodesic error of the initial map is 0.313 for a weight of 0, 0.076 for a weight of 1,
-# 0.055 for a weight of 10, and 0.052 for a weight of 100.
+# bodies, the weights 0, 1, 10 and 100 give initial maps with mean geodesic errors of 0.313, 0.076, 0.055 and
+# 0.052.
 _COMMUTATIVITY = 10.0
 
 

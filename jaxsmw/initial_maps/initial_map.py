@@ -34,8 +34,8 @@ def initial_map(
     """Compute the pointwise map T: X -> Y from which refinement begins.
 
     On a mesh with more than 15 000 vertices, descriptors are computed and compared only at about 10 000
-    evenly spread samples. Every other vertex of X receives the match of the nearest sample. An unreferenced
-    vertex of X receives the match of the nearest referenced vertex.
+    evenly spread samples. Vertices of X that are not samples receive the match of the nearest sample. An
+    unreferenced vertex of X receives the match of the nearest referenced vertex.
 
     **Arguments:**
 
@@ -45,19 +45,20 @@ def initial_map(
         - `"shot"`: nearest neighbours in SHOT descriptors, which distinguish left from right.
         - `"wks"`, `"hks"`, `"wavelet"`: nearest neighbours in the wave kernel signature, the heat kernel
           signature or the wavelet signature, which do not distinguish left from right.
-        - `"functional"`: the pointwise map that is computed from a functional map that preserves SHOT and
-          commutes with the Laplacian.
+        - `"functional"`: a pointwise map computed from a functional map that preserves SHOT and commutes with
+          the Laplacian.
         - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
         - m `SurfacePoints` on Y: a map to points on faces. Each point is replaced by the nearest corner of
           its face.
         - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The initial
-          map then consists of nearest neighbours in SHOT and in geodesic distances to the landmarks.
+          map is then computed by nearest-neighbour search in SHOT and in geodesic distances to the landmarks.
 
     **Returns:** The initial map as an integer array (m,), 0-based vertices of Y. With SHOT, the function
     issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
-    **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, indices out of
-    range, a spectrum of another mesh, or a mesh that is too coarse for SHOT. `ArithmeticError` if the
+    **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, or indices
+    that are out of range or belong to unreferenced vertices. Also `InputError` for a spectrum of another
+    mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if the
     functional map of `"functional"` cannot be computed.
     """
     if isinstance(init, SurfacePoints):
@@ -83,7 +84,7 @@ _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 
 
 def _features(sampled: SampledPair, init: str) -> _Features:
-    """Compute the features of both shapes for the nearest-neighbour search of a named initial map."""
+    """Compute the features of both shapes for the initial map of the given name."""
     if init == "shot":
         features = paired_shot(sampled)
     elif init in SIGNATURES:

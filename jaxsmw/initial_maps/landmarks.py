@@ -10,8 +10,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
 # The weight of distances to landmarks relative to SHOT descriptors, which are unit vectors. With this weight,
-# a difference of half the square root of the area in one distance is as large as the norm of a SHOT
-# descriptor. On pairs of real bodies, weights from 1 to 3 give nearly the same maps.
+# a distance of half the square root of the area is as large as the norm of a SHOT descriptor. On pairs of
+# real bodies, weights from 1 to 3 give nearly the same maps.
 _WEIGHT = 2.0
 # This finite value replaces the infinite distance between two connected components. The value is larger than
 # any distance within a component.
@@ -31,8 +31,9 @@ def landmark_features(
     **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex. The first 352
     columns are SHOT, and the other l columns are distances.
 
-    **Raises:** `InputError` if `landmarks` has another shape, gives two matches to one vertex of X, or
-    contains a number that is not a referenced vertex. Also `InputError` if a mesh is too coarse for SHOT.
+    **Raises:** `InputError` if `landmarks` does not have the shape (l, 2), or gives two matches to one vertex
+    of X. Also `InputError` if a number in `landmarks` is not a referenced vertex, or if a mesh is too coarse
+    for SHOT.
     """
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(

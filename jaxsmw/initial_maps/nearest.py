@@ -20,7 +20,7 @@ def nearest_map(
     **Arguments:**
 
     - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
-    - `features_x`, `features_y`: the features (a, d) and (b, d), with one row per compared vertex.
+    - `features_x`, `features_y`: the features of X (a, d) and of Y (b, d), with one row per compared vertex.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
     """

@@ -86,8 +86,8 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     - `path`: the file to create or to replace.
     - `pointwise_map`: the target vertex of each source vertex (m,), 0-based integers.
 
-    **Raises:** `InputError` if the array is not a list of vertices, the suffix is `.npz`, `.baryc_gt`, `.vts`
-    or `.json`, or the file cannot be written.
+    **Raises:** `InputError` if the array is not a list of non-negative integers, or the file cannot be
+    written. `InputError` is also raised for the suffixes `.npz`, `.baryc_gt`, `.vts` and `.json`.
     """
     check_map_name(path)
     targets = np.asarray(pointwise_map)
@@ -130,11 +130,11 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 
 
 class Table:
-    """The numbers of a file as a matrix, with one row per line of text or per row of a stored array.
+    """The numbers of a file as a matrix. Each line of text, or each row of a stored array, is one row.
 
-    Maps, landmarks and ground truth are all read through this class, so the same fault causes the same
-    message. In text files, spaces or tabs separate numbers. Commas are refused, because with a decimal comma,
-    the single number `3,5` would become the two vertices 3 and 5.
+    The readers of maps, landmarks and ground truth use this class, so the same fault causes the same message.
+    In text files, spaces or tabs separate numbers. Commas are refused, because `3,5` could be a number with a
+    decimal comma or the two vertices 3 and 5.
 
     **Arguments:**
 
@@ -232,11 +232,11 @@ class Table:
         return 1 if is_mat_file(self.path) else default
 
     def place(self, row: int) -> str:
-        """Return the file name and the line number of a row (0-based), as text for messages."""
+        """Return the file name and the line number of a row, as text for messages. `row` is 0-based."""
         return f"{self.path}, {'line' if self._is_text else 'row'} {row + 1}"
 
     def word(self, row: int, column: int) -> str:
-        """Return the text of a number in the file, for messages. Row and column are 0-based."""
+        """Return a number as it is written in the file, for messages. Row and column are 0-based."""
         return self._words[row][column][:40] if self._is_text else f"{self.values[row, column]:.15g}"
 
     def require_rows(self, mesh_x: Mesh) -> None:
@@ -247,9 +247,9 @@ class Table:
         m = len(mesh_x.vertices)
         if self.rows != m:
             raise InputError(
-                f"{self.path}: has {self.rows} {'lines' if self._is_text else 'rows'}, but one is "
-                f"needed for each of the {m} vertices of {mesh_x.name}: give the file for this pair, from "
-                "source to target."
+                f"{self.path}: has {self.rows} {'lines' if self._is_text else 'rows'}, but needs one "
+                f"for each of the {m} vertices of {mesh_x.name}: give the file for this pair, from source to "
+                "target."
             )
 
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
@@ -258,7 +258,6 @@ class Table:
         **Arguments:**
 
         - `column`: the 0-based position of the column.
-        - `mesh`: the mesh to which the vertices belong.
         - `base`: the index of the first vertex in the file, 0 or 1.
 
         **Raises:** `InputError` if a number is not a vertex of the mesh. The message names the first such
@@ -272,12 +271,12 @@ class Table:
         **Arguments:**
 
         - `column`: the 0-based position of the column.
-        - `count`: the number of existing elements, such as vertices or faces of a mesh.
-        - `what`: the name of these elements in messages, in the plural.
+        - `count`: the number of elements to which the indices refer, such as the vertices of a mesh.
+        - `what`: the plural name of these elements in messages, such as `vertices of Y`.
         - `base`: the index of the first element in the file, 0 or 1.
 
         **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
-        all numbers are valid for the other index base, the message recommends the other index base.
+        the other index base fits all numbers, the message recommends the other index base.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)

@@ -3,8 +3,8 @@
 MATLAB code for functional maps uses the following names. `T12` is the pointwise map from shape 1 to shape 2,
 with 1-based vertices. `C21` is the functional map that takes functions on shape 2 to functions on shape 1. A
 shape is a struct with the fields `surface`, `evals`, `evecs` and `A`. The field `surface` is a struct with
-the coordinates `X`, `Y` and `Z` and the faces `TRIV`. The field `A` contains the areas. In this library, X is
-shape 1 and Y is shape 2, so `T12` is T and `C21` is C.
+the coordinates `X`, `Y` and `Z` and the faces `TRIV`. The field `A` contains the vertex areas. In this
+library, X is shape 1 and Y is shape 2, so `T12` is T and `C21` is C.
 """
 
 from __future__ import annotations
@@ -33,15 +33,9 @@ def is_mat_file(path: str | os.PathLike[str]) -> bool:
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
-    """Parse the contents of a `.mat` file into a dictionary of its variables.
+    """Parse the contents of a `.mat` file into a dictionary from the names of variables to their values.
 
     Structs become dictionaries, and axes of length 1 are dropped.
-
-    **Arguments:**
-
-    - `data`: the contents of the file.
-
-    **Returns:** A dictionary from the names of the variables to their values.
 
     **Raises:** `InputError` if the contents are damaged, in format 7.3, or too large
     (`jaxsmw.io.mat_format.unpacked` documents the limit). The message does not name the file.
@@ -50,7 +44,7 @@ def parse_variables(data: bytes) -> dict[str, Any]:
         variables = scipy.io.loadmat(io.BytesIO(unpacked(data)), simplify_cells=True)
     except InputError:
         raise
-    except Exception:  # damaged files can raise any exception in SciPy
+    except Exception:  # SciPy can raise any exception for damaged files
         raise InputError(
             "is damaged or not a .mat file: save it again, with save(..., '-v7') in MATLAB or with "
             "scipy.io.savemat in Python."
@@ -60,8 +54,6 @@ def parse_variables(data: bytes) -> dict[str, Any]:
 
 def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the variables of a `.mat` file of any size; see `parse_variables`.
-
-    **Returns:** A dictionary from the names of the variables to their values.
 
     **Raises:** `InputError` if the file cannot be read or `parse_variables` refuses its contents. The message
     names the file.
@@ -113,9 +105,9 @@ def read_matrix(
 
     **Returns:** The matrix (rows, columns), float64.
 
-    **Raises:** `InputError` if the file cannot be read, if it contains no suitable matrix, or if it contains
-    several suitable matrices and none of them has the given name. The message names the file and the
-    variables.
+    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
+    raised if the file contains several suitable matrices, and none of these has the given name. The message
+    names the file and the variables.
     """
     variables = read_variables(path)
     matrices = {key: value for key, value in variables.items() if is_real(value)}

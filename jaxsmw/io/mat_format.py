@@ -1,9 +1,9 @@
-"""A check of the size of a `.mat` file's contents before SciPy reads them.
+"""Checks how much memory the contents of a `.mat` file take, before SciPy reads the file.
 
 A compressed variable can unpack to a thousand times its size. A cell array can declare a billion cells that
 the file does not contain. SciPy allocates memory for all unpacked bytes and for all declared cells. Therefore
-this module unpacks the variables itself, up to a limit, and adds up the sizes of all arrays, including nested
-arrays.
+this module unpacks the variables itself, up to a limit. It also adds up the sizes of all arrays, including
+nested arrays.
 
 The format is described in The MathWorks, "MAT-File Format", level 5.
 """
@@ -21,25 +21,21 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import largest_contents
 
 _MATRIX, _COMPRESSED = 14, 15
-# The number of bytes per number for each data type. Data types that are not listed have 1 byte per number.
+# The number of bytes per number for each data type. All other data types have 1 byte per number.
 _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18: 4}
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# SciPy takes at least 10 microseconds per array. In this time, SciPy can read a few KiB of numbers. Therefore
-# the size of every array is counted as at least this number of bytes.
+# Every array is counted as at least this number of bytes. SciPy takes at least 10 microseconds per array, and
+# could read a few KiB of numbers in this time.
 _LEAST_BYTES_OF_ARRAY = 4096
-# The largest accepted size in bytes of the list of a struct's field names: 64 bytes for each of 1000 fields.
-# The structs of shapes have about ten fields.
+# The largest accepted size of all field names of a struct, in bytes. The limit allows 1000 fields with names
+# of 64 bytes. The structs of shapes have about ten fields.
 _LONGEST_NAMES = 64 * 1000
 
 
 def unpacked(data: bytes) -> bytes:
     """Unpack all variables of a `.mat` file and check their sizes.
-
-    **Arguments:**
-
-    - `data`: the contents of the file.
 
     **Returns:** The contents of an equivalent file in which no variable is compressed.
 
@@ -79,7 +75,7 @@ def _inflated(data: bytes, order: str, limit: int) -> bytes:
     _, size = struct.unpack(f"{order}II", tag)
     if size > limit:
         raise _too_large()
-    # In `decompress`, a size of 0 would mean that there is no limit.
+    # `decompress` would treat a size of 0 as no limit.
     contents = stream.decompress(stream.unconsumed_tail, size) if size else b""
     if len(contents) < size:
         raise ValueError("a compressed variable ends early")

@@ -1,7 +1,7 @@
 """Readers of mesh files in the formats OFF, OBJ, PLY, STL and MAT, and writers of OFF and PLY files.
 
-This module does not use the readers of other libraries, because vertices must keep their order and a damaged
-file must cause one clear error message. The reader of libigl accepts indices out of range and aborts the
+Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this module
+does not use the readers of other libraries. The reader of libigl accepts indices out of range and aborts the
 process on some invalid headers. The reader of trimesh splits and drops vertices of OBJ files, and it cannot
 read binary PLY files whose polygons have different numbers of corners.
 """
@@ -44,9 +44,9 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.mat`: a file with a struct that has the coordinates X, Y and Z (or a matrix VERT) and the 1-based
           faces TRIV, such as `surface` in the TOSCA data set. The struct may be a field of another struct, as
           in the files of `write_spectrum`.
-    - `weld`: if True, faces use the lowest-numbered of all vertices at exactly the same position. The other
-        vertices stay in the mesh without faces, so no vertex is renumbered. Welding has
-        no effect on an STL file, whose corners are always merged.
+    - `weld`: if True, vertices at exactly the same position are merged. Faces then use only the
+        lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
+        renumbered. Welding has no effect on an STL file, whose corners are always merged.
 
     **Returns:**
 
@@ -57,8 +57,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     **Raises:**
 
     `InputError` if the file cannot be read, does not have the format of its suffix, ends early, or contains
-    data after the declared end. Also `InputError` if `make_mesh` refuses the mesh, for example because an
-    index is out of range, a position is not finite, or all faces are degenerate.
+    data after the declared end. `InputError` is also raised if `make_mesh` refuses the mesh, for example
+    because an index is out of range, a position is not finite, or all faces are degenerate.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -81,9 +81,10 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
 
 class _Polygons(NamedTuple):
-    """The polygons of a file: vertex positions, the list of the corners of all faces, and face sizes.
+    """The polygons of a file.
 
-    The size of a face is its number of corners.
+    `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
+    of each face.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -145,8 +146,8 @@ def _polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], I
     possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
     if not possible.all():
         raise InputError(
-            f"{_excerpt(lines[int(possible.argmin())])} is written where a face with its number of corners "
-            "should be, so the file is damaged or its header is wrong: export the mesh again."
+            f"{_excerpt(lines[int(possible.argmin())])} does not begin with the number of corners of a face, "
+            "so the file is damaged or its header is wrong: export the mesh again."
         )
     sizes = sizes.astype(np.int64)
     starts = np.cumsum(sizes) - sizes
@@ -201,7 +202,7 @@ def _parse_obj(data: bytes) -> _Polygons:
         raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
-    if (corners < 0).any():  # negative indices count backward from the last vertex before the face
+    if (corners < 0).any():  # a negative index counts backward from the last vertex above its face
         vertex_at = [match.start() for match in vertex.finditer(text)]
         face_at = [match.start() for match in face.finditer(text)]
         above = np.repeat(np.searchsorted(vertex_at, face_at), sizes)
@@ -216,8 +217,8 @@ def _parse_stl(data: bytes) -> _Polygons:
     """Parse an STL file, which is a list of separate triangles (https://www.fabbers.com/tech/STL_Format)."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
-    # Text files and some binary files begin with "solid", so the length of a file determines whether the file
-    # is binary.
+    # Both text files and some binary files begin with "solid". Therefore a file is treated as binary if its
+    # length fits its header.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
         corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
@@ -228,8 +229,9 @@ def _parse_stl(data: bytes) -> _Polygons:
         facets = len(re.findall(r"\bendfacet\b", text))
         if len(corners) != 3 * facets or "endsolid" not in text:
             raise InputError(
-                f"{count_of(facets, 'complete facet')} with {count_of(len(corners), 'corner')} in total are "
-                "not triangles, so the file is truncated or damaged: export the mesh again."
+                f"has {count_of(facets, 'complete facet')} and {count_of(len(corners), 'corner')}, but must "
+                "have three corners per facet and end with endsolid, so the file is truncated or damaged: "
+                "export the mesh again."
             )
     elif len(data) >= header:
         raise InputError(
@@ -266,7 +268,7 @@ class _Property(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """The numbers of one property in all rows, as one array, and the count of numbers in each row."""
+    """The values of a property in all rows, one row after another, and the number of values in each row."""
 
     values: np.ndarray
     sizes: np.ndarray
@@ -377,8 +379,8 @@ def _ply_table(
     if not count or not properties:
         return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
 
-    # If all lists of a property have the same length, as in most files, the table is one array of records,
-    # and NumPy reads all rows at once.
+    # In most files, all lists of a property have the same length. NumPy then reads all rows together, as one
+    # array of records.
     spans, _ = _ply_row(body, offset, properties)
     sizes = {name: size for name, (_, size) in zip(properties, spans, strict=True)}
     lengths = {name: f"length of {name}" for name, (_, length) in properties.items() if length}
@@ -407,10 +409,9 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """Return where the values of a row are stored, and the offset of the row's end.
+    """Return the span of each property in a row, and the offset of the row's end.
 
-    The returned list has one entry for each property of the row: the offset of the property's first value,
-    and the number of its values.
+    A span consists of the offset of the property's first value and the number of the property's values.
 
     **Raises:** `EOFError` if the body ends within the row.
     """

@@ -1,4 +1,4 @@
-"""Readers and writers of spectra and functional maps, and the conversion of spectra of other libraries.
+"""Readers and writers of spectra and functional maps, and a converter for spectra of other libraries.
 
 `docs/exchange.md` explains the conventions. This module recognises objects of other libraries by their
 attributes and does not import these libraries.
@@ -30,7 +30,7 @@ from jaxsmw.io.mat_files import (
 )
 from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
 
-# A shape of another library, and a dense or sparse mass matrix; see `make_spectrum`.
+# `make_spectrum` documents which objects these types contain.
 SpectrumLike: TypeAlias = Any
 MassMatrix: TypeAlias = Any
 
@@ -53,8 +53,8 @@ def make_spectrum(
 
     The arrays are checked and scaled to a surface of area 1. If the surface has area a, the eigenvalues are
     multiplied by a, the eigenvectors are multiplied by the square root of a, and the vertex areas are divided
-    by a. A functional map C between unscaled eigenbases on surfaces of areas a_X and a_Y becomes
-    the map sqrt(a_Y / a_X) C between the scaled eigenbases.
+    by a. If the unscaled surfaces X and Y have areas a_X and a_Y, multiply a pullback C by sqrt(a_Y / a_X) to
+    use it with the scaled spectra.
 
     **Arguments:**
 
@@ -68,12 +68,12 @@ def make_spectrum(
     - `name`: the name of the spectrum in messages.
 
     **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its float type is JAX's default
-    (float32 unless `jax_enable_x64` is set).
+    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
+    float type (float32 unless `jax_enable_x64` is set).
 
-    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. Also
-    `InputError` if the eigenvalues are negative or not ascending, a vertex area is negative, the eigenvectors
-    are not orthonormal, or an object of another library has no eigenbasis.
+    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. `InputError`
+    is also raised if the eigenvalues are negative or not ascending, a vertex area is negative, the
+    eigenvectors are not orthonormal, or an object of another library has no eigenbasis.
     """
     if eigenvectors is None and vertex_areas is None:
         eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
@@ -104,7 +104,7 @@ def make_spectrum(
         raise InputError(
             f"{name}: the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
             f"{deviation:.2g}): give the lumped mass matrix with which the eigenvectors were computed, in "
-            "the same unit."
+            "the same unit of length."
         )
     arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
     return Spectrum(*map(jax.device_put, arrays))
@@ -125,7 +125,7 @@ def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
 
 
 def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
-    """Return vertex areas as a list. If `areas` is a mass matrix, the vertex areas are the sums of its rows.
+    """Return vertex areas as a list. The vertex areas of a mass matrix are the sums of its rows.
 
     `shape` is the shape (n, k) of the eigenvectors.
     """
@@ -134,7 +134,8 @@ def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
         matrix = areas.to_sparse_coo().coalesce()
         areas = sp.coo_array((np.asarray(matrix.values()), np.asarray(matrix.indices())), shape=matrix.shape)
     if sp.issparse(areas) or np.ndim(areas) == 2:
-        # A sparse matrix in a malicious file can have so many rows that the row sums would fill the memory.
+        # A malicious file can contain a sparse matrix with so many rows that their sums would fill the
+        # memory.
         if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
             raise InputError(
                 f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
@@ -169,13 +170,13 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
 
     - `path`: the file.
         - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
-        - A `.mat` file contains one struct with the following fields, or the same fields as variables.
-          `evals` (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given
-          by `A`, the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
+        - A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
+          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given by `A`,
+          the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
 
     **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its float type is JAX's default
-    (float32 unless `jax_enable_x64` is set).
+    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
+    float type (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
     does not contain exactly one eigenbasis. The message names the file and the fault.
@@ -204,7 +205,7 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             arrays = [file[field] for field in fields]
     except InputError:
         raise
-    except Exception:  # damaged files can raise any exception in NumPy
+    except Exception:  # NumPy can raise any exception for damaged files
         raise InputError(
             f"{path}: is damaged or lacks one of {', '.join(fields)}: write the spectrum again."
         ) from None
@@ -226,12 +227,13 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
 
     - `evals` (k) and `evecs` (n, k) are the eigenvalues and eigenvectors.
     - `A` (n, n) is the lumped mass matrix, as a sparse matrix.
-    - `area` is the total area, `sqrt_area` its square root, and `nv` the number of vertices.
+    - `area` is the total area, `sqrt_area` is the square root of the total area, and `nv` is the number of
+      vertices.
     - If a mesh is given, `nf` is the number of faces. `surface` is a struct with the coordinates `X`, `Y` and
       `Z` and the 1-based faces `TRIV`. The coordinates are scaled to the area of the spectrum (usually 1), so
       all fields describe the same surface.
 
-    Numbers are written in double precision. To compute the spectrum in double precision as well, use
+    Numbers are written in double precision. To compute the spectrum in double precision, use
     `jax.enable_x64`.
 
     **Arguments:**
@@ -306,8 +308,9 @@ def read_functional_map(
     **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. k_X and k_Y are at
     most the numbers of eigenvectors of the spectra.
 
-    **Raises:** `InputError` if the file cannot be read, contains no suitable matrix, or contains a matrix
-    that is too large for the spectra or not finite. The message names the file and the fault.
+    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
+    raised if the matrix is too large for the spectra, or has entries that are not finite. The message names
+    the file and the fault.
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
@@ -335,7 +338,7 @@ def write_functional_map(
 
     - `path`: the file to create or to replace, with the suffix `.mat`.
     - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. The
-        eigenbases belong to surfaces of area 1, as in the spectra of this library.
+        eigenbases must belong to surfaces of area 1, as the spectra of this library do.
 
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.

@@ -11,12 +11,11 @@ _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 def is_number(word: str, *, finite: bool = True) -> bool:
     """Return whether a word is a decimal number in the usual notation, such as `-1.5e3`.
 
-    Python's `float` also accepts words with underscores (`1_0`) and words with digits of other scripts. In
-    data files such words are errors, so this function refuses them.
+    Unlike Python's `float`, this function refuses words with underscores (`1_0`) and words with digits of
+    other scripts.
 
     **Arguments:**
 
-    - `word`: a word without spaces.
     - `finite`: if False, `nan` and `inf` are also accepted. The caller must then check for such values.
     """
     return bool(_NUMBER.fullmatch(word)) or (not finite and bool(_NOT_FINITE.fullmatch(word)))

@@ -42,8 +42,6 @@ def alternative_initial_maps(
 ) -> Iterator[Int64[np.ndarray, " m"]]:
     """Yield alternative initial maps, which are computed one by one.
 
-    If one initial map of a pair exchanges limbs, another initial map often does not.
-
     The first alternative initial maps come from functional maps. A nearest-neighbour search in SHOT from X to
     Y gives one functional map, and a search from Y to X gives another functional map. The weighted mean of
     both functional maps is filtered as in the MWP paper and converted to a pointwise map.
@@ -52,8 +50,8 @@ def alternative_initial_maps(
     For two full shapes with descriptors (`describe`), further maps come from pairings of the extremities of X
     with the extremities of Y. The pairings are selected by the distances between extremities. For each
     pairing, a nearest-neighbour search in SHOT and in distances to the extremities gives a map. A feature
-    regression with few eigenvectors refines this map. Among the refined maps that differ from each other, the
-    maps with the best scores are yielded.
+    regression with few eigenvectors refines this map. Of the refined maps, the best-scoring maps that differ
+    from each other are yielded.
 
     **Arguments:**
 
@@ -90,10 +88,10 @@ def _in_both_directions(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
 ) -> Int64[np.ndarray, " m"]:
-    """Compute the pointwise map that follows from the weighted mean of two functional maps.
+    """Compute the pointwise map from the weighted mean of two functional maps.
 
-    One functional map comes from a nearest-neighbour search in feature space from X to Y, the other from a
-    search from Y to X. `weight` is the weight of the second functional map.
+    A nearest-neighbour search in feature space from X to Y gives one functional map. A search from Y to X
+    gives the other functional map, whose weight is `weight`.
     """
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
@@ -153,8 +151,8 @@ def _by_extremities(
 class _CoarseRefinement:
     """A function that computes maps by nearest-neighbour search and refines them by a feature regression.
 
-    The feature regression is coarse, which suffices to determine the match of each limb. The feature
-    regression begins with few eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
+    A coarse feature regression suffices to determine the match of each limb. The feature regression begins
+    with few eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
     """
 
     def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
@@ -179,7 +177,7 @@ class _CoarseRefinement:
         )
 
     def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
-        """Return the outcome of the feature regression, which may have failed, with distortion None."""
+        """Run the feature regression and return its outcome, whose distortion is None."""
         nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
         padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
         first = jax.device_put(padded.astype(np.int32))

@@ -22,9 +22,8 @@ def expected_error(
     """Estimate the geodesic error of every match without ground truth.
 
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
-    first quantity is the detour of a vertex, which is the distance between the vertex and the vertex to which
-    the reverse map takes its match. The second quantity is the mean change in length of the edges at a
-    vertex.
+    first quantity is the detour: the distance between a vertex and the vertex to which the reverse map takes
+    its match. The second quantity is the mean change in length of the edges at a vertex.
 
     Where limbs look swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows
     with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices by

@@ -81,11 +81,10 @@ def extremities(
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
     """Return pairings of the extremities of two bodies, the most plausible pairing first.
 
-    A pairing assigns a different extremity of the other body to each extremity of the body with fewer
-    extremities. The remaining extremities of the other body are unpaired. A pairing is plausible if the
-    distances between extremities, and the remoteness of extremities, are similar on both bodies. The cost of
-    a pairing is the sum of the squared differences of distances and of remoteness. The cost does not
-    distinguish left from right.
+    A pairing matches each extremity of the body with fewer extremities to a different extremity of the other
+    body. A pairing is plausible if the distances between extremities, and the remoteness of extremities, are
+    similar on both bodies. The cost of a pairing is the sum of the squared differences of distances and of
+    remoteness. The cost does not distinguish left from right.
 
     **Arguments:**
 
@@ -93,8 +92,7 @@ def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int6
     - `number`: the largest number of pairings to return.
 
     **Returns:** A list of arrays (l, 2), where l is the number of extremities of the body with fewer
-    extremities. Each row contains the index of an extremity of X and the index of the extremity of Y that is
-    paired with it.
+    extremities. Each row pairs the index of an extremity of X with the index of an extremity of Y.
     """
     fewer, more = (x, y) if len(x.vertices) <= len(y.vertices) else (y, x)
     partners = np.array(list(permutations(range(len(more.vertices)), len(fewer.vertices))))

@@ -49,12 +49,12 @@ def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncerta
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
     The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty comes from the
-    last stage whose refiner computes an uncertainty. If there is no such stage, the uncertainty is taken to
-    be zero.
+    last stage whose refiner computes an uncertainty. If no refiner computes an uncertainty, the uncertainty
+    is zero.
 
     **Arguments:**
 
-    - `outcome`: the outcome. If its distortion was not computed, a distortion of 1 is used.
+    - `outcome`: the outcome. If the outcome's distortion is None, 1 is used instead.
     - `uncertainty_weight`: the weight of the uncertainty; see `RepairSettings`.
 
     **Returns:** The score, without unit. The score is infinite if a stage failed.
@@ -97,11 +97,11 @@ class Judge:
         return score(outcome, self.settings.uncertainty_weight)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
-        """Return those faults of an outcome that repair can remove. Each is a mask of vertices of X (m,).
+        """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
 
-        One fault consists of the vertices with orientation reversal. The other fault consists of the vertices
-        in discontinuous parts. A fault is not returned if its share of X's area is at most `negligible_area`
-        or at least `excessive_area` in the settings.
+        The two possible faults are the vertices with orientation reversal and the vertices in discontinuous
+        parts. A fault is not returned if its share of X's area is at most `negligible_area` or at least
+        `excessive_area` in the settings.
         """
         mesh_x, found, scores = self.pair.mesh_x, self._matches(outcome), self.settings.scores
         both = (
@@ -113,10 +113,10 @@ class Judge:
         return [fault for fault in both if low < areas[fault].sum() < high]
 
     def looks_right(self, outcome: Outcome) -> bool:
-        """Return whether the map of a judged outcome looks right, so it needs no further repair.
+        """Return whether the map of a judged outcome looks right.
 
-        A map looks right if its outcome is not suspicious. The map of a suspicious outcome also looks right
-        if its distortion is below `doubtful` in the settings and it has no faults.
+        A map looks right if its outcome is not suspicious. A map without faults also looks right if its
+        distortion is below `doubtful` in the settings.
         """
         assert outcome.distortion is not None
         slightly_distorted = outcome.distortion < self.settings.doubtful

@@ -39,19 +39,18 @@ def refine_in_stages(
     position `repair.stage` is called the repeated stage.
 
     1. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
-       with a fault in the previous map have no weight. If there are both kinds of faults, rounds that leave
-       out the vertices with orientation reversal alternate with rounds that leave out the discontinuous
-       parts.
-    2. Fallback: the repeated stage, with the numbers of eigenvectors in `fallback_levels`, and all later
-       stages run once more, from the best outcome of the rounds. The map of the fallback is kept if its score
-       is better. The map is also kept if it looks right and its score is worse by less than
-       `score_tolerance`. Otherwise the previous map is kept.
-    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to the repeated
-       stage, which then runs again in up to `rough_rounds` rounds. Up to `finalists` of these outcomes, those
-       with the best scores, are refined by all stages and repaired. Among the outcomes that look right, the
-       outcome with the best score is returned. If no outcome looks right, but at least `agreeing` initial
-       maps lead to the same map, this map is returned. If fewer initial maps agree, the outcome with the best
-       score is returned.
+       with a fault in the previous map have weight zero. If a map has both orientation reversal and
+       discontinuous parts, successive rounds leave out these two faults alternately.
+    2. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
+       The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
+       is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
+       worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
+    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to and
+       including the repeated stage. The repeated stage then runs again in up to `rough_rounds` rounds. The
+       best-scoring outcomes that differ from each other, at most `finalists`, are refined by all later stages
+       and repaired. Among the outcomes that look right, the outcome with the best score is returned. If no
+       outcome looks right, but at least `agreeing` initial maps lead to the same map, this map is returned.
+       If fewer initial maps agree, the outcome with the best score is returned.
 
     **Arguments:**
 
@@ -111,7 +110,7 @@ class _Runner:
     def run(self, first: int, before: Outcome, last: int | None = None) -> Outcome:
         """Run the stages from position `first` up to, but not including, position `last`.
 
-        **Returns:** The outcome `before`, extended by the refinements of these stages.
+        **Returns:** The outcome `before`, extended by the refinements of the stages that ran.
         """
         for view, stage in self.steps[first:last]:
             if not before.successful:
@@ -142,7 +141,7 @@ class _Repairer:
     settings: RepairSettings
 
     def begun(self, first: Int[Array, " m"]) -> Outcome:
-        """Run all stages up to and including the repeated stage. The returned outcome is not yet judged."""
+        """Run all stages up to and including the repeated stage, without judging the outcome."""
         return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
 
     def finished(self, outcome: Outcome) -> Outcome:
@@ -168,7 +167,7 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Return the best outcome among a suspicious outcome and those from alternative initial maps."""
+        """Return the best of a suspicious outcome and the outcomes from alternative initial maps."""
         rough = self._rough_outcomes(alternatives)
         # The search does not stop at the first map that looks right, because a later map may be better.
         finished, tried = [best], [best, *rough]
@@ -190,9 +189,10 @@ class _Repairer:
         return best
 
     def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
-        """Refine alternative initial maps up to the repeated stage, and repair them in a few rounds.
+        """Refine alternative initial maps up to the repeated stage, and repair them in up to `rough_rounds`
+        rounds.
 
-        **Returns:** The successful outcomes, with the best score first.
+        **Returns:** The successful outcomes, ordered by score, best first.
         """
         rough: list[Outcome] = []
         for number, first in enumerate(alternatives, 2):
@@ -205,8 +205,8 @@ class _Repairer:
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
         """Run rounds of repair and return the best outcome.
 
-        In each round, the vertices with one kind of fault in the previous map have no weight. If `finish` is
-        True, each round also runs all stages after the repeated stage.
+        In each round, the vertices with one fault of the previous map have weight zero. If `finish` is True,
+        each round also runs all stages after the repeated stage.
         """
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)
@@ -224,7 +224,7 @@ class _Repairer:
     def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
         """Run `stage` instead of the repeated stage, starting from the final map of an outcome.
 
-        The returned outcome is not yet judged.
+        The method does not judge the returned outcome.
         """
         (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
         found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))

@@ -26,10 +26,10 @@ def dirichlet_energy_ratio(
 ) -> float:
     """Return the Dirichlet energy of the matched positions, divided by the energy of X's own positions.
 
-    Both energies are computed in the span of X's eigenvectors. The restriction to this span removes the
-    scatter of single matches, which grows with the density of the mesh. Between poses of one body, the ratio
-    of the true map is about 1, even if the triangulations differ. Between non-isometric shapes, the ratio of
-    the true map is up to 1.1. Discontinuous maps have larger ratios.
+    Both energies are computed in the span of X's eigenvectors. The span of the eigenvectors excludes the
+    scatter of single matches, which grows with the density of the mesh. For true maps between poses of one
+    body, the ratio is about 1, even if the triangulations differ. For true maps between non-isometric shapes,
+    the ratio is up to 1.1. Discontinuous maps have larger ratios.
 
     **Arguments:**
 
@@ -70,10 +70,10 @@ def distortion(
     """Return the distortion of a map, which is 1 for isometries and larger for worse maps.
 
     The distortion is the `dirichlet_energy_ratio` times `1 + orientation_weight * share`, where `share` is
-    the share of X's area with `orientation_reversal`. Without this factor, a map that mirrors the body would
-    have a smaller distortion than a map with swapped legs. For two full shapes, an energy ratio below 1 is
-    replaced by its inverse. The ratio of a partial pair is not inverted, because large parts of the full
-    shape have no match.
+    the share of X's area with `orientation_reversal`. Without the factor for orientation reversal, a map that
+    mirrors the body would have a smaller distortion than a map with swapped legs. For two full shapes, an
+    energy ratio below 1 is replaced by its inverse. The ratio of a partial pair is not inverted, because
+    large parts of the full shape have no match.
 
     Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
     1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
@@ -102,8 +102,7 @@ def discontinuous_parts(
 
     An edge is discontinuous if its ends have matches that are far apart (`ScoreSettings` contains the
     thresholds). After the removal of discontinuous edges, X consists of one or more connected components. All
-    components except the component of largest area are discontinuous parts. An example of a discontinuous
-    part is a swapped limb.
+    components except the component of largest area are discontinuous parts.
 
     **Arguments:**
 
@@ -131,8 +130,8 @@ def orientation_reversal(
     """Find the vertices of X around which the map exchanges left and right, as on swapped limbs.
 
     The matches of the three corners of a triangle of X form a triangle on Y. The area of the triangle on Y is
-    taken as negative if its orientation is opposite to the orientation of Y's surface. The density of this
-    signed area on X is smoothed in the span of X's first eigenvectors and compared with a threshold.
+    taken as negative if the triangle is oriented opposite to Y's surface. The density of this signed area on
+    X is smoothed in the span of X's first eigenvectors and compared with a threshold.
 
     **Arguments:**
 

@@ -14,11 +14,12 @@ class ScoreSettings:
     **Attributes:**
 
     - `vertices_per_eigenvector`: the smallest number of vertices per eigenvector in the computation of
-      Dirichlet energies. With more eigenvectors, the energies on a coarse mesh would depend on the distances
-      between vertices.
+      Dirichlet energies. With more eigenvectors, the energies on a coarse mesh would depend on the mesh
+      resolution.
     - `discontinuity_distance`, `discontinuity_ratio`: an edge is discontinuous if the matches of its ends are
-      at least `discontinuity_distance` apart and at least `discontinuity_ratio` times as far apart as the
-      ends. (On bodies of 5000 vertices, the matches of neighbouring vertices are 0.03 apart.)
+      at least `discontinuity_distance` apart. The distance between the matches must also be at least
+      `discontinuity_ratio` times the length of the edge. (On bodies of 5000 vertices, the matches of
+      neighbouring vertices are 0.03 apart.)
     - `orientation_eigenvectors`: the number of eigenvectors in whose span the density of signed area is
       smoothed.
     - `orientation_threshold`: a map reverses the orientation where the smoothed density of signed area is
@@ -51,10 +52,10 @@ class ExpectedErrorSettings:
       between a vertex and the vertex to which the reverse map takes its match.
     - `distortion_weight`: the weight of the mean change in length of the edges at a vertex. With the default
       values of both weights, the true errors on real pairs are 0.8 to 1.4 times the expected errors.
-    - `misplaced_weight`: the expected error on a limb that looks swapped, in units of the square root of the
-      limb's area.
-    - `heat_time`: the time of the heat flow that averages over neighbours. The default value averages over a
-      disk of radius 0.06.
+    - `misplaced_weight`: the increase of the expected error on a limb that looks swapped, in units of the
+      square root of the limb's area.
+    - `heat_time`: the time of the heat flow that averages over neighbouring vertices. The default value
+      averages over a disk of radius 0.06.
     """
 
     detour_weight: float = 0.5
@@ -71,8 +72,8 @@ class ExtremitySettings:
 
     - `samples`: the number of evenly spread samples from which mean distances to the surface are computed.
     - `distance`: the smallest allowed distance between two extremities.
-    - `most`: the largest number of extremities. The limit exists because the number of pairings grows very
-      fast with the number of extremities.
+    - `most`: the largest number of extremities. The number of pairings grows very fast with the number of
+      extremities.
     """
 
     samples: int = 200
@@ -87,22 +88,22 @@ class RepairSettings:
     The settings are passed as `Preset(stages, repair=RepairSettings(...))` and take effect in `jaxsmw.match`.
     A map is judged by its distortion, which is 1 for isometries and larger for worse maps, and by its faults.
     The faults are vertices with orientation reversal, and parts that discontinuities separate from the rest
-    of X. The tables and entries with numbers R1, R2, … are in `docs/research_log.md`.
+    of X. Tables and entries R1, R2, … are in `docs/research_log.md`.
 
     **Attributes:**
 
-    - `stage`: the 0-based position, among the stages of the preset, of the stage that repair repeats. The
+    - `stage`: the 0-based position, in the stages of the preset, of the stage that repair repeats. The
       refiner of this stage must have levels.
     - `fallback_levels` (entry R4): the numbers of eigenvectors in the iterations of the fallback. The
       fallback is one further repetition of the stage after the rounds. By default, the fallback begins with
       fewer eigenvectors than the stage.
     - `suspicious` (Table R3): a map whose distortion is at least this value, a number above 1, is suspicious
-      and is repaired. Correct maps between poses of one body have a smaller distortion.
+      and is repaired. Correct maps between poses of one body have a distortion below this value.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value, which should be at least `suspicious`. Between non-isometric shapes, some correct maps have
       distortions up to this value.
     - `negligible_area`: a fault with at most this share of X's area, from 0 to 1, is not repaired. Small
-      faults, as at fingertips, appear and disappear by chance.
+      faults, such as at fingertips, appear and disappear by chance.
     - `excessive_area`: a fault with at least this share of X's area, from 0 to 1, is not repaired. If most of
       a body is mapped upside down, the rest of the map does not suffice to find the correct map.
     - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
@@ -111,8 +112,7 @@ class RepairSettings:
       for alternative initial maps run the repeated stage but no later stages.
     - `finalists`: the largest number of alternative initial maps that are refined by all stages, at least 0.
     - `agreeing` (entry R7): if no map looks right, but at least this number of initial maps lead to the same
-      map, that map is chosen. (Two wrong maps are sometimes the same, but three wrong maps are seldom the
-      same.)
+      map, that map is chosen. (Two wrong maps sometimes agree, but three wrong maps seldom agree.)
     - `uncertainty_weight` (Table R13): the weight of the feature regression's uncertainty in the score,
       relative to the logarithm of the distortion; at least 0. Upside-down maps have a higher uncertainty than
       correct maps, and mirrored maps have a higher distortion. Weights from 6 to 12 lead to nearly the same
@@ -124,12 +124,12 @@ class RepairSettings:
       pair contains a tuple of SHOT radii and a weight w from 0 to 1. The radii are positive integers, in
       units of 0.06 times the square root of the area. Nearest neighbours of X's vertices on Y give one
       functional map, with weight 1 - w. Nearest neighbours of Y's vertices on X give another functional map,
-      with weight w. The initial map is computed from the weighted mean.
+      with weight w. The initial map is computed from the weighted mean of both functional maps.
     - `alternative_eigenvectors`: the number of eigenvectors of the functional maps in `alternatives`.
     - `extremity_levels`: the levels (numbers of eigenvectors) of the feature regression that refines maps
       from pairings of extremities (entry R14).
-    - `extremity_descriptors`, `extremity_samples`: the number of descriptors and the number of samples of
-      this feature regression (entry R14).
+    - `extremity_descriptors`, `extremity_samples`: the number of descriptors and the number of samples of the
+      feature regression with `extremity_levels` (entry R14).
     - `extremity_pairings`: the largest number of pairings of extremities that are tried.
     - `extremity_maps`: the largest number of alternative initial maps that come from pairings of extremities.
     - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.

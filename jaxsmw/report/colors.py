@@ -14,8 +14,7 @@ from jaxsmw.geometry.mesh import Mesh
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
 
-The value is the largest error threshold that evaluations report. By default, all figures and pages use this
-scale, so their colours are comparable.
+All figures and pages use this scale by default, so their colours are comparable.
 """
 
 # Björn Ottosson, "A perceptual color space for image processing", 2020. The first matrix converts OKLab to
@@ -36,8 +35,7 @@ _CONES_TO_RGB = np.array(
 )
 
 # The colours of errors in OKLab, from paper white for no error to dark plum for large errors. Lightness
-# decreases monotonically, which keeps the order visible to colour-blind readers and in black-and-white
-# prints.
+# decreases monotonically, so the order is visible to colour-blind readers and in black-and-white prints.
 _ERROR_SCALE = np.array(
     [
         [0.95, 0.00, 0.015],
@@ -49,8 +47,8 @@ _ERROR_SCALE = np.array(
 )
 
 # The colours of signed values in OKLab, from blue for the most negative value to red for the most positive
-# value. Both ends have the same lightness, so neither sign stands out. Zero is paper white in the scale for
-# light backgrounds (False) and dark in the scale for dark backgrounds (True).
+# value. Both ends have the same lightness, so neither sign stands out. The keys of the dictionary say whether
+# the background is dark. Zero is paper white on light backgrounds, and dark on dark backgrounds.
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -93,10 +91,10 @@ def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray,
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
 
-    The right side of the body is green, and the left side is red. Along the longer of the two other axes,
-    height and length, the hue changes from yellow to blue. Along the shorter axis only the lightness changes,
-    because differences in lightness are hard to see under shading. Each limb of people and animals
-    therefore has its own hue, and swapped limbs are obvious.
+    The right side of the body is green, and the left side is red. The hue changes from yellow to blue along
+    the height or the length of the body, whichever is larger. Along the smaller of height and length, only
+    the lightness changes. Each limb of people and animals therefore has its own hue, and swapped limbs are
+    obvious.
 
     Along each axis, the colour depends on the vertex's relative position in the bounding box and on its
     relative rank among all vertices. Without the rank, the trunk of a slender body would be uniformly grey.
@@ -104,14 +102,14 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     **Arguments:**
 
     - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices: x runs across the body, y
-      points up and z forward.
+      points up and z points forward.
 
     **Returns:** sRGB colours (n, 3) in [0, 1].
     """
     used = mesh.vertices[mesh.referenced_vertices]
     low, high = used.min(axis=0), used.max(axis=0)
-    # Coordinates are rounded to this grid. Otherwise, the ranks of vertices on a flat mesh would depend on
-    # rounding errors, which would make the colours noisy.
+    # Coordinates are rounded to this grid. Without the grid, the ranks of vertices on a flat mesh would
+    # depend on rounding errors, and the colours would be noisy.
     grid = 1e-6 * np.max(high - low)
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):

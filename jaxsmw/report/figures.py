@@ -33,7 +33,8 @@ _DPI = 200
 # The largest height and width of a body, in pixels.
 _BODY_SIZE = (800, 800)
 _LONGEST_NAME = 36
-# The height of one line of a legend in inches, and the width of the error scale at the right edge in pixels.
+# `_LEGEND_LINE` is the height of one line of a legend, in inches. `_SCALE_WIDTH` is the width of the margin
+# for the error scale, in pixels.
 _LEGEND_LINE, _SCALE_WIDTH = 0.24, 190
 _INK, _FAINT = "#1d2430", "#79818c"
 # Okabe and Ito's colours, which colour-blind readers can tell apart. The lines also differ in style, because
@@ -232,7 +233,7 @@ def draw_quality_curves(
     - `curves`: a dictionary from the name of each map to its curve, which is a pair of thresholds (p,) and
       shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order. The shares are numbers
       in [0, 1].
-    - `mean_errors`: a dictionary from the names of maps to their mean errors, which the legend shows. The
+    - `mean_errors`: a dictionary from the name of a map to its mean error, which the legend shows. The
       dictionary need not contain all maps.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -365,13 +366,13 @@ def draw_forest(
     """A forest plot with one or several panels.
 
     Each panel shows estimates with their intervals, and a vertical line at zero. The scale is linear near
-    zero and logarithmic elsewhere, which makes both small and large estimates visible.
+    zero and logarithmic elsewhere, so small and large estimates are both visible.
 
     **Arguments:**
 
-    - `panels`: a dictionary from the title of each panel to its series. The series are a dictionary from
-      names to arrays (rows, 3). Each row of an array contains an estimate and the lower and upper end of its
-      interval, or NaN for a missing estimate. The names of the series are the same in all panels.
+    - `panels`: a nested dictionary. `panels[title][name]` is an array (rows, 3) for each title of a panel and
+      each name of a series. Each row of an array contains an estimate and the lower and upper end of its
+      interval, or NaN for a missing estimate. All panels have the same series.
     - `rows`: the names of the rows, from top to bottom.
     - `xlabel`: the name of the estimated quantity.
     - `linear_up_to`: the absolute value of an estimate above which the scale is logarithmic.
@@ -444,7 +445,7 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure of tables of positive numbers, whose cells are coloured by their numbers.
+    """A figure of tables of positive numbers. The colour of each cell represents its number.
 
     Each cell also contains its number as text. All tables have the same logarithmic colour scale.
 
@@ -453,7 +454,7 @@ def draw_heat_maps(
     - `panels`: a dictionary from the title of each table to its numbers (rows, columns).
     - `rows`: the name of the parameter that varies from row to row, and its value in each row.
     - `columns`: the name of the parameter that varies from column to column, and its value in each column.
-    - `label`: the name of the quantity that the numbers measure.
+    - `label`: the label of the colour scale, such as the name of the quantity in the tables.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -502,10 +503,7 @@ def draw_heat_maps(
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
     """Writes a figure as PNG, PDF or SVG. The file is written completely or not at all.
 
-    **Arguments:**
-
-    - `path`: the file, whose suffix (`.png`, `.pdf` or `.svg`) determines the format.
-    - `figure`: the figure.
+    The suffix of the file (`.png`, `.pdf` or `.svg`) determines the format.
 
     **Raises:** `InputError` for any other suffix, if the file cannot be written, or if matplotlib is missing.
     """
@@ -518,7 +516,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Checks that matplotlib is installed. Call this function before a long computation.
+    """Checks that matplotlib is installed.
 
     **Raises:** `InputError` if matplotlib is missing.
     """
@@ -531,7 +529,7 @@ def check_drawable() -> None:
 
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
-    """Checks that `save_figure` can write a file. Call this function before a long computation.
+    """Checks that `save_figure` can write a file.
 
     **Raises:** `InputError` if the suffix of the file is not `.png`, `.pdf` or `.svg`, if the file cannot be
     written, or if matplotlib is missing.
@@ -542,7 +540,7 @@ def check_figure_path(path: str | os.PathLike[str]) -> None:
     check_writable(path)
 
 
-# Dates are left out of the files, because equal figures must give equal files.
+# The files contain no dates, because equal figures must give equal files.
 _METADATA: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 
 
@@ -555,9 +553,9 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draws the bodies next to each other at the same scale, with the role and the name above each body.
+    """Draws the bodies next to each other at the same scale. Above each body are its role and its name.
 
-    The pictures that `render` returns are not rescaled. `right_margin` is in pixels.
+    The figure shows the pictures of `render` without rescaling. `right_margin` is in pixels.
     """
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]

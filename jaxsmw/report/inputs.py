@@ -1,4 +1,4 @@
-"""Checks of the maps, errors and functional maps that figures and pages show."""
+"""Checks the maps, errors and functional maps that figures and pages show."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ from jaxsmw.geometry.mesh import Mesh
 def check_map(
     mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int[np.ndarray | Array, " m"]
 ) -> Int64[np.ndarray, " m"]:
-    """Checks a pointwise map, and returns it as a NumPy array.
+    """Checks a pointwise map, and returns the map as an int64 array (m,).
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-
-    **Returns:** The map (m,) as int64.
 
     **Raises:** `InputError` if the map does not have one vertex of Y for every vertex of X.
     """
@@ -48,7 +46,6 @@ def check_errors(
 
     **Arguments:**
 
-    - `mesh_x`: the source, with m vertices.
     - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains a
       non-negative error for each vertex of X, or NaN where the error is unknown.
 
@@ -69,7 +66,7 @@ def check_errors(
 
 
 def check_error_limit(limit: float) -> None:
-    """Checks the error at which the colour scale of errors ends.
+    """Checks the upper end of the colour scale of errors.
 
     **Raises:** `InputError` if the limit is not positive or not finite.
     """

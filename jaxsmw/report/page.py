@@ -38,7 +38,7 @@ from jaxsmw.report.rendering import ELEVATION, choose_azimuth
 from jaxsmw.report.standing import stand_pair
 from jaxsmw.runtime.files import atomic_write
 
-# On narrow screens, bodies that are wider than this multiple of their height are shown one above the other.
+# If the bodies are wider than this multiple of their height, narrow screens show one body above the other.
 _WIDE = 0.65
 
 _EXPLANATIONS = {
@@ -125,22 +125,22 @@ def write_page(
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
-    - `spectra`: the spectra of X and Y; None (the default) for a page without wavelets. The page contains at
-      most `jaxsmw.report.page_data.eigenvectors_on_page` eigenvectors of each shape, rounded to one byte per
-      number (`jaxsmw.report.page_data.encode_rounded`).
+    - `spectra`: the spectra of X and Y; None (the default) for a page without wavelets.
+      `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page. Each entry
+      of an eigenvector is rounded to one byte (`jaxsmw.report.page_data.encode_rounded`).
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
     - `statistics`: a dictionary from labels to values as text, which the page shows below the bodies.
-    - `error_meanings`: a dictionary from the names in `ShownMap.errors` to sentences that explain these
-      errors on the page.
+    - `error_meanings`: a dictionary from each name in `ShownMap.errors` to a sentence that explains this kind
+      of error on the page.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
     - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
-    **Raises:** `InputError` if there is no map, if the maps, errors or spectra do not fit the meshes, if a
-    functional map is not a matrix of finite numbers, if the limit is not positive, if `up` is not an axis, or
-    if the file cannot be written.
+    **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
+    `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
+    positive, `up` is not an axis, or the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one map.")
@@ -221,7 +221,7 @@ def _add_wavelets(
 
 
 def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
-    """A dictionary from the name of each colouring mode of the viewer to its label on the page."""
+    """A dictionary from the name of each mode of the viewer to the label of the mode on the page."""
     modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
     if has_spectra:
         modes["wavelets"] = "Wavelets"

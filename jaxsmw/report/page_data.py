@@ -16,8 +16,9 @@ from jaxsmw.pair import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map
 
-# The largest and the smallest number of eigenvectors per shape on a page, and the largest number of entries
-# of all eigenvectors of both shapes. Each entry takes one byte before it is encoded in base64.
+# A page contains between `_FEWEST` and `_EIGENVECTORS` eigenvectors per shape, or no eigenvectors. The
+# eigenvectors of both shapes together have at most `_VALUES` entries, which take one byte each before
+# encoding in base64.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 
 COLOR_SCALES = {
@@ -27,12 +28,12 @@ COLOR_SCALES = {
 }
 """A dictionary from the name of each colour scale to its sRGB colours (n, 3) in [0, 1], evenly spaced.
 
-The middle colour of each of the two signed scales belongs to the value zero.
+In both signed scales, the middle colour belongs to the value zero.
 """
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
-    """The number of eigenvectors of each shape that a page of two meshes contains.
+    """The number of eigenvectors per shape on a page that shows two meshes.
 
     The number is 100, as in the MWP paper, for meshes with at most 60 000 vertices in total. Above 60 000
     vertices the number decreases, and above 300 000 vertices it is 0.
@@ -46,9 +47,8 @@ def spectra_on_page(
 ) -> tuple[Spectrum, Spectrum] | None:
     """The spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    If the two spectra have different numbers of eigenvectors, as for a partial pair, eigenpairs are also
-    removed whose eigenvalues are above the smaller of the two largest eigenvalues
-    (`jaxsmw.pair.common_range`).
+    If the two spectra have different numbers of eigenvectors, as for a partial pair, they are also truncated
+    to their common range of eigenvalues (`jaxsmw.pair.common_range`).
 
     **Arguments:**
 
@@ -104,10 +104,10 @@ def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
     """Rounds the numbers of a matrix to one byte each, and encodes them in base64.
 
     Each row has its own unit. The code c represents the number sign(c) c² times this unit, so small numbers
-    have smaller rounding errors than large numbers. Small numbers matter: an eigenvector that is large on a
-    limb is small on the rest of the body, where evenly spaced levels would cause visible errors of wavelets.
-    On people and animals, the root mean square of the rounding errors of wavelets is 0.005 times the length
-    of the colour scale.
+    have smaller rounding errors than large numbers. An eigenvector that is large on a limb is small on the
+    rest of the body. Evenly spaced levels would therefore cause visible errors of wavelets there. On people
+    and animals, rounding changes the wavelets by 0.005 times the length of the colour scale (root mean
+    square).
 
     **Arguments:**
 

@@ -17,25 +17,25 @@ _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
 """The angle at which the viewer looks down on the body, in radians."""
 
-# For each light, the direction to the light in camera coordinates (right, up, towards the viewer) and the
-# strength of the light.
+# The first three numbers of each light are its direction in camera coordinates (right, up, towards the
+# viewer). The last number is the strength of the light.
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# The number of samples per pixel in each direction, and the approximate number of samples that are tested
-# against faces at a time.
+# `_SUPERSAMPLING` is the number of samples per pixel in each direction. About `_CHUNK` samples at a time are
+# tested against faces.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
 
 def choose_azimuth(meshes: Sequence[Mesh]) -> float:
-    """The azimuth of a view that shows all meshes well.
+    """The azimuth from which a common camera shows all meshes well.
 
-    The best direction of view is the horizontal direction in which the bodies are thin. People are then seen
-    from the front, and animals from the side. Directions close to a preferred direction r are favoured, where
-    r is a view from the front and a little from the side. The chosen direction is the eigenvector of
-    M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the sum of the
-    meshes' horizontal covariance matrices, each scaled to trace 1.
+    The best direction of view is the horizontal direction in which the bodies are thin. This direction shows
+    people from the front and animals from the side. Directions close to a preferred direction r are favoured.
+    The direction r shows a body from the front and a little from the side. The chosen direction is the
+    eigenvector of M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the
+    sum of the meshes' horizontal covariance matrices, each scaled to trace 1.
 
     **Arguments:**
 
@@ -107,7 +107,7 @@ def render(
     sides = positions[corners[:, 1:]] - positions[corners[:, :1]]
     flat = np.cross(sides[:, 0], sides[:, 1])
     # Where the normals of the corners cancel out, the normal of the face is used. If the back of a face is
-    # visible, its normal is reversed, because the back is lit like the front.
+    # visible, the normal is reversed, because lights illuminate both sides of a face equally.
     normal = np.where(np.any(normal, axis=1, keepdims=True), normal, flat) * np.where(flat[:, 2:] < 0, -1, 1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -134,7 +134,8 @@ def _rasterize(
     columns: int,
     rows: int,
 ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """The frontmost face at each sample (-1 if there is none), its barycentric weights, and its depth.
+    """For each sample: the frontmost face (-1 if there is none), the barycentric weights in this face, and
+    the depth.
 
     Each face is tested against all samples in its bounding box. One chunk of faces is processed at a time.
     """

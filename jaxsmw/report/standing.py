@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
 
 import igl
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.choices import Axis
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh
 
-# For each axis, the rotation that makes this axis of a file point up. Forward is +z in y-up files and -y in
-# z-up files, and x runs across the body in both. After the rotation, bodies of both kinds of files face the
-# same way.
+# For each axis, the rotation that makes this axis of a file point up. In files with y up, bodies face +z. In
+# files with z up, bodies face -y. After the rotation, bodies of both kinds of files face +z.
 _STAND = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -33,9 +31,9 @@ _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # files, the spread along z is at least 0.47 times the spread along y, except for two animals that leap or
 # crouch.
 _SLENDER = 0.45
-# For each usual axis, the amount by which the score of another axis must exceed the score of the usual axis.
-# If people stand on one foot with raised arms, an upside-down axis has a score that is up to 0.18 higher than
-# the score of the correct axis. If bodies sit or leap, a wrong axis has a score that is up to 0.09 higher.
+# If y or z is the usual axis, the score of another axis must be higher by at least this amount. For people
+# who stand on one foot with raised arms, the score of an upside-down axis is up to 0.18 higher than that of
+# the correct axis. For bodies that sit or leap, the score of a wrong axis is up to 0.09 higher.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, because larger or smaller values carry no information. The range is in
@@ -45,8 +43,9 @@ _STABILITY_RANGE = (-0.2, 0.1)
 # body's height.
 _CONTACT = 0.1
 _DIRECTIONS = 32
-# The side length of the grid cells in which vertices are merged, and the length up to which limbs are ignored
-# as noise. Both are in units of the square root of the area. A body has about 1500 cells.
+# `_CELL` is the side length of the grid cells in which vertices are merged. A body has about 1500 cells.
+# Limbs up to the length `_SHORTEST_LIMB` are ignored as noise. Both lengths are in units of the square root
+# of the area.
 _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
 # A shape is treated as partial if its area is between these multiples of the area of the other shape.
@@ -56,8 +55,8 @@ _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     """The mesh turned upright and scaled to area 1, with its bounding box centred on the origin.
 
-    Faces are reoriented where needed, so adjacent faces have consistent orientations. Vertices keep their
-    indices.
+    Faces are reoriented where needed, so adjacent faces have consistent orientations. Vertices are not
+    renumbered.
 
     **Arguments:**
 
@@ -75,8 +74,8 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
         )
     if up is None:
         up = guess_up(mesh)
-    elif up not in _STAND:
-        raise InputError(f"up={up!r} is not an axis; choose one of {', '.join(get_args(Axis))}.")
+    else:
+        check_choice(up, Axis, "an axis")
     vertices = mesh.vertices @ np.array(_STAND[up], dtype=float).T / np.sqrt(mesh.area)
     used = vertices[mesh.referenced_vertices]
     faces, _ = igl.bfs_orient(mesh.faces)
@@ -116,14 +115,14 @@ def guess_up(mesh: Mesh) -> Axis:
     """Guesses which axis of the file points up, from the limbs on which the body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
-    axis (`_hanging_limbs`), because usually legs and arms hang down, and only the head points up. The second
-    term measures how stably the body would stand (`_stability`). The usual axis is y for a body that is
-    slender along y, such as a person, and z otherwise. The usual axis is returned if no other axis has a
-    clearly higher score.
+    axis (`_hanging_limbs`). Legs and arms usually hang down, and only the head points up. The second term
+    measures how stably the body would stand (`_stability`). The usual axis is y for a body that is slender
+    along y, such as a person. For other bodies, the usual axis is z. The usual axis is returned unless the
+    score of another axis is clearly higher.
 
-    By visual inspection, the guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies, 30 of 32 SMAL
-    animals, 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16 topology. The guess can be wrong for a
-    body that leaps, crouches, lies down or is cut in half.
+    The guess was checked by eye. The guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies and 30 of
+    32 SMAL animals. The guess is also right for 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16
+    topology. The guess can be wrong for a body that leaps, crouches, lies down or is cut in half.
 
     **Arguments:**
 
@@ -147,8 +146,8 @@ def guess_up(mesh: Mesh) -> Axis:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """A coarse copy of the mesh: one point per grid cell, at the mean of the cell's vertices, and the edges
-    between cells.
+    """A coarse copy of the mesh. Each grid cell has one point, at the mean of its vertices, and edges join
+    cells.
     """
     used = mesh.vertices[mesh.referenced_vertices]
     keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
@@ -167,8 +166,8 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
     A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
     lower. The length of a limb is the persistence of its component in the sublevel sets of the height
     (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that
-    contains the lowest point of the body is left out. Therefore the sum includes three limbs of a standing
-    quadruped, and no limb of a quadruped on its back.
+    contains the lowest point of the body is left out. The sum therefore includes three legs of a standing
+    quadruped, but no leg of a quadruped that lies on its back.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 

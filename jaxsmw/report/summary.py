@@ -1,4 +1,4 @@
-"""Reports with pictures, numbers and interactive pages, about one match or about several maps of a pair."""
+"""Writes reports of one match, and pages that compare several maps of a pair."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ def write_report(
 ) -> list[Path]:
     """Writes pictures of a match, an interactive page and a summary to a directory.
 
-    The report contains the expected error (`Correspondence.expected_error`) and, if given, measured errors.
+    The report contains the expected error (`Correspondence.expected_error`), and the measured errors if
+    given.
 
     **Arguments:**
 
@@ -202,9 +203,9 @@ def _save_figures(
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
-    """The refiner and the number of eigenvectors of the last stage that preserves wavelets.
+    """The refiner and the number of eigenvectors of the last stage with a `WaveletPreservation` refiner.
 
-    The result is None if no stage preserves wavelets.
+    The result is None if there is no stage with such a refiner.
     """
     for stage in reversed(correspondence.preset.stages):
         if isinstance(stage.refiner, WaveletPreservation):
@@ -235,8 +236,8 @@ def write_comparison(
     - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
       vertices of Y. The page lists the maps in the order of the dictionary.
     - `errors`: a dictionary from the same names to a `GeodesicError`. The page shows these errors as colours.
-      The page also contains a table of the mean errors and further statistics of all maps, and the
-      correspondence quality curves.
+      The page also contains the correspondence quality curves, and a table of statistics such as the mean
+      errors.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
@@ -297,7 +298,7 @@ def _encoded(
     spectrum_y: Spectrum,
     convention: Convention = "pullback",
 ) -> Float[np.ndarray, "k_out k_in"]:
-    """The functional map of a pointwise map, in the precision of the spectra."""
+    """The functional map of a pointwise map, with the float type of the spectra."""
     with jax.enable_x64(spectrum_x.eigenvectors.dtype == np.float64):
         encoded = compiled(encode)(
             jax.device_put(pointwise_map), spectrum_x, spectrum_y, convention=convention
@@ -310,7 +311,7 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
-    """A dictionary from the label of each statistic of a map to its value; empty if no errors are given."""
+    """A dictionary from the label of each error statistic to its value as text; empty without errors."""
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -324,7 +325,6 @@ def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
 
     **Arguments:**
 
-    - `bank`: the filter bank.
     - `eigenvalues`: the eigenvalues of a shape (k,), ascending. The figure marks these eigenvalues and ends
       at the last eigenvalue.
 
@@ -396,17 +396,17 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """A dictionary of the package versions, the machine and the device on which results depend."""
+    """A dictionary of the facts on which results depend: package versions, machine and device."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
 def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """A dictionary with the errors of the m source vertices, named as on the page; empty without errors."""
+    """A dictionary from the label `Error` to the errors of the m source vertices; empty without errors."""
     return {} if error is None else {"Error": _per_vertex(error, m)}
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """The mean of the errors of each of the m source vertices; NaN for a vertex without errors."""
+    """The mean error of each of the m source vertices; NaN for a vertex without errors."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

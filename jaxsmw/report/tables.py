@@ -1,4 +1,4 @@
-"""The results of a benchmark for publication: tables, quality curves and a Parquet file."""
+"""Writes the results of a benchmark as tables, quality curves and a Parquet file."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ class MethodSummary(NamedTuple):
 
     - `mean`, `median`: the mean and the median of the errors of all pairs. The error of a pair is its mean
       geodesic error, in thousandths of the square root of the target's area.
-    - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. On each pair, the error of
-      `REFERENCE` is subtracted from the error of this method. `difference` is the mean of these differences
-      over all pairs, with its confidence interval, in the unit of `mean`; NaN for `REFERENCE` itself.
+    - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. For each pair, the error of
+      the method `REFERENCE` is subtracted from the error of this method. `difference` is the mean of these
+      differences over all pairs, with its confidence interval, in the unit of `mean`. `difference` is NaN for
+      `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
-    - `area_under_curve`: the area under the correspondence quality curve, at most 1; the mean over all pairs.
-    - `coverage`: the coverage of the target, in [0, 1]; the mean over all pairs.
+    - `area_under_curve`: the mean area under the correspondence quality curves of all pairs, at most 1.
+    - `coverage`: the mean share of a target's area that belongs to matched vertices, in [0, 1].
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
     - `pipeline_seconds`: the median time in seconds from the meshes to the result, which includes the
       precomputation of both shapes.
@@ -96,7 +97,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Returns a dictionary from each pair (source, target) to its mean error; failures are left out.
+    """Returns a dictionary from each pair (source, target) to its mean error, without failed pairs.
 
     The errors are in the unit of `MethodSummary.mean`.
     """
@@ -120,7 +121,7 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
-    """Returns the time that the precomputation of both shapes of a pair takes, in seconds."""
+    """Returns the precomputation time of both shapes of a pair, in seconds."""
     sides = {row["source"], row["target"]}
     return sum(
         float(shapes[side][column])
@@ -147,10 +148,7 @@ _COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
 
 
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a Markdown table with one row for each method.
-
-    `summaries` is a dictionary from the name of each method to its summary.
-    """
+    """Returns a Markdown table with one row for each method in `summaries`."""
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
     return markdown([header, *rows])
@@ -167,10 +165,9 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a LaTeX table with one row for each method.
+    """Returns a LaTeX table with one row for each method in `summaries`.
 
-    `summaries` is a dictionary from the name of each method to its summary. The horizontal lines of the table
-    need the LaTeX package booktabs. The smallest mean error is in bold.
+    The horizontal lines of the table need the LaTeX package booktabs. The smallest mean error is in bold.
     """
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
@@ -191,9 +188,6 @@ def write_tables(
     **Arguments:**
 
     - `directory`: an existing directory. Existing files of the same names are replaced.
-    - `data_set`: the data set on which the methods were measured.
-    - `results`: the results of the benchmark.
-    - `settings`: the settings of the benchmark.
     - `methods`: a dictionary from names to methods, which must contain every method in `results`.
 
     **Returns:** A dictionary from the name of each method to its summary.

@@ -1,4 +1,4 @@
-"""Export of two meshes with a common texture as OBJ files, for other 3D programs."""
+"""Exports two meshes with a common texture as OBJ files, for other 3D programs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
 """The files that `write_textured_pair` writes."""
 
 _MATERIAL = "newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd texture.png\n"
-# The side length of the square picture in pixels, and the number of checkerboard squares along a side.
+# Each side of the square picture has `_PIXELS` pixels and `_SQUARES` checkerboard squares.
 _PIXELS, _SQUARES = 1024, 32
 
 
@@ -35,7 +35,7 @@ def write_textured_pair(
     - `directory`: an existing directory, to which `TEXTURE_FILES` are written. Existing files with these
       names are replaced, each completely or not at all.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: a point on Y for every vertex of X (m points), for example `Correspondence.surface_points()`.
+    - `points`: m points on Y, the matches of the vertices of X, such as `Correspondence.surface_points()`.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -58,7 +58,7 @@ def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # The signs of singular vectors are arbitrary. Here, the component with the largest absolute value is made
+    # The sign of a singular vector is arbitrary. Here, its component of largest absolute value becomes
     # positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)

@@ -53,7 +53,7 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
     sizes = {spectrum.eigenvalues.shape[0] for spectrum in spectra}
     if len(sizes) > 1:
         raise ValueError(
-            f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them to one number first"
+            f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them to the same number"
         )
     largest = max(spectrum.mask.shape[0] for spectrum in spectra)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(spectrum.pad(largest) for spectrum in spectra))
@@ -81,9 +81,8 @@ def refine_pairs(
     processes (`jax.distributed`), call this function with the same arguments in each process. The function
     uses the devices of all processes, and every process receives all results.
 
-    For each pair, the refinement agrees with the result of `refine` up to rounding errors, because sums over
-    padded arrays and batched products are rounded differently. Functional maps agree to the precision of the
-    float type. A match can differ only if two vertices of Y are equally far away to this precision.
+    The results agree with those of `refine` up to rounding errors. Functional maps agree to the precision of
+    the float type. A match can differ only if two vertices of Y are equally far away to this precision.
 
     **Arguments:**
 
@@ -96,10 +95,9 @@ def refine_pairs(
     - `iterations`: the number of iterations, an integer of at least 1.
     - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
       number s must be the same for all shapes. With None, all iterations use all vertices.
-    - `partial`: whether one shape of each pair is a part of the other. If True, both shapes must have the
-      same unit of length.
-    - `stop_when_unchanged`: whether to skip the remaining iterations of a pair once none of its matches
-      changes.
+    - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
+      True, both shapes must have the same unit of length.
+    - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
     - `history`: whether to record a `History` of each pair.
     - `batch_size`: the number of pairs that each device refines at the same time. The default on CPUs is 1,
       because larger batches save no time there and need more memory. The default on other devices is as many
@@ -109,13 +107,14 @@ def refine_pairs(
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
 
     **Returns:** An iterator over tuples of two elements: the index of a pair in `pairs`, and the `Refinement`
-    of this pair. Pairs of equal size follow each other. Numerical failures raise no error, so compare the
-    `result` of each refinement with `RESULTS.successful`.
+    of this pair. The iterator groups the pairs by their padded sizes, so their order differs from the order
+    in `pairs`. Numerical failures raise no error, so compare the `result` of each refinement with
+    `RESULTS.successful`.
 
-    **Raises:** `ValueError` if there is not one initial map per pair, there are not samples for every shape,
-    a pair refers to a shape that does not exist, an initial map does not contain one integer per vertex of X,
-    a shape is not a `Spectrum`, or `batch_size` is below 1. The errors of `refine` are raised while the
-    iterator runs.
+    **Raises:** `ValueError` if the length of `pointwise_maps` differs from that of `pairs`, or the length of
+    `samples` differs from that of `spectra`. `ValueError` is also raised if a pair refers to a shape that
+    does not exist, an initial map does not contain one integer per vertex of X, a shape is not a `Spectrum`,
+    or `batch_size` is below 1. The errors of `refine` are raised while the iterator runs.
     """
     _check_pairs(spectra, pairs, pointwise_maps, samples)
     if batch_size is not None and batch_size < 1:
@@ -158,10 +157,7 @@ def _check_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     samples: Sequence[Int[Array, " _"]] | None,
 ) -> None:
-    """Checks the arguments of `refine_pairs`.
-
-    **Raises:** `ValueError` in the cases that the docstring of `refine_pairs` lists, except for `batch_size`.
-    """
+    """Raises `ValueError` if an argument of `refine_pairs`, other than `batch_size`, is not valid."""
     if len(pairs) != len(pointwise_maps):
         raise ValueError(
             f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
@@ -174,7 +170,7 @@ def _check_pairs(
     for position, spectrum in enumerate(spectra):
         if not isinstance(spectrum, Spectrum):
             raise ValueError(
-                f"shape {position} is a {type(spectrum).__name__}, but a Spectrum is needed: compute it by "
+                f"shape {position} is a {type(spectrum).__name__}, but a Spectrum is needed: compute it with "
                 "compute_spectrum"
             )
     for position, (pair, pointwise_map) in enumerate(zip(pairs, pointwise_maps, strict=True)):
@@ -214,14 +210,14 @@ class _Sizes(NamedTuple):
     k_y: int
 
     def bytes_per_pair(self, itemsize: int) -> int:
-        """Returns the result of the function `bytes_per_pair` for these sizes."""
+        """Returns the memory of one pair of these sizes; see the function `bytes_per_pair`."""
         return bytes_per_pair(self.m, self.n, max(self.k_x, self.k_y), itemsize)
 
 
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Returns the indices of all pairs in `pairs`, grouped by the sizes of the pairs."""
+    """Returns a dictionary from sizes to the indices of all pairs in `pairs` with these sizes."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
@@ -299,7 +295,7 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
     """Returns the default number of pairs that a device refines at the same time.
 
-    The number is 1 on CPUs. On other devices, it is the number of pairs that fit into the memory, at most 64.
+    The number is 1 on CPUs. On other devices, as many pairs as fit into the memory are refined, at most 64.
     """
     if _one_at_a_time(device):
         return 1
@@ -310,7 +306,7 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    """Returns whether to refine pairs one after another, as on CPUs.
+    """Returns whether a device should refine pairs one after another.
 
     On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
     """
@@ -320,7 +316,7 @@ def _one_at_a_time(device: jax.Device) -> bool:
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
     """Returns the approximate memory that `refine` uses on a device for one pair, in bytes.
 
-    This memory includes the spectra of the pair. It grows linearly with m and n.
+    The memory includes the spectra of the pair, and grows linearly with m and n.
 
     **Arguments:**
 

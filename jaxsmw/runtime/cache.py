@@ -24,7 +24,7 @@ import platformdirs
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
-# Every key is a hash that includes this number. Increment the number when a change of the code changes
+# Every key is a hash that includes this number. Increment this number when a change of the code changes the
 # results for the same inputs.
 _FORMAT = 4
 
@@ -44,7 +44,7 @@ def cached(
     directory. An empty name or `off` disables the cache. The environment variable `JAXSMW_CACHE_LIMIT` limits
     the size of the cache in GiB, by default to 4. Above this limit, the least recently used entries are
     removed. If an entry is damaged, its result is computed again. If an entry cannot be written, the function
-    warns and returns the result.
+    issues a warning and returns the result.
 
     **Arguments:**
 
@@ -52,7 +52,7 @@ def cached(
     - `inputs`: all values on which the result depends, in a fixed order.
     - `compute`: a function without arguments, which returns the result as a dictionary from names to arrays.
 
-    **Returns:** The dictionary that `compute` returned, in this call or in an earlier call, bit for bit.
+    **Returns:** The result of `compute`. A result from the disk is identical, bit for bit.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -104,7 +104,7 @@ def cache_compiled_programs() -> None:
     The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
     environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
     variables, the function changes none of them. Each type of processor has its own directory, because JAX
-    does not distinguish processors, and machines with different processors may share the disk.
+    does not distinguish processors. Machines with different processors can therefore share the disk.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -158,7 +158,7 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
-        # The header contains the number of bytes that follow, so different lists of inputs give different
+        # The header determines the number of bytes that follow, so different lists of inputs give different
         # bytes.
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
@@ -166,7 +166,7 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
 
 
 def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
-    """Return the arrays of an entry, or None if the entry is missing, damaged, or does not match its name."""
+    """Return the arrays of an entry, or None if the entry is missing, is damaged or has another key."""
     # Reading a damaged file can raise any exception. The result is then computed again.
     with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
@@ -179,10 +179,7 @@ def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:
-    """Remove the least recently used files of the cache until the remaining files fit the limit.
-
-    The limit is in bytes.
-    """
+    """Remove the least recently used files until the files of the cache take at most `limit` bytes."""
     files = []
     for entry in os.scandir(directory):
         with suppress(FileNotFoundError):  # another process may also remove files

@@ -20,8 +20,8 @@ _OPTIONS: dict[str, str | bool] = {
     "xla_disable_hlo_passes": "tree_reduction_rewriter",
 }
 # Linux limits the number of memory maps of a process. Compiled programs are released when the process uses
-# more than this share of the limit. A pair of shapes of new sizes adds programs that use up to 3 % of the
-# limit and up to 250 MB of memory.
+# more than this share of the limit. The programs for a pair with new sizes use up to 3 % of the limit, and up
+# to 250 MB of memory.
 _LARGEST_SHARE = 0.25
 
 
@@ -29,11 +29,10 @@ def compiler_options() -> dict[str, str | bool]:
     """Returns options of `jax.jit` that make nearest-neighbour searches fast on CPUs.
 
     Pass the result to `jax.jit` as `compiler_options`. By default, XLA uses the library YNNPACK for products
-    and sums on CPUs. Waking the threads of this library takes longer than a small operation. The options
-    disable YNNPACK, which reduces the time of a search in patches by 28 to 37 %. By default, XLA also splits
-    each long sum into several loops to reduce rounding errors. The options disable this splitting, so
-    compilation takes 30 % less time (docs/speed.md). Sums of a million numbers are still accurate to within
-    5e-6.
+    and sums on CPUs. Waking the threads of YNNPACK takes longer than a small operation. The options disable
+    YNNPACK, which reduces the time of a search in patches by 28 to 37 %. By default, XLA also splits each
+    long sum into several loops to reduce rounding errors. The options disable this splitting, so compilation
+    takes 30 % less time (docs/speed.md). Sums of a million numbers are still accurate to within 5e-6.
 
     JAX accepts these options only in the outermost `jax.jit`. Other compiled functions may call
     `jaxsmw.refine`, so `jaxsmw.refine` does not set the options itself. The options depend on the default
@@ -86,13 +85,14 @@ def compile_ahead(
 
     **Arguments:**
 
-    - `function`: the function to compile.
-    - `arguments`: a function without arguments that returns arrays of the given sizes. Its result is a tuple
-      of positional arguments and a mapping of named arguments. JAX only traces this function.
+    - `arguments`: a function without arguments that returns arrays of the given sizes. The function returns a
+      tuple of positional arguments and a mapping of named arguments. JAX traces this function without
+      computing the arrays.
     - `settings`: the remaining keyword arguments of the function.
 
-    **Returns:** A future that is done when the program is compiled. If the arguments contain an error, the
-    exception is stored in this future, and a later call of `compiled(function)` raises it again.
+    **Returns:** A future that is done when the program is compiled. If compilation raises an exception, the
+    future stores the exception. A later call of `compiled(function)` with the same arguments raises the
+    exception again.
     """
     program: Any = compiled(function)  # the annotations of Equinox do not declare `lower`
     x64 = jax.config.read("jax_enable_x64")
@@ -117,9 +117,9 @@ def release_programs() -> None:
 
     Commands call this function between pairs. Library functions must not call it, because `jax.clear_caches`
     also clears the programs of the caller. On Linux, the programs for a few dozen pairs of different sizes
-    would use up all memory maps of the process, and LLVM would then end the process. Released programs are
-    compiled again when they are needed, or are loaded from the disk if JAX has stored them there. On other
-    systems the function does nothing.
+    would use up all memory maps of the process. LLVM would then end the process. JAX compiles released
+    programs again when they are needed, or loads them from the disk. On other systems the function does
+    nothing.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

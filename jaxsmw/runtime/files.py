@@ -14,21 +14,20 @@ from jaxsmw.errors import InputError
 LARGEST_FILE = 2**30
 """The size of the largest file that is read as a whole, in bytes (1 GiB).
 
-A text file of 1 GiB describes a mesh of ten million vertices. Parsing it needs up to 15 GiB of memory.
+A text file of 1 GiB describes a mesh of ten million vertices. Parsing such a file needs up to 15 GiB of
+memory.
 """
 
 
 def largest_contents(size_of_file: int) -> int:
     """Return the largest plausible size of the unpacked contents of a compressed file, in bytes.
 
-    A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to
-    1 GiB are always accepted, because a mesh of ten million vertices has this size. Only files of
-    eigenvectors have larger contents. Compression hardly reduces the size of eigenvectors, so larger
-    contents are accepted if they have at most four times the size of the compressed file.
+    A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to 1
+    GiB are always accepted, because a mesh of ten million vertices has this size. Only files of eigenvectors
+    have larger contents. Compression hardly reduces the size of eigenvectors, so contents above 1 GiB may be
+    at most four times as large as the compressed file.
 
-    **Arguments:**
-
-    - `size_of_file`: the size of the compressed file, in bytes.
+    `size_of_file` is the size of the compressed file, in bytes.
     """
     return max(2**30, 4 * size_of_file)
 
@@ -67,7 +66,7 @@ def size_of_file(path: str | os.PathLike[str]) -> int:
         status = os.stat(path)
     except FileNotFoundError:
         raise InputError(f"{path}: does not exist: check the path.") from None
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+    except (OSError, ValueError) as error:  # `ValueError` if the name contains a null character
         raise _unreadable(path, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a regular file: give the path of a file.")
@@ -87,18 +86,15 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     because writers such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link,
     the target of the link is replaced.
 
-    **Arguments:**
-
-    - `path`: the file to create or to replace.
-
     **Returns:**
 
     A context manager that yields the temporary `Path`. The temporary file exists and is empty.
 
     **Raises:**
 
-    `InputError` is raised before the block starts if the directory or the name makes writing impossible.
-    `InputError` is also raised if the block raises an `OSError`, for example because the disk is full.
+    `InputError` is raised before the block starts if the directory does not exist, the name is not valid, or
+    permissions forbid writing. `InputError` is also raised if the block raises an `OSError`, for example
+    because the disk is full.
     """
     target = _target(path)
     temporary = _temporary(target)
@@ -111,8 +107,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
-        # After success, the temporary file was moved to `path`. If the directory does not exist, the
-        # temporary file was never created.
+        # The temporary file does not exist if it was moved to `path`, or if the directory does not exist.
         if os.path.lexists(temporary):
             temporary.unlink()
         _unfinished.discard(temporary)
@@ -125,7 +120,8 @@ _unfinished: set[Path] = set()
 def remove_unfinished() -> None:
     """Remove the temporary files of all open blocks of `atomic_write`.
 
-    A signal handler that ends the process calls this function, because `finally` clauses do not run then.
+    A signal handler calls this function before it ends the process, because `finally` clauses do not run
+    then.
     """
     for temporary in _unfinished.copy():
         with suppress(OSError):
@@ -135,17 +131,15 @@ def remove_unfinished() -> None:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that `atomic_write` can write a file, without leaving a new file behind.
 
-    Call this function before a long computation.
-
     **Raises:**
 
-    `InputError` if the directory does not exist, the name is impossible, or permissions forbid writing.
+    `InputError` if the directory does not exist, the name is not valid, or permissions forbid writing.
     """
     target = _target(path)
     temporary = _temporary(target)
     try:
         _check_target(path, target)
-        # A check of the permissions is not conclusive, because some file systems refuse all new files.
+        # A check of the permissions is not sufficient, because some file systems refuse all new files.
         temporary.touch(exist_ok=False)
         temporary.unlink()
     except OSError as error:
@@ -156,7 +150,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
     """Return a path with all symbolic links resolved."""
     try:
         return Path(os.path.realpath(path))
-    except ValueError as error:  # a null character in the name
+    except ValueError as error:  # the name contains a null character
         raise _unwritable(path, error) from error
 
 
@@ -202,8 +196,6 @@ def _reason(error: OSError | ValueError) -> str:
 def check_directory(path: str | os.PathLike[str]) -> None:
     """Check that `make_directory` can succeed, without leaving a new directory behind.
 
-    Call this function before a long computation.
-
     **Raises:**
 
     `InputError` if the directory cannot be created, or if no file can be written to the directory.
@@ -218,18 +210,16 @@ def check_directory(path: str | os.PathLike[str]) -> None:
 
 
 def make_directory(path: str | os.PathLike[str]) -> Path:
-    """Create a directory and its parents, unless they exist.
-
-    **Returns:** The path of the directory.
+    """Create a directory and its parents, unless they exist, and return the path of the directory.
 
     **Raises:** `InputError` if the directory cannot be created, or if no file can be written to the
     directory.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+    except (OSError, ValueError) as error:  # `ValueError` if the name contains a null character
         raise InputError(
-            f"{path}: cannot be made a directory ({_reason(error)}): choose another path."
+            f"{path}: cannot be created as a directory ({_reason(error)}): choose another path."
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Common sizes for shapes, so that one compiled program serves shapes of similar sizes."""
+"""Pads shapes to a few common sizes. One compiled program then serves all shapes of similar sizes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from jaxtyping import Shaped
 from jaxsmw.core.search import BLOCK
 
 # A padded size is a multiple of `power / _SUBDIVISION`, where `power` is the largest power of two below the
-# number of vertices. It is also a multiple of the block size of the search. For padded sizes of at least
-# 1024, at most 1/8 of the vertices are padding. All shapes with 4000 to 16 000 vertices together have only 17
+# number of vertices. Every padded size is also a multiple of the block size of the search. If the padded size
+# is at least 1024, at most 1/8 of its vertices are padding. Shapes with 4000 to 16 000 vertices have only 17
 # different padded sizes.
 _SUBDIVISION = 8
 

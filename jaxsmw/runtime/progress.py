@@ -12,9 +12,9 @@ logger = logging.getLogger("jaxsmw")
 
 @contextmanager
 def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Logs the name of a step, and stores the wall time of the block in `seconds[name]`.
+    """Logs the name of a step, and stores the wall time of the block in `seconds[name]`, in seconds.
 
-    The time is in seconds. If the block raises an exception, no time is stored.
+    If the block raises an exception, no time is stored.
     """
     logger.info("%s ...", name)
     start = time.perf_counter()

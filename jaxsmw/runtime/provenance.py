@@ -17,7 +17,7 @@ _LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
-    """Return a dictionary from names to versions, of Python and of the packages on which results depend."""
+    """Return a dictionary from names to versions, for Python and the packages on which results depend."""
     return {
         **{package: metadata.version(package) for package in _PACKAGES},
         "python": platform.python_version(),
@@ -36,9 +36,9 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """Return the git commit of the library's checkout, followed by `-dirty` if files have changed since.
+    """Return the git commit of the library. The suffix `-dirty` marks uncommitted changes.
 
-    If the library is not in a git checkout, or if git is missing, return the installed version.
+    If there is no git checkout or git is missing, return the installed version.
     """
     call = ["git", "-C", str(_LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:
@@ -53,9 +53,9 @@ def made_with() -> str:
 
 
 def measured_code() -> list[Path]:
-    """Return the Python files of the library on which results depend.
+    """Return the library's Python files, except those of the command line and of the report.
 
-    These are all files except those of the command line and of the report.
+    The results of computations depend on these files.
     """
     left_out = ("report", "cli", "__main__.py")
     return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]
@@ -64,8 +64,7 @@ def measured_code() -> list[Path]:
 def code_digest(paths: Iterable[Path]) -> str:
     """Return a hash of the code in Python files, as 16 hexadecimal digits.
 
-    Comments, docstrings and layout do not affect the hash. The names and the order of the files affect the
-    hash.
+    The hash depends on the names and the order of the files, but not on comments, docstrings or layout.
     """
     digest = hashlib.sha256()
     for path in paths:

@@ -19,7 +19,7 @@ def one_blas_thread() -> AbstractContextManager[object]:
     """Returns a context in which the linear algebra of NumPy and SciPy uses one thread.
 
     On CPUs the limit also applies to XLA, which uses the LAPACK of SciPy. On small arrays, more threads save
-    no time, and the threads of OpenBLAS keep their cores busy while they wait for the next matrix.
+    no time. The threads of OpenBLAS also keep their cores busy while they wait for the next matrix.
     """
     return _libraries().limit(limits=1, user_api="blas")
 
@@ -35,8 +35,8 @@ def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[R
 
     If the function raises an exception in a thread, `side_by_side` raises this exception.
     """
-    # One context of `one_blas_thread` encloses both threads. If each thread had its own context, the first
-    # thread to end would also remove the limit for the other thread.
+    # One context of `one_blas_thread` encloses both threads. With one context per thread, the first thread to
+    # end would also remove the limit for the other thread.
     with one_blas_thread(), ThreadPoolExecutor(2) as executor:
         futures = [executor.submit(copy_context().run, compute, side) for side in (x, y)]
         result_x, result_y = (future.result() for future in futures)

@@ -20,7 +20,7 @@ await build({
   charset: "ascii",
   legalComments: "none",
   // Every page contains a copy of three.js, so it must also contain the licence of three.js.
-  // A test compares the digest with the digest of viewer.js.
+  // tests/test_page.py compares this digest with the digest of viewer.js.
   banner: { js: `/* Built from viewer.js with SHA-256 ${digest}.\nContains three.js:\n\n${license.trim()}\n*/` },
 });
 writeFileSync(new URL("THREE-LICENSE", assets), license);

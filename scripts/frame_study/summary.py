@@ -44,8 +44,8 @@ class Comparison(NamedTuple):
 def compare(errors: Float64[np.ndarray, " p"], reference: Float64[np.ndarray, " p"], seed: int) -> Comparison:
     """Compare the errors of a variant with the errors of the default, pair by pair.
 
-    A NaN error means that the variant failed on the pair. On such a pair, the variant is counted as
-    not better than the default.
+    If the variant failed on a pair, its error is NaN, and the variant is counted as not better than the
+    default.
     """
     succeeded = np.isfinite(errors)
     differences = (errors - reference)[succeeded & np.isfinite(reference)]
@@ -100,7 +100,7 @@ class Study:
         return 1e3 * self.numbers(variant, data_set, f"error_{self.settings.iterations}")
 
     def median_settling(self, variant: Variant, data_set: str) -> float:
-        """Return the median of the iteration in which the map of a pair settles (see `SETTLED`).
+        """Return the median, over all pairs, of the iteration in which the map settles (see `SETTLED`).
 
         The median is infinite if at least half of the maps never settle. The median leaves out pairs on which
         the variant failed.
@@ -113,7 +113,7 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """Return the mean paired difference from the default, or NaN if there are no measurements."""
+        """Return the mean paired difference from the default with its interval; NaN without measurements."""
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
@@ -128,7 +128,8 @@ class Study:
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """Return the mean energy ratio E(C) / E(0), which is comparable between frames of all heights."""
+        """Return the mean energy ratio E(C) / E(0), which is comparable between frames of different
+        heights."""
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")

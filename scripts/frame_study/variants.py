@@ -288,7 +288,7 @@ def least_kernel_eigenvalue(
 ) -> float:
     """Return the ratio of the smallest to the largest eigenvalue of the kernel of a variant.
 
-    The variant multiplies the unfiltered map C_0 from the shape to itself elementwise by this kernel. Up to
+    The variant multiplies C_0, the unfiltered map from the shape to itself, elementwise by this kernel. Up to
     rounding, the ratio is nonnegative for every filter bank. The ratio is negative for `band_mask`.
     """
     method = refiner(variant, bank, spectrum, spectrum, number_of_filters=number_of_filters)

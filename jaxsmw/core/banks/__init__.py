@@ -1,13 +1,12 @@
 """Filter banks: a scaling function and wavelet filters, which are functions of the eigenvalue.
 
-All banks of this package depend only on ratios of eigenvalues, so a shape and a scaled copy of this shape
-have the same responses. By convention, the first filter of a bank is the scaling function, which passes the
-lowest eigenvalues.
+All banks of this package depend only on ratios of eigenvalues, so scaling a shape does not change the
+responses. By convention, the first filter of a bank is the scaling function, which passes the lowest
+eigenvalues.
 
 - The following banks are Parseval frames, whose squared filters sum to one: `Meyer`, `SimpleTight`,
   `Itersine`, `HalfCosine`, `Held`, `Simoncelli`, `Papadakis`, `Regular`, `Identity` and `SoftmaxFrame`. The
-  filters of `SoftmaxFrame` can be learned. These banks remain Parseval frames when `Warped` evaluates them on
-  a warped spectrum.
+  filters of `SoftmaxFrame` can be learned.
 - The following banks are not tight: `CubicSpline`, `MexicanHat`, `Heat`, `Gabor`, `ExponentialWindow` and
   `LowPass`. The function `tighten` turns any bank into a tight frame.
 """

@@ -10,17 +10,17 @@ from jaxtyping import Array, Float
 
 
 class FilterBank(eqx.Module):
-    """The base class of filter banks: a scaling function g_0 and wavelet filters g_1 … g_L of the eigenvalue.
+    """The base class of filter banks (a scaling function g_0 and wavelet filters g_1 … g_L).
 
     `jaxsmw.banks` contains ready subclasses, such as `Meyer` (the default of `WaveletPreservation`) and
     `CubicSpline`.
 
-    A subclass must define `__call__(points, eigenvalues)`, which returns the responses (filters, p) of all
-    filters at p points. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,), ascending, are those of the
-    shape, and the last eigenvalue is lambda_max.
+    A subclass must define `__call__(points, eigenvalues)`, which returns the responses (filters, p) at
+    `points` (p,) in [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order; the
+    last one is lambda_max.
 
     A bank is an Equinox module, and therefore a pytree. The continuous parameters of a bank are arrays, which
-    JAX can trace and differentiate. Its sizes, such as the number of filters, are static fields.
+    JAX can trace and differentiate. The sizes of a bank, such as the number of filters, are static fields.
     """
 
     @abc.abstractmethod
@@ -46,8 +46,7 @@ def sample_bank(
 ) -> Float[Array, "filters p"]:
     """Returns the responses (filters, p) of a bank, and checks their shape.
 
-    The check is necessary because users can define their own banks. The arguments are those of
-    `FilterBank.__call__`.
+    The check is necessary because users can define their own banks.
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """

@@ -14,7 +14,7 @@ from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _LogSpacedDilates(FilterBank):
-    """A bank of a scaling function and of one wavelet at log-spaced scales.
+    """A bank of a scaling function and one wavelet at several log-spaced scales.
 
     The scaling function passes the eigenvalues below `lambda_max / ratio`.
     """
@@ -39,8 +39,7 @@ class _LogSpacedDilates(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
-        # The scales are in units of 1 / lambda_max. In absolute units, the coarsest scale is 2 / lambda_min,
-        # with lambda_min = lambda_max / ratio, and the finest scale is 1 / lambda_max.
+        # The scales are in units of 1 / lambda_max.
         scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
         wavelets = self.wavelet(scales[:, None] * relative[None, :])
         if self.normalize:
@@ -51,26 +50,26 @@ class _LogSpacedDilates(FilterBank):
 class CubicSpline(_LogSpacedDilates):
     """A filter bank of a cubic-spline wavelet at several scales. The bank is not tight.
 
-    The wavelet is a function of y, the product of the scale and the eigenvalue lambda. The wavelet equals y²
-    for y below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
+    The wavelet is a function of y, which is the scale times the eigenvalue lambda. The wavelet equals y² for
+    y below 1, a cubic spline for y from 1 to 2, and 4 / y² for y above 2. The `filters - 1` scales are
     log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function passes the eigenvalues
     below `lambda_max / ratio`.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
-    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
+    is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
-    The wavelet is that of Hammond, Vandergheynst and Gribonval, "Wavelets on graphs via spectral graph
-    theory", 2011, also known as "abspline". The MWP paper compares this filter bank with its tight frame.
-    With the default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
+    The wavelet, also known as "abspline", is from Hammond, Vandergheynst and Gribonval, "Wavelets on graphs
+    via spectral graph theory", 2011. The MWP paper compares this filter bank with the Meyer frame. With the
+    default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
 
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
     - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
       the eigenvalues from `lambda_max / ratio` to lambda_max.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
-      1 / lambda_max. The default is False.
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
+      of 1 / lambda_max. The default is False.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `ratio` is not a single finite number above 1.
@@ -83,21 +82,20 @@ class CubicSpline(_LogSpacedDilates):
         return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        # At zero, the scaling function equals the maximum of the wavelet. The wavelet reaches this maximum at
-        # 2 - 1 / sqrt(3).
+        # At zero, the scaling function equals the wavelet's maximum, which is at 2 - 1 / sqrt(3).
         return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
 
 
 class MexicanHat(_LogSpacedDilates):
     """A filter bank of the Mexican-hat wavelet `y exp(-y)` at several scales. The bank is not tight.
 
-    Here y is the product of the scale and the eigenvalue lambda. In space, this wavelet corresponds to the
-    second derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
+    Here y is the scale times the eigenvalue lambda. In space, this wavelet corresponds to the second
+    derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
     `1 / lambda_max`. The scaling function passes the eigenvalues below `lambda_max / ratio`.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
-    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
+    is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014. The
     scales are those of Hammond, Vandergheynst and Gribonval 2011. With the default parameters, the frame
@@ -108,8 +106,8 @@ class MexicanHat(_LogSpacedDilates):
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
     - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
       the eigenvalues from `lambda_max / ratio` to lambda_max.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale, in units of
-      1 / lambda_max. The default is False.
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
+      of 1 / lambda_max. The default is False.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `ratio` is not a single finite number above 1.
@@ -127,9 +125,9 @@ class Heat(FilterBank):
 
     The bank is not tight. All filters of this bank are low-pass filters.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
-    row per diffusion time. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max], one
+    row per diffusion time. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The kernels are those of Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale
     signature based on heat diffusion", 2009.

@@ -1,4 +1,4 @@
-"""Frame bounds of filter banks, and tight frames made from any bank."""
+"""Frame bounds of filter banks, and the conversion of any bank into a tight frame."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from jaxsmw.core.checks import check_choice
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
-    """Returns the frame function G of a filter bank at k eigenvalues, (k,).
+    """Returns the values (k,) of the frame function G of a filter bank at k eigenvalues.
 
-    The frame function `G(lambda) = sum_l g_l(lambda)²` is the sum of the squared filters g_l, eq. (7) of the
-    MWP paper. G is constant for a tight frame, and 1 for a Parseval frame.
+    The frame function `G(lambda) = sum_l g_l(lambda)²` is the sum of the squared filters g_l (equation (7) of
+    the MWP paper). G is constant for a tight frame, and 1 for a Parseval frame.
 
     **Arguments:**
 
@@ -34,7 +34,7 @@ class FrameBounds(NamedTuple):
 
     **Attributes:**
 
-    - `lower`, `upper`: the minimum and the maximum, as arrays of shape () without unit.
+    - `lower`, `upper`: the minimum and the maximum of the frame function, arrays of shape () without unit.
     """
 
     lower: Float[Array, ""]
@@ -59,13 +59,13 @@ def frame_bounds(
       lambda_max.
     - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then hold for
       functions in the span of the corresponding eigenvectors. `"interval"` evaluates G at evenly spaced
-      points of [0, lambda_max]. The bounds then hold for every shape with this lambda_max, if the bank
-      depends on no other eigenvalue.
+      points of [0, lambda_max]. If the bank depends only on lambda_max, these bounds hold for every shape
+      with this lambda_max.
     - `resolution`: the number of points at which `"interval"` evaluates G, at least 2, by default 10 001.
-      `over="eigenvalues"` ignores this number. The lower bound from the points is slightly too large, and the
-      upper bound is slightly too small. If h is the spacing of the points, this error is at most
-      `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G. With the default resolution, the error is below
-      1e-5 G for the banks of this package with up to 8 filters.
+      `over="eigenvalues"` ignores this number. Between the points, G can be outside the bounds. With a point
+      spacing h, the error of a bound is at most `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G. With
+      the default resolution, the relative error is below 1e-5 for the banks of this package with up to 8
+      filters.
 
     **Returns:** A `FrameBounds` with the attributes `lower` and `upper`, the smallest and the largest value
     of G, as arrays of shape () without unit.
@@ -95,8 +95,7 @@ class Tightened(FilterBank):
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
         largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
-        # NaN must remain in the result. This comparison is negated, because `>=` would be False for NaN and
-        # would replace NaN by zero.
+        # `~(largest < tiny)` keeps NaN in the result; `largest >= tiny` would replace NaN by zero.
         covered = ~(largest < jnp.finfo(points.dtype).tiny)
         scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
         frame = jnp.where(covered, frame_function(scaled)[None, :], 1)
@@ -104,21 +103,21 @@ class Tightened(FilterBank):
 
 
 def tighten(bank: FilterBank) -> FilterBank:
-    """Returns the canonical tight frame of a filter bank, which divides each filter g_l by `sqrt(G)`.
+    """Returns the canonical tight frame of a filter bank: each filter g_l divided by `sqrt(G)`.
 
-    G is the frame function `sum_l g_l²`. Among all Parseval frames, the canonical tight frame has the
-    smallest sum of squared differences from g_l at every eigenvalue. If the given bank is a Parseval frame,
-    its responses do not change.
+    G is the frame function `sum_l g_l²`. At every eigenvalue, the canonical tight frame is the Parseval frame
+    closest to the given bank in the least-squares sense. If the given bank is a Parseval frame, its responses
+    do not change.
 
-    If all responses at an eigenvalue are below the smallest normal floating-point number, the new responses
-    and their gradients are zero at this eigenvalue. The new bank is then a Parseval frame only on the rest of
-    the spectrum.
+    Where all responses of the bank are zero or subnormal numbers, the new responses and their gradients are
+    zero. At such eigenvalues, the new bank is not a Parseval frame.
 
     **Arguments:**
 
     - `bank`: any `FilterBank`.
 
-    **Returns:** A `FilterBank` with the responses `g_l / sqrt(G)`, (filters, p) for p points. It has the same
-    parameters (pytree leaves) as `bank`, and its responses are differentiable with respect to them.
+    **Returns:** A `FilterBank` with the responses `g_l / sqrt(G)`, (filters, p) for p points. The new bank
+    has the same parameters (pytree leaves) as `bank`, and its responses are differentiable with respect to
+    these parameters.
     """
     return Tightened(bank)

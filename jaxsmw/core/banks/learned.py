@@ -16,11 +16,11 @@ class SoftmaxFrame(FilterBank):
 
     The squared filters are a softmax: `g_l(lambda)² = exp(z_l(lambda)) / sum_j exp(z_j(lambda))`. Each z_l is
     a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. With
-    enough knots, the softmax approximates every Parseval frame of positive continuous filters.
+    enough knots, the softmax can approximate any Parseval frame of positive continuous filters.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
-    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
     To learn a frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by
     gradient descent. If the smallest eigenvalues matter most, use `Warped(SoftmaxFrame(…), Power())`. The
@@ -28,10 +28,11 @@ class SoftmaxFrame(FilterBank):
 
     **Arguments:**
 
-    - `logits`: (filters, knots), an array or nested lists of the values of z_l at the knots, with at least 1
-      filter and 2 knots. Adding a constant to a column does not change the filters.
+    - `logits`: (filters, knots), the values of z_l at the knots, as an array or nested lists. At least 1
+      filter and 2 knots are needed. Adding a constant to a column of the logits does not change the filters.
 
-    **Raises:** `ValueError` if the logits do not have this shape.
+    **Raises:** `ValueError` if the logits are not of shape (filters, knots) with at least 1 filter and 2
+    knots.
     """
 
     logits: Float[Array, "filters knots"] = eqx.field(converter=as_parameter)
@@ -52,15 +53,15 @@ class SoftmaxFrame(FilterBank):
 
         **Arguments:**
 
-        - `bank`: any `FilterBank`. The frame does not keep the signs of its filters, because all filters of a
+        - `bank`: any `FilterBank`. Negative responses of the bank become positive, because all filters of a
           `SoftmaxFrame` are positive.
         - `knots`: the number of knots, at least 2. The default is 32.
-        - `floor`: a number from 1e-12 to 1 (1 excluded), by default 0.01. Absolute responses of the bank
-          below the floor are raised to the floor, because a filter that is zero cannot be learned.
+        - `floor`: a number in [1e-12, 1), by default 0.01. Responses of the bank whose absolute value is
+          below the floor are replaced by the floor, because a response of zero cannot be learned.
 
         **Returns:** A `SoftmaxFrame` with logits (filters, knots).
 
-        **Raises:** `ValueError` if `knots` is below 2, if `floor` is outside this range, or if the bank
+        **Raises:** `ValueError` if `knots` is below 2, if `floor` is not in [1e-12, 1), or if the bank
         returns responses that are not of shape (filters, knots).
         """
         if knots < 2 or not 1e-12 <= floor < 1:

@@ -15,21 +15,22 @@ from jaxsmw.core.checks import as_parameter, check_between
 class ExponentialWindow(FilterBank):
     """A filter bank of one infinitely smooth low-pass filter. The bank is not tight.
 
-    The filter is 1 at the eigenvalue 0, 1/2 at half the edge, and 0 beyond the edge. With the eigenvalue
-    lambda as a fraction of lambda_max, the filter is `e(u) / (e(u) + e(1 - u))`. Here
-    `e(u) = exp(-slope / u)` and `u = 1 - lambda / edge` (Perraudin et al., "GSPBOX: A toolbox for signal
-    processing on graphs", 2014).
+    The filter is 1 at the eigenvalue 0, 1/2 at half the edge, and 0 beyond the edge. If the eigenvalue lambda
+    is expressed as a fraction of lambda_max, the filter is `e(u) / (e(u) + e(1 - u))`. Here
+    `e(u) = exp(-slope / u)` and `u = 1 - lambda / edge`. The filter is from Perraudin et al., "GSPBOX: A
+    toolbox for signal processing on graphs", 2014.
 
-    `bank(points, eigenvalues)` returns the responses (1, p) at points (p,) of the eigenvalue axis.
-    `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is lambda_max. Points and
-    eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (1, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
     **Arguments:**
 
-    - `edge`: the eigenvalue from which the filter is zero, as a fraction of lambda_max, by default 0.2. The
+    - `edge`: the eigenvalue above which the filter is zero, as a fraction of lambda_max, by default 0.2. The
       value is a single positive number, or an array of shape ().
-    - `slope`: the steepness, by default 1. The value is a single positive number, or an array of shape ().
-      The derivative of the filter at half the edge is `-2 slope / edge`.
+    - `slope`: the steepness of the filter, by default 1. The value is a single positive number, or an array
+      of shape (). At half the edge, the derivative with respect to `lambda / lambda_max` is
+      `-2 slope / edge`.
 
     **Raises:** `ValueError` if a parameter is not a single positive, finite number.
     """
@@ -45,8 +46,7 @@ class ExponentialWindow(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
-        # At u = 0 and u = 1, an exponent is infinite and has no gradient. The clipping excludes both values
-        # of u.
+        # Clipping excludes u = 0 and u = 1, where an exponent is infinite and has no gradient.
         tiny = jnp.finfo(points.dtype).eps
         u = jnp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
         return jax.nn.sigmoid(slope / (1 - u) - slope / u)[None, :]
@@ -55,12 +55,12 @@ class ExponentialWindow(FilterBank):
 class LowPass(FilterBank):
     """A filter bank of one low-pass filter, for experiments without wavelets. The bank is not tight.
 
-    The filter is the scaling function of `Meyer` with an adjustable edge. It is 1 up to the edge, and 0
-    beyond twice the edge. In between, it falls smoothly.
+    The filter is the scaling function of `Meyer` with an adjustable edge. It is 1 up to the edge, and falls
+    smoothly to 0 at twice the edge.
 
-    `bank(points, eigenvalues)` returns the responses (1, p) at points (p,) of the eigenvalue axis.
-    `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is lambda_max. Points and
-    eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (1, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
     **Arguments:**
 
@@ -79,7 +79,7 @@ class LowPass(FilterBank):
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
-        # Beyond twice the edge, this sine is exactly zero. The equivalent `cos(pi / 2)` has a rounding
+        # Beyond twice the edge, this sine is exactly zero, but the equivalent `cos(pi / 2)` has a rounding
         # error.
         return jnp.sin(jnp.pi / 2 * (1 - meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
 

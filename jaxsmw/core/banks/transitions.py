@@ -1,4 +1,4 @@
-"""Parseval frames with smooth transitions between neighbouring bands: octave bands and pairs of bands."""
+"""Parseval frames of octave bands or of two bands, with smooth transitions between the bands."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from jaxsmw.core.checks import as_parameter, check_between
 class _Transitions(FilterBank):
     """A bank with the filters cos(theta_1), sin(theta_1) cos(theta_2), …, sin(theta_L).
 
-    Each theta_l is a function of the eigenvalue, which rises from 0 to pi/2 in the transition from one band
-    to the next. The squared filters sum to cos² + sin² = 1, because the transitions do not overlap.
+    Each angle theta_l rises from 0 to pi/2 in the transition from one band to the next. The transitions do
+    not overlap, so the squared filters sum to one.
     """
 
     @abc.abstractmethod
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        """Returns `theta / (pi / 2)` of each transition, which rises from 0 to 1."""
+        """Returns `theta / (pi / 2)`, which rises from 0 to 1, for each transition."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -35,9 +35,9 @@ class _Transitions(FilterBank):
 
 
 class _DyadicBands(_Transitions):
-    """A bank of octave bands. Each band rises over one octave and falls over the next octave.
+    """A bank of octave bands. Each filter rises over one octave and falls over the next octave.
 
-    The first band only falls, and the last band only rises.
+    The first filter only falls, and the last filter only rises.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -47,23 +47,23 @@ class _DyadicBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns `theta / (pi / 2)` of a transition as a function of a ramp. Both rise from 0 to 1."""
+        """Returns `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        # More than 100 octaves could overflow 2^octaves. The limit does not change the responses, because
-        # only the eigenvalue 0 is 100 octaves below the largest eigenvalue.
+        # The limit of 100 octaves prevents overflow of `2.0**octaves`. It does not change the responses,
+        # because no positive eigenvalue is 100 octaves below lambda_max.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
         return self.profile(jnp.clip(ratios - 1, 0, 1))
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns the Meyer polynomial nu(u), elementwise, for an array of any shape with numbers u from 0 to 1.
+    """Returns the Meyer polynomial nu(u), elementwise, for numbers u from 0 to 1.
 
-    The polynomial rises from 0 to 1. It is the polynomial of least degree with nu(u) + nu(1 - u) = 1 whose
-    first 3 derivatives vanish at 0 and 1.
+    The polynomial rises from 0 to 1, and its first 3 derivatives vanish at 0 and 1. It satisfies
+    `nu(u) + nu(1 - u) = 1`.
     """
     return ramp**4 * (35 - 84 * ramp + 70 * ramp**2 - 20 * ramp**3)
 
@@ -71,18 +71,17 @@ def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 class Meyer(_DyadicBands):
     """The Meyer frame: a filter bank of octave bands that is a Parseval frame.
 
-    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. The
-    scaling function falls to 0 over the next octave, in which the first wavelet rises. The last wavelet rises
-    from `lambda_max / 2` to lambda_max.
+    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. It
+    falls to 0 over the next octave, while the first wavelet rises. The last wavelet rises from
+    `lambda_max / 2` to lambda_max.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
-    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
+    is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The frame is that of Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section
-    4.2 of the MWP paper uses this frame. The scaling function passes the lowest eigenvalues, which belong to
-    the *largest* spatial scale. With the opposite assignment of filters to scales, the bank would not be
-    tight.
+    4.2 of the MWP paper uses this frame. The scaling function passes the lowest eigenvalues, which correspond
+    to the largest spatial scale.
 
     **Arguments:**
 
@@ -98,14 +97,14 @@ class Meyer(_DyadicBands):
 class SimpleTight(_DyadicBands):
     """The simple tight frame: a filter bank of octave bands that is a Parseval frame.
 
-    The bands are those of `Meyer`, but each band rises like sin² over an octave.
+    The bands are those of `Meyer`, but each filter rises like sin² over an octave.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis,
-    scaling function first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
+    is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The frame is that of Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and
-    application to denoising", 2018, after Coulhon, Kerkyacharian and Petrushev 2012.
+    application to denoising", 2018, based on Coulhon, Kerkyacharian and Petrushev 2012.
 
     **Arguments:**
 
@@ -116,13 +115,13 @@ class SimpleTight(_DyadicBands):
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
         sine, cosine = jnp.sin(jnp.pi / 2 * ramp), jnp.cos(jnp.pi / 2 * ramp)
-        # The result is the angle whose sine is `sine**2`, in units of pi / 2. The arctangent is smooth at
-        # both ends of the ramp.
+        # This is `2 / pi * arcsin(sine**2)`, written with `arctan2`, which is smooth at both ends of the
+        # ramp.
         return 2 / jnp.pi * jnp.arctan2(sine**2, cosine * jnp.sqrt(1 + sine**2))
 
 
 class _TwoBands(_Transitions):
-    """A bank of a low-pass and a high-pass filter. The transition between them starts at `edge`."""
+    """A bank of a low-pass and a high-pass filter, with a transition that starts at `edge`."""
 
     edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=1 / 3)
 
@@ -146,18 +145,18 @@ class Held(_TwoBands):
     The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
     rises.
 
-    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
-    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (2, p) at `points` (p,) in [0, lambda_max]. Row 0 is the
+    low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The filters are those of Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the
     Riesz transform", 2010.
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3.
-      The value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
-      filter does not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. The
+      value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
+      filter does not reach 1 on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
@@ -174,18 +173,18 @@ class Simoncelli(_TwoBands):
     rises. The filters are the cosine and the sine of an angle that is linear in the logarithm of the
     eigenvalue.
 
-    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
-    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (2, p) at `points` (p,) in [0, lambda_max]. Row 0 is the
+    low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The filters are those of Portilla and Simoncelli, "A parametric texture model based on joint statistics of
     complex wavelet coefficients", 2000.
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3.
-      The value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
-      filter does not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 1/3. The
+      value is a single number in (0, 1), or an array of shape (). If the edge is above 1/2, the high-pass
+      filter does not reach 1 on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
@@ -200,18 +199,18 @@ class Papadakis(_TwoBands):
     The low-pass filter falls from 1 to 0 between the edge and 5/3 times the edge, while the high-pass filter
     rises. The filters are the cosine and the sine of an angle that is linear in the eigenvalue.
 
-    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
-    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (2, p) at `points` (p,) in [0, lambda_max]. Row 0 is the
+    low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The filters are those of Romero, Alexander, Baid, Jain and Papadakis, "The geometry and the analytic
     properties of isotropic multiresolution analysis", 2009.
 
     **Arguments:**
 
-    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 3/8.
-      The value is a single number in (0, 1), or an array of shape (). If the edge is above 3/5, the high-pass
-      filter does not reach one on [0, lambda_max].
+    - `edge`: the eigenvalue at which the transition starts, as a fraction of lambda_max, by default 3/8. The
+      value is a single number in (0, 1), or an array of shape (). If the edge is above 3/5, the high-pass
+      filter does not reach 1 on [0, lambda_max].
 
     **Raises:** `ValueError` if the edge is not a single number in (0, 1).
     """
@@ -225,18 +224,18 @@ class Papadakis(_TwoBands):
 class Regular(_Transitions):
     """A Parseval frame of a low-pass and a high-pass filter, with a transition over the whole spectrum.
 
-    The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. The number s is computed from
-    `2 lambda / lambda_max - 1` by applying the function `sin(pi/2 ·)` repeatedly, `degree` times (Perraudin
-    et al., "GSPBOX: A toolbox for signal processing on graphs", 2014).
+    The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. To compute s, the function
+    `sin(pi/2 x)` is applied `degree` times to `x = 2 lambda / lambda_max - 1`. The filters are from Perraudin
+    et al., "GSPBOX: A toolbox for signal processing on graphs", 2014.
 
-    `bank(points, eigenvalues)` returns the responses (2, p) at points (p,) of the eigenvalue axis, low-pass
-    filter first. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (2, p) at `points` (p,) in [0, lambda_max]. Row 0 is the
+    low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
+    (arbitrary) unit as `points`; the last one is lambda_max.
 
     **Arguments:**
 
-    - `degree`: how many times the sine is applied, an integer of 0 or more, by default 3. A higher degree
-      makes the transition steeper.
+    - `degree`: the number of times that the sine is applied, an integer of at least 0, by default 3. A higher
+      degree makes the transition steeper.
 
     **Raises:** `ValueError` if the degree is negative.
     """

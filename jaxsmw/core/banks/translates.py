@@ -16,8 +16,7 @@ from jaxsmw.core.checks import as_parameter, check_between
 class _UniformTranslates(FilterBank):
     """A bank of evenly spaced translates of one window.
 
-    Each point of [0, lambda_max] is covered by `overlap` windows. If the squares of all integer translates of
-    the window sum to a constant, the squared filters also sum to a constant.
+    Each point of [0, lambda_max] is covered by `overlap` windows.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -40,23 +39,22 @@ class _UniformTranslates(FilterBank):
 
 
 class Itersine(_UniformTranslates):
-    """A filter bank of evenly spaced translates of the window `sin(pi/2 cos²(pi u))`: a Parseval frame.
+    """A Parseval frame of evenly spaced translates of the window `sin(pi/2 cos²(pi u))`.
 
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
-    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
-    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
-    2014. The squared window is 1/2 plus odd harmonics. The harmonics cancel in the sum over an even number of
-    translates.
+    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on
+    graphs", 2014. The squared windows sum to a constant because `overlap` is even.
 
     **Arguments:**
 
     - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that overlap at each eigenvalue, an even number, at least 2. The
+    - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2. The
       default is 2.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
@@ -72,14 +70,14 @@ class Itersine(_UniformTranslates):
 
 
 class HalfCosine(_UniformTranslates):
-    """A filter bank of evenly spaced translates of the Hann window `cos²(pi u)`: a Parseval frame.
+    """A Parseval frame of evenly spaced translates of the Hann window `cos²(pi u)`.
 
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
-    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
     tight graph wavelet and vertex-frequency frames", 2015. In that paper the squared filters sum to
@@ -107,14 +105,13 @@ class HalfCosine(_UniformTranslates):
 class Gabor(FilterBank):
     """A filter bank of Gaussians with evenly spaced centres from 0 to lambda_max. The bank is not tight.
 
-    The filters correspond to the windows of a short-time Fourier transform. They follow Shuman, Ricaud and
-    Vandergheynst, "Vertex-frequency analysis on graphs", 2016, but the bank has only `filters` centres,
-    instead of a centre at every eigenvalue. The first Gaussian is centred at 0 and the last at lambda_max.
-    Each Gaussian is 1 at its centre.
+    The filters correspond to the windows of a short-time Fourier transform. Shuman, Ricaud and Vandergheynst,
+    "Vertex-frequency analysis on graphs", 2016, centre a window at every eigenvalue; this bank has only
+    `filters` centres. Each Gaussian is 1 at its centre.
 
-    `bank(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the eigenvalue axis, one
-    row per filter. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max].
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as
+    `points`; the last one is lambda_max.
 
     **Arguments:**
 

@@ -17,9 +17,9 @@ class Warp(eqx.Module):
 
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
     are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
-    `__call__(points, eigenvalues)`, which returns the warped points (p,), ascending for ascending points.
-    `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,), ascending, are those of the shape, and the last
-    eigenvalue is lambda_max.
+    `__call__(points, eigenvalues)`, which returns the warped points (p,). The warped points must increase
+    with the points. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in
+    ascending order; the last one is lambda_max.
 
     A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
     on ratios of eigenvalues.
@@ -40,21 +40,20 @@ class Warp(eqx.Module):
 class Warped(FilterBank):
     """A filter bank evaluated on a warped spectrum: the filters are `g_l(warp(lambda))`.
 
-    If `bank` is a Parseval frame, `Warped(bank, warp)` is a Parseval frame. The construction is that of
+    If `bank` is a Parseval frame, `Warped(bank, warp)` is also a Parseval frame. The construction is that of
     Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency
     frames", 2015.
 
-    `Warped(bank, warp)(points, eigenvalues)` returns the responses (filters, p) at points (p,) of the
-    eigenvalue axis. `eigenvalues` (k,), ascending, are those of the shape, and the last eigenvalue is
-    lambda_max. Points and eigenvalues have the same unit, which can be any unit.
+    `Warped(bank, warp)(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0,
+    lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary)
+    unit as `points`; the last one is lambda_max.
 
     **Arguments:**
 
     - `bank`: any `FilterBank` with filters g_l.
-    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. If the filters of the
-      bank are uniform translates (`Itersine` or `HalfCosine`), `Logarithm` widens the bands at higher
-      eigenvalues, as in a bank of wavelets. `SpectralDistribution` makes bands that contain equal numbers of
-      eigenvalues.
+    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. `Logarithm` widens the
+      bands of `Itersine` and `HalfCosine` at higher eigenvalues, as in a bank of wavelets.
+      `SpectralDistribution` gives these bands equal numbers of eigenvalues.
     """
 
     bank: FilterBank
@@ -91,7 +90,7 @@ class Logarithm(Warp):
 class Power(Warp):
     """The warp `(lambda / lambda_max)^exponent` of the eigenvalues lambda, for `Warped`.
 
-    The default exponent 0.5, the square root, turns eigenvalues into frequencies.
+    The default exponent 0.5 (the square root) turns eigenvalues into frequencies.
 
     **Arguments:**
 
@@ -113,18 +112,17 @@ class Power(Warp):
 
 
 class SpectralDistribution(Warp):
-    """The warp that maps an eigenvalue lambda to the number of smaller eigenvalues, for `Warped`.
+    """The warp that maps each eigenvalue to its index in the spectrum, for `Warped`.
 
-    Between eigenvalues, the warp is linear. With this warp, uniform translates (`Itersine` or `HalfCosine`)
-    pass equal numbers of eigenvalues, except that the windows at both ends of the spectrum pass fewer. The
+    Between eigenvalues, the warp is linear. With this warp, the windows of `Itersine` and `HalfCosine` pass
+    equal numbers of eigenvalues. Only the windows at both ends of the spectrum pass fewer eigenvalues. The
     warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
     vertex-frequency frames", 2015. It has no parameters.
 
     An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
     the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is
-    repeated, the responses at the eigenvalues depend only on their indices. By Weyl's law, the eigenvalues of
-    a surface grow nearly linearly. On surfaces, this warp is therefore nearly linear, and its effect is
-    small.
+    repeated, the responses at the eigenvalues depend only on the eigenvalues' indices. The eigenvalues of a
+    surface grow nearly linearly with their index (Weyl's law), so this warp has little effect on surfaces.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:

@@ -1,4 +1,4 @@
-"""The parts that coarse-to-fine refiners share: levels, descriptors, and weights for partial shapes."""
+"""The base class of coarse-to-fine refiners, and functions that these refiners share."""
 
 from __future__ import annotations
 
@@ -44,14 +44,16 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
-      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
-      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
-      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
-      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
-    - `search`: how the matches of all vertices are found. `"exhaustive"` compares all vertices of X with all
-      vertices of Y, `"patches"` skips patches of Y that are too far away, and `"auto"` chooses between the
-      two.
+    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
+      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
+      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
+      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
+      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
+      default), all iterations use all eigenvectors.
+    - `search`: the nearest-neighbour search that matches all vertices. `"exhaustive"` compares all vertices
+      of X with all vertices of Y. `"patches"` skips patches of Y that are too far away. `"auto"` chooses
+      `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least 15 000, and
+      `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
@@ -68,7 +70,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Returns two Boolean arrays, True for the eigenvectors of X (k_x,) and of Y (k_y,) in an iteration.
+        """Returns which eigenvectors of X (k_x,) and of Y (k_y,) an iteration uses, as Boolean arrays.
 
         **Arguments:**
 
@@ -110,18 +112,18 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Returns the weights of both shapes, reduced at vertices that only the full shape has.
+    """Reduces the weights of vertices that probably exist only on the full shape.
 
     The shape with the larger mean residual is treated as the full shape. The weight w of each of its vertices
     becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean` is the
-    weighted mean of the residuals of the other shape. Then the weights of the full shape are scaled to sum 1.
-    The weights of the other shape stay the same.
+    weighted mean residual of the other shape. Then the weights of the full shape are scaled to sum 1. The
+    weights of the other shape stay the same.
 
     **Arguments:**
 
     - `weights_x`, `weights_y`: the weights of the vertices of X (m,) and of Y (n,), each with sum 1.
-    - `residuals_x`, `residuals_y`: the squared distance of each vertex to its match, (m,) and (n,), in the
-      same unit.
+    - `residuals_x`, `residuals_y`: the squared distances from vertices to their matches, (m,) for X and (n,)
+      for Y, in the same unit.
 
     **Returns:** The new weights of the vertices of X (m,) and of Y (n,), each with sum 1.
     """

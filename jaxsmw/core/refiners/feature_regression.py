@@ -36,31 +36,33 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     features of their matches. The first iteration uses the matches of the initial map. Later iterations use
     the matches of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which gives the
     functional map by least squares (Ovsjanikov et al. 2012). Descriptors are regressed on descriptors. The
-    covariance of the residuals measures how reliable each combination of features is. This covariance defines
-    a Mahalanobis distance between the features of a vertex of X and the features predicted from a vertex of
-    Y. The next match of a vertex of X is the nearest vertex of Y in this distance. For the reverse map, the
-    features of Y are regressed on the features of X in the same way. The argument `levels` increases the
-    number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
+    covariance of the residuals measures how accurately each combination of features is predicted. This
+    covariance defines a Mahalanobis distance between the features of a vertex of X and the features predicted
+    from a vertex of Y. The next match of a vertex of X is the nearest vertex of Y in this distance. For the
+    reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
+    increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. If the initial map is as good as a result of `WaveletPreservation`,
-    the refined map is closer to the ground truth than the initial map. The measurements are in
-    docs/accuracy.md.
+    The method does not assume isometry. If the initial map is as accurate as a map of `WaveletPreservation`,
+    the refined map is closer to the ground truth than the initial map. docs/accuracy.md contains the
+    measurements.
 
-    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape whose matches fit badly
-    receive smaller weights (`partial_matching_weights`).
+    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
+    smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
+    to its match.
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
-      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
-      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
-      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
-      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
-    - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
-      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` skips patches of
-      Y that are too far away. It compares only eigenvectors and ignores descriptors, so the matches can
-      differ from those of `"exhaustive"`. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the
-      numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
+    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
+      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
+      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
+      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
+      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
+      default), all iterations use all eigenvectors.
+    - `search`: the nearest-neighbour search that matches all vertices. Samples are always matched by
+      exhaustive search. `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` skips
+      patches of Y that are too far away. The search in patches compares only eigenvectors and ignores
+      descriptors, so its matches can differ from those of `"exhaustive"`. `"auto"` chooses `"patches"` on
+      CPUs if the geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
@@ -84,7 +86,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Returns the regressions along the matches as the next state, and `RESULTS.successful`.
+        """Regresses the features of matched vertices. Returns the next state and `RESULTS.successful`.
 
         If there is a previous state, the regressions also use the matches of the reverse map.
         """
@@ -121,7 +123,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
         """Returns the vertex of X that is nearest to each vertex of Y, (n,).
 
-        Distances are computed in the `embeddings`, as for `recover`.
+        Distances are computed between the points of `embeddings`.
         """
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         embed = self.embeddings if patches is None else self._eigenvector_embeddings
@@ -139,8 +141,9 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
         """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
 
-        The distance between the points of a vertex of X and a vertex of Y is a Mahalanobis distance. It
-        compares the features of the vertex of X with the prediction of these features from the vertex of Y.
+        The dimension d_x is the number of features of X. The distance between a point of X and a point of Y
+        is a Mahalanobis distance. This distance compares the features of the vertex of X with the prediction
+        of these features from the vertex of Y.
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
@@ -149,8 +152,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
         """Returns the coordinates of the `embeddings` that depend only on eigenvectors.
 
-        The search in patches uses only these coordinates, because patches are compact in them. They are the
-        first k_x coordinates, because the whitening matrix is triangular.
+        The search in patches uses only these coordinates, because patches are compact in these coordinates.
+        The whitening matrix is triangular, so these coordinates are the first k_x coordinates.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
@@ -158,7 +161,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The features of the vertices of one shape, with the vertices' shares of the area and the mask.
+    """The features of the vertices of one shape, the vertices' shares of the area (`weights`), and the mask.
 
     Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
     vertex if the spectrum has descriptors.
@@ -171,7 +174,7 @@ class _Features(NamedTuple):
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
         area = jnp.sum(spectrum.vertex_areas)
-        # The scaled eigenvectors have mean square 1, whatever the unit of length.
+        # This factor scales the eigenvectors to mean square 1 in every unit of length.
         values = spectrum.eigenvectors * jnp.sqrt(area)
         if spectrum.descriptors is not None:
             values = jnp.concatenate([values, spectrum.descriptors], axis=1)
@@ -198,19 +201,18 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """A prediction of features, stored as two linear maps from features to points.
+    """A linear prediction of features, stored as two matrices that take features to points.
 
-    The distance between a query point and a target point measures the error of the prediction. It is the
-    Mahalanobis distance between the features of the query vertex and their prediction from the features of
-    the target vertex.
+    The distance between a query point and a target point is a Mahalanobis distance. This distance compares
+    the features of the query vertex with the prediction of these features from the target vertex.
 
     **Attributes:**
 
-    - `queries`: a matrix (d_out, d_out). The features of a query vertex times this matrix are its point in
-      the nearest-neighbour search.
-    - `database`: a matrix (d_in, d_out). The features of a target vertex times this matrix are its point in
-      the search.
-    - `uncertainty`: half the logarithm of the determinant of the residual covariance of the active features.
+    - `queries`: a matrix (d_out, d_out). The product of the features of a query vertex and this matrix is the
+      query point in the nearest-neighbour search.
+    - `database`: a matrix (d_in, d_out). The product of the features of a target vertex and this matrix is
+      the target point in the nearest-neighbour search.
+    - `uncertainty`: half the log-determinant of the residual covariance, restricted to the active features.
     """
 
     queries: Float[Array, "d_out d_out"]
@@ -251,16 +253,16 @@ class Regression(CoarseToFineState):
     def uncertainty(self) -> Float[Array, ""]:
         """The mean logarithm of the standard deviation of the residuals, a scalar array; lower is better.
 
-        The mean is taken over the principal components of the residuals of both predictions. It is computed
-        as half the sum of the log-determinants of both residual covariances, divided by the total
-        number of features, that of X plus that of Y.
+        The mean is taken over the principal components of the residuals of both predictions. The uncertainty
+        is half the sum of the log-determinants of both residual covariances, divided by the number of
+        features of X plus the number of features of Y.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features
 
 
 class _Moments(NamedTuple):
-    """The weighted mean products of the features of matched vertices."""
+    """The weighted second moments of the features of matched vertices."""
 
     xx: Float[Array, "d_x d_x"]
     xy: Float[Array, "d_x d_y"]
@@ -283,7 +285,7 @@ def _regress(
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
     """Returns the functional map, and the prediction of the features of X from the features of Y.
 
-    Both results use only the active eigenvectors.
+    The functional map and the prediction use only the active eigenvectors.
     """
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
@@ -301,9 +303,8 @@ def _regress(
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
     factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
-    # The whitening is triangular, so each coordinate depends only on the features up to its own index.
-    # Inactive features are set to zero, because they would add only a constant and rounding errors to the
-    # distances.
+    # The whitening is triangular, so coordinate i depends only on features 0 to i. Inactive features are set
+    # to zero, because they would add only a constant and rounding errors to the distances.
     whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

@@ -37,11 +37,10 @@ _DESCRIPTORS, _FALLING = 2.8, 1.5
 # times the square root of the area. If the spectrum has few eigenvectors, the duration is longer, because
 # heat flow must reduce the last eigenvector to at most exp(-_DECAY) times its size.
 _HEAT_TIME, _DECAY = 3e-3, 4.0
-# If a least-squares fit contains vertices with small weights, it uses this ridge. The ridge is a multiple of
-# the mean square of the eigenvectors.
+# The least-squares fit on partial shapes uses this ridge, in units of the mean square of the eigenvectors.
 _RIDGE = 1e-3
-# After this number of squarings, a matrix of trace 1 is nearly the projection onto the eigenvector of its
-# largest eigenvalue.
+# `_nearest_rotations` squares matrices this many times. The result is nearly the projection onto the
+# eigenvector of the largest eigenvalue.
 _SQUARINGS = 12
 
 
@@ -51,36 +50,39 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     In each iteration, the positions of the matches are projected onto the first eigenvectors. The projection
     gives the low frequencies of the deformed surface. The argument `levels` increases the number of
     eigenvectors from iteration to iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020). The
-    remaining details of the surface rotate with the neighbourhoods of the vertices, as in
-    as-rigid-as-possible deformation (Sorkine, Alexa 2007). The best rotation around each vertex is computed
-    from averages over its neighbourhood, which heat flow provides. On samples and on partial shapes,
-    eigenvectors are not orthonormal, so coefficients are computed by least squares. Otherwise no linear
-    system is solved.
+    remaining details of the surface are rotated with the neighbourhood of each vertex, as in
+    as-rigid-as-possible deformation (Sorkine, Alexa 2007). Heat flow averages over the neighbourhood of each
+    vertex, and the best rotation is computed from these averages. On samples and on partial shapes,
+    eigenvectors are not orthonormal, so coefficients are computed by least squares. On full shapes without
+    samples, no linear system is solved.
 
     The next matches are the nearest vertices in a joint space of both surfaces. The coordinates of this space
     are positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra
     have descriptors. The weight of the descriptors decreases as the number of eigenvectors increases. If one
     shape is a mirror image of the other, all rotations include a reflection.
 
-    The initial map must be nearly correct. The refined map is then closer to the ground truth than the
-    results of methods that use only eigenfunctions. The measurements are in docs/accuracy.md. The spectra
-    need positions and normals, which `jaxsmw.compute_spectrum` provides and `Spectrum.with_positions` adds.
+    The initial map must be nearly correct. From a nearly correct map, `Registration` gives a more accurate
+    map than refiners that use only eigenfunctions. docs/accuracy.md contains the measurements. Both spectra
+    must contain positions and normals, which `jaxsmw.compute_spectrum` computes. `Spectrum.with_positions`
+    adds positions and normals to a spectrum.
 
     Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are
-    instead scaled by the same factor. Vertices of the full shape whose matches fit badly then receive smaller
-    weights (`partial_matching_weights`).
+    instead scaled by the same factor, and vertices of the full shape with large residuals receive smaller
+    weights (`partial_matching_weights`). A residual is the squared distance from a vertex to its match in the
+    joint space, without descriptors.
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors in each iteration: any iterable of integers of at least 1, such as
-      a tuple, a list or a range, stored as a tuple. A level above the number of available eigenvectors means
-      all eigenvectors. If X and Y have different numbers of eigenvectors, a level applies to the shape with
-      more eigenvectors, and the other shape uses a proportional number. Iterations after the last level use
-      all eigenvectors. If `levels` is empty (the default), all iterations use all eigenvectors.
-    - `search`: how the matches of all vertices are found. (Matches of samples are always found by exhaustive
-      search.) `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` finds the same
-      matches but skips patches that are too far away. `"auto"` chooses `"patches"` on CPUs if the geometric
-      mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
+    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
+      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
+      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
+      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
+      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
+      default), all iterations use all eigenvectors.
+    - `search`: the nearest-neighbour search that matches all vertices. Samples are always matched by
+      exhaustive search. `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` finds
+      the same matches but skips patches that are too far away. `"auto"` chooses `"patches"` on CPUs if the
+      geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
@@ -113,7 +115,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def update(
         self, prepared: PreparedSurfaces, pointwise_map: Int[Array, " m"], previous: Registered | None
     ) -> tuple[Registered, RESULTS]:
-        """Returns the deformations that follow from the matches, and `RESULTS.successful`."""
+        """Computes the deformations from the matches. Returns the next state and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         patches = prepared.reverse_patches
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
@@ -147,7 +149,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the `objective` of the matches from which the deformation of X was computed."""
+        """Returns the `objective` for the pointwise map from which the state was computed."""
         return self.objective(prepared, state, pointwise_map)
 
     def embeddings(
@@ -183,7 +185,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, spectrum: Spectrum, area: Float[Array, ""]) -> _Surface:
-        """Returns the surface that belongs to a spectrum, scaled from the given area to area 1."""
+        """Returns the surface of a spectrum. Lengths are divided by the square root of `area`."""
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
                 "Registration needs positions and normals, but a spectrum lacks them: use compute_spectrum, "
@@ -213,7 +215,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Returns the surface with only the given vertices (s,), whose sampled spectrum is `spectrum`."""
+        """Returns the given vertices (s,) of the surface. `spectrum` is the spectrum of these vertices."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -222,7 +224,7 @@ class _Surface(NamedTuple):
         )
 
     def reweighted(self, weights: Float[Array, " s"]) -> _Surface:
-        """Returns the same vertices with other weights in the least-squares fit of coefficients."""
+        """Returns the same vertices, with the given weights in the least-squares fit of coefficients."""
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
         ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
@@ -259,8 +261,9 @@ class Deformation(NamedTuple):
     - `own`: the coefficients of the surface's positions (k_x, 3), zero for inactive eigenvectors.
     - `matched`: the coefficients of the positions, normals and eigenfunctions of the matches (k_x, d), zero
       for inactive eigenvectors.
-    - `moments`: coefficients (k_x, 24) of averages by heat flow. The averaged quantities are positions,
-      matched positions, the products of both, and the products of normals with matched normals.
+    - `moments`: the coefficients (k_x, 24) of quantities after heat flow. The quantities are positions,
+      matched positions, the products of positions with matched positions, and the products of normals with
+      matched normals.
     """
 
     own: Float[Array, "k_x 3"]
@@ -275,14 +278,14 @@ class Deformation(NamedTuple):
         matches: Int[Array, " s"],
         active: Bool[Array, " k_x"],
     ) -> Deformation:
-        """Returns the deformation that follows from the matches of a surface's vertices on another surface.
+        """Computes the deformation of a surface onto another surface from the matches of its vertices.
 
         **Arguments:**
 
         - `surface`: the vertices to be matched.
         - `other`: all vertices of the other surface.
         - `matches`: one vertex of `other` for each vertex of `surface` (s,).
-        - `active`: True for the eigenvectors of this iteration (k_x,).
+        - `active`: a Boolean array (k_x,), True for the eigenvectors that the iteration uses.
         """
 
         def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
@@ -302,7 +305,7 @@ class Deformation(NamedTuple):
         )
 
     def points(self, surface: _Surface) -> Float[Array, "s d"]:
-        """Returns the deformed vertices of the surface, (s, d), as positions, normals and eigenfunctions."""
+        """Returns the weighted positions, normals and eigenfunctions of the deformed vertices, (s, d)."""
         low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
         own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
         rotations = _rotations(moments, surface)
@@ -332,9 +335,9 @@ def _product_space(
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-    The points of a vertex of X and a vertex of Y are close to each other under two conditions: the vertex of
-    X, deformed onto Y, is close to the vertex of Y, and the vertex of Y, deformed onto X, is close to the
-    vertex of X.
+    The points of a vertex x of X and a vertex y of Y are close to each other if both deformations match the
+    two vertices. This means that the deformed x is close to y on Y, and that the deformed y is close to x on
+    X.
     """
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
@@ -363,7 +366,7 @@ def _without_missing_parts(
 
 
 def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-    """Returns the rotations that best align the neighbourhood of each vertex with that of its match.
+    """Returns the rotations that best align the neighbourhoods of vertices with those of their matches.
 
     If one surface is a mirror image of the other, all rotations include a reflection.
     """
@@ -378,15 +381,16 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
-    """Returns the rotation R that maximises the trace of R S for each covariance S (Horn 1987).
+    """Returns, for each covariance S, the rotation R that maximises the trace of R S (Horn 1987).
 
-    The trace is a quadratic form in the unit quaternion of R, so the best quaternion is an eigenvector of the
-    matrix of this form. The eigenvector belongs to the largest eigenvalue.
+    The trace is a quadratic form in the unit quaternion of R. The best quaternion is the eigenvector for the
+    largest eigenvalue of this form.
     """
     table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
     quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
     sizes = jnp.sqrt(jnp.sum(quadratic**2, axis=(1, 2), keepdims=True))
-    # Adding the identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers.
+    # Adding the identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers
+    # of the matrix.
     powers = quadratic / jnp.where(sizes > 0, sizes, 1) + jnp.eye(4, dtype=covariances.dtype)[None]
 
     def squared(_: Any, powers: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:

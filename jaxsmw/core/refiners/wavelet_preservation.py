@@ -27,7 +27,7 @@ class PreparedWavelets(Prepared):
 
     **Attributes:**
 
-    - `wavelets`: both shapes, together with the responses of the filter bank at their eigenvalues.
+    - `wavelets`: a `WaveletProblem`, which contains both spectra and the responses of the filter bank.
     - `solution`: the values that `Solution.prepare` returns.
     - `patches`: the patches of X and Y, or None if the search uses no patches.
     """
@@ -42,27 +42,27 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
 
     In each iteration, the refiner computes a functional map that preserves the wavelets of all scales. A
     nearest-neighbour search in the `spectral_embeddings` of this functional map then gives the pointwise map.
-    Use the refiner with `jaxsmw.refine`, `refine_pairs`, `refine_softly` or a `Stage`.
+    Pass the refiner to `jaxsmw.refine`, `refine_pairs`, `refine_softly` or a `Stage`.
 
     **Arguments:**
 
     - `bank`: the filter bank, a `FilterBank`. The default is `Meyer()`, the Parseval frame of the MWP paper.
-    - `solution`: the `Solution` that computes the functional map from a pointwise map. `Filtering()` (eq. (8)
-      of the MWP paper, the default) is meant for Parseval frames, whose squared filters sum to one.
-      `LeastSquares()` is exact for every frame. `RegularizedLeastSquares()` adds further energy terms.
-      `NearestOrthogonal()` makes the map of another solution orthogonal.
+    - `solution`: the `Solution` that computes the functional map from a pointwise map. `Filtering()` (the
+      default) is equation (8) of the MWP paper, which is meant for Parseval frames. `LeastSquares()` computes
+      the exact minimiser of the energy for every frame. `RegularizedLeastSquares()` adds further terms to the
+      energy. `NearestOrthogonal()` makes the functional map of another solution orthogonal.
     - `convention`: the direction of the functional map C. A `"pullback"` (k_X, k_Y) takes functions on Y to
       functions on X. A `"pushforward"` (k_Y, k_X) takes functions on X to functions on Y, as in the notation
       of the MWP paper. The pushforward is meant for study only, because it fails on real pairs. The docstring
       of `spectral_embeddings` explains why.
     - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"` (the default), the bank ends at
-      the largest eigenvalue of each shape, so a difference in size between the shapes has no effect. With
-      `"common"`, it ends at the larger of the two shapes' largest eigenvalues on both shapes.
-    - `search`: how nearest neighbours are found. `"exhaustive"` compares all vertices of X with all vertices
-      of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. On large
-      shapes and a CPU, this search is several times as fast, but its compilation takes some seconds longer.
-      `"auto"` chooses `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least
-      15 000, and `"exhaustive"` otherwise.
+      the largest eigenvalue of each shape, so different sizes of the shapes have no effect. With `"common"`,
+      the bank ends at the same eigenvalue on both shapes: the larger of the two shapes' largest eigenvalues.
+    - `search`: the method of nearest-neighbour search. `"exhaustive"` compares all vertices of X with all
+      vertices of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. For
+      large shapes on a CPU, the search in patches is several times as fast, but its compilation takes some
+      seconds longer. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the numbers of vertices is
+      at least 15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `bank` is not a `FilterBank` or `solution` is not a `Solution`; `ValueError` if
     `convention`, `lambda_max` or `search` is unknown.
@@ -114,7 +114,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Returns the state with the functional map that the solution computes, and a status code.
+        """Computes the functional map with `solution`. Returns the next state and a status code.
 
         The status code is a member of `RESULTS`.
         """
@@ -136,7 +136,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the energy of eq. (5) of the MWP paper, in the area norm; see `WaveletProblem.energy`."""
+        """Returns the energy of equation (5) of the MWP paper, with areas as the weights of vertices."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(

@@ -1,7 +1,7 @@
 """Solutions: methods that compute a functional map from a pointwise map.
 
-The refiner `WaveletPreservation` uses a `Solution` in every iteration. Each solution minimises the
-wavelet-preservation energy, exactly or approximately, with or without further energy terms.
+The refiner `WaveletPreservation` uses a `Solution` in every iteration. The solutions minimise the
+wavelet-preservation energy exactly or approximately; `RegularizedLeastSquares` adds further terms.
 """
 
 from jaxsmw.core.functional_map import WaveletProblem

@@ -58,8 +58,8 @@ class Solution(eqx.Module, Generic[PreparedT]):
           filter bank, and the convention of C.
         - `prepared`: the values that `prepare` returned for this problem.
         - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
-        - `previous`: the functional map (k_out, k_in) of the previous iteration, from which an iterative
-          solver can start; None in the first iteration.
+        - `previous`: the functional map (k_out, k_in) of the previous iteration, or None in the first
+          iteration. An iterative solver can start from this map.
 
         **Returns:** The functional map C (k_out, k_in), and a status code, which is a member of `RESULTS`.
         """

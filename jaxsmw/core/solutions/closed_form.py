@@ -37,24 +37,24 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """The solution for Parseval frames. It filters the functional map C_0 of a pointwise map T.
+    """A solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
 
-    The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)`, eq. (8) of the MWP paper. The filters g_l
-    are those of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the shape
-    that C maps to and of the shape that C maps from. The sum equals the elementwise product of C_0 and the
-    `multiscale_kernel` of the bank, so no linear system is solved. `Filtering` is a `Solution`, for the
+    The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (equation (8) of the MWP paper), where g_l
+    are the filters of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the
+    shape that C maps to and of the shape that C maps from. The sum equals the elementwise product of C_0 and
+    the `multiscale_kernel` of the bank, so no linear system is solved. `Filtering` is a `Solution`, for the
     argument `solution` of `WaveletPreservation`.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
-    default pullback convention, this is exact only if T preserves area; otherwise C is only close to the
-    minimiser. If the bank is not a Parseval frame, C is not the minimiser, but only a filtered map.
+    default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
+    to the minimiser. If the bank is not a Parseval frame, C does not minimise this energy.
 
     **Arguments:**
 
-    - `pseudo_inverse`: the pseudo-inverse `Phi^+` of the eigenvectors Phi of the shape that C maps to.
-      `"area"` (the default) is `Phi^T A`, where the diagonal matrix A contains the vertex areas.
-      `"least_squares"` is `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. When a refiner
-      iterates on samples, `Filtering` always uses `"least_squares"`.
+    - `pseudo_inverse`: the form of the pseudo-inverse `Phi^+`. The columns of Phi are the eigenvectors of the
+      shape that C maps to. `"area"` (the default) is `Phi^T A`, where the diagonal matrix A contains the
+      vertex areas. `"least_squares"` is `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight.
+      When a refiner iterates on samples, `Filtering` always uses `"least_squares"`.
 
     **Raises:** `ValueError` if `pseudo_inverse` is unknown.
     """
@@ -79,7 +79,7 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns C of eq. (8) of the MWP paper, (k_out, k_in), and `RESULTS.successful`."""
+        """Returns the filtered map C (k_out, k_in), and `RESULTS.successful`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
@@ -91,8 +91,8 @@ class NearestOrthogonal(Solution[PreparedT]):
     `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
     et al. 2012). `NearestOrthogonal` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
 
-    The status code is that of the other solution, so a failure of the other solution is reported. If the
-    other map contains NaN, all entries of the new map are NaN.
+    The status code is that of the other solution. If the other solution's map contains NaN, all entries of
+    the new map are NaN.
 
     **Arguments:**
 
@@ -112,7 +112,7 @@ class NearestOrthogonal(Solution[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the polar factor (k_out, k_in) of the other solution's map, and its status code."""
+        """Returns the polar factor (k_out, k_in) of the other solution's map, and the status code."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
         return product(left, right), result
@@ -121,18 +121,18 @@ class NearestOrthogonal(Solution[PreparedT]):
 class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
-    The energy is that of eq. (5) of the MWP paper. The minimiser C (k_out, k_in) is computed by one Cholesky
-    factorisation of the gram matrix of the energy, which has the shape (k_in, k_in). `LeastSquares` is a
-    `Solution`, for the argument `solution` of `WaveletPreservation`.
+    Equation (5) of the MWP paper defines the energy. One Cholesky factorisation of the energy's gram matrix
+    (k_in, k_in) gives the minimiser C (k_out, k_in). `LeastSquares` is a `Solution`, for the argument
+    `solution` of `WaveletPreservation`.
 
     `solve` returns C and the status code `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
-    `RESULTS.singular_system`. The map is undetermined if all filters are zero at an eigenvalue of the shape
-    that C maps from. The system is singular if the gram matrix is singular to working precision.
+    `RESULTS.singular_system`. The functional map is undetermined if all filters are zero at an eigenvalue of
+    the shape that C maps from. The system is singular if the gram matrix is singular to working precision.
 
     **Arguments:**
 
     - `norm`: the weights of the vertices of X in the energy. `"area"` (the default) weights each vertex by
-      its area. `"frobenius"` gives all vertices the same weight, as in eq. (5) of the paper.
+      its area. `"frobenius"` gives all vertices the same weight, as in equation (5) of the MWP paper.
 
     **Raises:** `ValueError` if `norm` is unknown.
     """
@@ -149,7 +149,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C of the energy, (k_out, k_in), and a status code (member of `RESULTS`)."""
+        """Returns the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

@@ -17,8 +17,8 @@ class ProjectedDescriptors(eqx.Module):
     **Attributes:**
 
     - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with `Phi^+ = Phi^T A`.
-    - `operators`: (d, k, k), the operator `Phi^+ diag(f) Phi` of each function f, which multiplies other
-      functions by f (Nogneng and Ovsjanikov 2017); None if no operators were computed.
+    - `operators`: (d, k, k), one matrix `Phi^+ diag(f) Phi` per function f. This matrix multiplies other
+      functions by f (Nogneng and Ovsjanikov 2017). The attribute is None if no operators were computed.
     """
 
     coefficients: Float[Array, "k d"]
@@ -30,8 +30,8 @@ class ProjectedDescriptors(eqx.Module):
     ) -> ProjectedDescriptors:
         """Projects the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
 
-        If `operators` is True, the multiplication operators are computed as well. This method does not check
-        the shapes of the arrays; `DescriptorPair.project` does.
+        If `operators` is True, the method also computes the multiplication operators. Only
+        `DescriptorPair.project` checks the shapes of the arrays.
         """
         dual = dual_eigenvectors(spectrum, "area")
 
@@ -47,20 +47,20 @@ class ProjectedDescriptors(eqx.Module):
 class DescriptorPair(eqx.Module):
     """Corresponding functions on two shapes X and Y, such as descriptors, expressed in the eigenbases.
 
-    `RegularizedLeastSquares` uses a `DescriptorPair` in its terms for descriptors. `DescriptorPair.project`
+    `RegularizedLeastSquares` uses a `DescriptorPair` in its descriptor terms. `DescriptorPair.project`
     computes a pair from the values of functions at the vertices.
 
     **Attributes:**
 
     - `x`, `y`: d functions on X and the corresponding d functions on Y, expressed in the eigenbases. The
-      attribute `coefficients` of `x` is (k_x, d) and that of `y` is (k_y, d). Column j contains the
-      coefficients of function j. The attribute `operators` is (d, k_x, k_x) for `x` and (d, k_y, k_y) for
-      `y`, or None. Matrix j multiplies other functions by function j, in the eigenbasis.
+      shapes are (k_x, d) for `x.coefficients` and (k_y, d) for `y.coefficients`. Column j contains the
+      coefficients of function j. The shapes are (d, k_x, k_x) for `x.operators` and (d, k_y, k_y) for
+      `y.operators`, each of which can be None. Matrix j multiplies other functions by function j, in the
+      eigenbasis.
 
-    The term for descriptor commutativity needs the operators of both shapes. If `x.operators` is None,
-    `RegularizedLeastSquares` raises `ValueError` when this term has a weight. If only `y.operators` is None,
-    `RegularizedLeastSquares` omits this term. `DescriptorPair.project` computes the operators of both shapes
-    or of neither.
+    The term for descriptor commutativity needs the operators of both shapes. `RegularizedLeastSquares` raises
+    `ValueError` if this term has a weight and an operator array is None. `DescriptorPair.project` computes
+    the operators of both shapes or of neither shape.
 
     **Raises:** `ValueError` if `coefficients` does not have two dimensions on each shape, or if X and Y have
     different numbers of functions.
@@ -94,9 +94,9 @@ class DescriptorPair(eqx.Module):
         - `descriptors_x`, `descriptors_y`: the values of d functions on X (m, d) and of the corresponding
           functions on Y (n, d), in any unit.
         - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-        - `operators`: whether to compute the multiplication operators of both shapes as well, which are d
-          matrices of size k x k per shape. Descriptor commutativity needs these operators. The default is
-          False.
+        - `operators`: whether to compute the multiplication operators of both shapes as well. Each shape has
+          d operators, which are matrices of size k x k. Descriptor commutativity needs these operators. The
+          default is False.
 
         **Raises:** `ValueError` if the values do not have one row per vertex and one column per function, or
         if X and Y have different numbers of functions.

@@ -39,34 +39,32 @@ def _as_weight(value: ArrayLike | None) -> Array | None:
 
 
 class RegularizedLeastSquares(Solution[None]):
-    """The solution that minimises the wavelet-preservation energy plus further terms, by an iterative solver.
+    """A solution that minimises the wavelet-preservation energy and further terms with an iterative solver.
 
     `RegularizedLeastSquares` is a `Solution`, for the argument `solution` of `WaveletPreservation`. The
     functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
-    - Wavelet preservation is the energy of eq. (5) of the MWP paper.
+    - Wavelet preservation is the energy of equation (5) of the MWP paper.
     - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
       Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps from. Both
       matrices are divided by the larger of the two shapes' largest eigenvalues.
-    - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. Only this term
-      is not quadratic.
+    - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
+      only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
       descriptors on both shapes (Ovsjanikov et al. 2012).
     - Descriptor commutativity is `sum_d ||C D_in - D_out C||²`, where the operators D_in and D_out multiply a
       function by descriptor d (Nogneng and Ovsjanikov 2017).
 
-    The terms are scaled to values of similar size. If one of the two matrices in the difference of a term is
-    replaced by zero, the term is about k_out for a nearly orthogonal C. Weights near one are therefore
-    comparable, for all banks and all units of descriptors. The wavelet term is divided by the mean of the
-    frame function, which is one for a Parseval frame. `F_out` and `F_in` are scaled by a common factor so
-    that the squared norm of `F_out` is k_out. All operators are scaled by a common factor so that the squared
-    norms of the operators `D_out` sum to k_out.
+    The terms are scaled to similar sizes, so their weights are comparable for all banks and all units of
+    descriptors. The wavelet term is divided by the mean of the frame function, which is one for a Parseval
+    frame. `F_out` and `F_in` are scaled by a common factor so that the squared norm of `F_out` is k_out. All
+    operators are scaled by a common factor so that the squared norms of the operators `D_out` sum to k_out.
 
-    The terms for wavelet preservation and descriptor preservation sum over thousands of columns. An exact
-    reduction first replaces the columns of both terms by k_in columns. Then `optimistix.least_squares` takes
-    Gauss–Newton steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver
-    starts from the functional map of the previous iteration; in the first iteration, it starts from an
-    estimate. C is differentiable, by implicit differentiation at the minimum.
+    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. First,
+    these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
+    steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver starts from the
+    functional map of the previous iteration; in the first iteration, it starts from an estimate. C is
+    differentiable, by implicit differentiation at the minimum.
 
     The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
@@ -77,7 +75,8 @@ class RegularizedLeastSquares(Solution[None]):
       `descriptor_commutativity`: the weights of the five terms. Each weight is a single positive number or an
       array of shape (), or None to omit the term. The defaults are 1, 1, 0.1, None and None, in this order.
     - `descriptors`: a `DescriptorPair`, which the two descriptor terms need; None (the default) if neither
-      has a weight. Descriptor commutativity needs `DescriptorPair.project(..., operators=True)`.
+      term has a weight. Descriptor commutativity needs the result of
+      `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
       by its area. `"frobenius"` gives all vertices the same weight.
     - `tolerance`: a positive number, by default 1e-3, which is both the relative and the absolute
@@ -139,13 +138,12 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the C that minimises the weighted sum of all terms, (k_out, k_in), and a status code
-        (`RESULTS`).
+        """Returns the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
 
-        The solver starts from `previous`. If `previous` is None, the solver starts from an estimate.
+        The solver starts from `previous`, or from an estimate if `previous` is None.
 
-        **Raises:** `ValueError` if the descriptors are expressed in another number of eigenvectors than the
-        functional map.
+        **Raises:** `ValueError` if the descriptors and the functional map have different numbers of
+        eigenvectors.
         """
         energy = None
         if self.wavelet_preservation is not None:
@@ -174,15 +172,15 @@ class RegularizedLeastSquares(Solution[None]):
         - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. It must
           be None if, and only if, this weight is None.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
-          the shape that C maps from (k_in,). `descriptors.x` belongs to the shape that C maps to, as in the
-          pullback convention.
+          the shape that C maps from (k_in,). `descriptors.x` must belong to the shape that C maps to, as in
+          the pullback convention.
         - `initial`: the functional map (k_out, k_in) from which the solver starts. By default, the solver
           starts from an estimate.
 
         **Returns:** The minimiser C (k_out, k_in), and a status code, which is a member of `RESULTS`.
 
         **Raises:** `ValueError` if an energy is given without a weight or a weight without an energy, or if
-        the descriptors are expressed in another number of eigenvectors than C.
+        the descriptors and C have different numbers of eigenvectors.
         """
         descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
         return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
@@ -204,16 +202,15 @@ class RegularizedLeastSquares(Solution[None]):
         determined = curvature > quadratic.rounding()
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
-        # The entries of C are scaled so that the quadratic terms have the same curvature in each entry. Then
-        # conjugate gradients need few steps.
+        # This scaling gives the quadratic terms the same curvature in each entry of C, so conjugate gradients
+        # need few steps.
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if initial is None:
             initial = quadratic.cross * unit**2
         functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
         if len(terms) == 1:
             result = where(quadratic.is_regular(), result, RESULTS.singular_system)
-        # A NaN outside the quadratic terms appears only in the residuals. An example is the square root of a
-        # negative weight, which is not checked if the weight is traced.
+        # Traced weights are not checked, so a negative weight can make the residuals NaN.
         residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
         finite &= jnp.all(jnp.isfinite(residuals))
         result = where(solvable, result, RESULTS.undetermined_functional_map)
@@ -226,7 +223,7 @@ class RegularizedLeastSquares(Solution[None]):
         shape: tuple[int, int],
         dtype: DTypeLike,
     ) -> QuadraticEnergy:
-        """Returns the weighted sum of the given energy and descriptor preservation."""
+        """Returns the weighted sum of the given energy and the descriptor-preservation term."""
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError(
                 "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
@@ -311,8 +308,8 @@ class _Term(NamedTuple):
     **Attributes:**
 
     - `residual`: the residual as a function of C.
-    - `curvature`: half the second derivative of the term in each entry of C; None if the term is not
-      quadratic.
+    - `curvature`: half the second derivative of the term with respect to each entry of C; None if the term is
+      not quadratic.
     """
 
     residual: Callable[[Float[Array, "k_out k_in"]], Array]
@@ -323,8 +320,8 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
     """Returns the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
 
     The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
-    the gram matrix, because the factor has the same inner products as the columns. A ridge of the size of the
-    rounding error is added to the gram matrix, so the factor exists even if the energy alone does not
+    the gram matrix, because the factor has the same inner products as the columns. Adding the rounding error
+    to the diagonal of the gram matrix ensures that the factor exists, even if the energy alone does not
     determine C.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
@@ -337,10 +334,7 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """Returns the weighted term `||Lambda_out C - C Lambda_in||²`.
-
-    The eigenvalues are divided by the larger of the two shapes' largest eigenvalues.
-    """
+    """Returns the weighted term of Laplacian commutativity."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -348,7 +342,7 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """Returns the weighted term `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns."""
+    """Returns the weighted term of orthogonality."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -356,10 +350,7 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """Returns the weighted term `sum_d ||C D_in - D_out C||²`.
-
-    A common factor scales all operators so that the squared norms of the D_out sum to k_out.
-    """
+    """Returns the weighted term of descriptor commutativity."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]

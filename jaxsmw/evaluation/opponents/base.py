@@ -45,9 +45,9 @@ class MethodInput:
       `both_directions` is True; otherwise None.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether one shape is a partial shape of the other. The spectra of a partial pair are
-      comparable only up to the smaller of the two shapes' largest eigenvalues.
-    - `prepared`: the prepared pair as in `jaxsmw.match`, for methods that run a preset.
+    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
+      spectra of a partial pair are comparable only up to the smaller of the two shapes' largest eigenvalues.
+    - `prepared`: the `PreparedPair` from which this input was created, for methods that run a preset.
     """
 
     spectrum_x: Spectrum
@@ -125,8 +125,8 @@ class Method(abc.ABC):
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
     - `both_directions`: whether the method needs `MethodInput.reverse_initial_map`.
-    - `full_only`: whether the method cannot match partial pairs.
-    - `partial_only`: whether the method cannot match pairs of full shapes.
+    - `full_only`: whether the method matches only pairs of full shapes.
+    - `partial_only`: whether the method matches only partial pairs.
     """
 
     reference: str
@@ -140,8 +140,8 @@ class Method(abc.ABC):
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """Returns the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
 
-        If the status code is not `RESULTS.successful`, the map is invalid. Most methods then return -1 for
-        all vertices.
+        If the status code is not `RESULTS.successful`, the map is invalid. After a failure, most methods
+        return -1 for all vertices.
         """
 
     def check(self, pairs: Sequence[DataPair]) -> None:

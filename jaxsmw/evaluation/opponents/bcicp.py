@@ -1,24 +1,26 @@
 """BCICP: refines the maps X -> Y and Y -> X together, to make them bijective and continuous.
 
-J. Ren, A. Poulenard, P. Wonka, M. Ovsjanikov, *Continuous and orientation-preserving correspondences via
-functional maps*, ACM Transactions on Graphics 37(6), 2018, section 5. Neither the authors' program nor the
-text of the paper was available for this reconstruction. The reconstruction has the steps of the paper. Where
-a step may differ from the paper, its docstring says "our choice". One iteration consists of four steps:
+This module reconstructs the method in section 5 of Ren, Poulenard, Wonka, Ovsjanikov, *Continuous and
+orientation-preserving correspondences via functional maps*, ACM Transactions on Graphics 37(6), 2018. Neither
+the authors' program nor the text of the paper was available for this reconstruction. The reconstruction
+follows the steps of the paper. If a step may differ from the paper, the docstring of its function says "our
+choice". One iteration consists of four steps:
 
 1. `_bijective_step`: spectral ICP improves both maps together.
-2. `_improve_coverage`: vertices without a preimage receive one from the reverse map, where possible. Steps
-   1 and 2 run twice in each iteration.
-3. `_smooth`: the images of neighbouring vertices are averaged in space.
-4. `_repair`: vertices in small regions that discontinuous edges separate from the rest receive new images.
-   The new images are interpolated from the images of the surrounding vertices.
+2. `_improve_coverage`: vertices without a preimage receive a preimage from the reverse map, if possible.
+   Steps 1 and 2 run twice in each iteration.
+3. `_smooth`: the positions of the images of neighbouring vertices are averaged.
+4. `_repair`: the vertices of small regions receive new images. Such a region is separated from the rest of
+   the shape by discontinuous edges. The new images are interpolated from the images of the surrounding
+   vertices.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
 The reconstruction has larger errors than the authors' program, although both start from the authors' initial
 maps. On the 45 non-isometric TOSCA pairs, the mean geodesic error is 0.373 for the initial maps, 0.169 for
-the reconstruction, and 0.110 for the maps that the authors published. The reconstruction has the smaller
-error on 5 of the 45 pairs. The number of iterations, the number of smoothing rounds and the order of the
-steps were chosen for small errors on 8 of the 45 pairs.
+the reconstruction, and 0.110 for the maps that the authors published. On 5 of the 45 pairs, the
+reconstruction has a smaller error than the published maps. The number of iterations, the number of smoothing
+rounds and the order of the steps were chosen for small errors on 8 of the 45 pairs.
 
 `BCICP` has the settings of the benchmark: 50 eigenvectors and 10 iterations.
 
@@ -45,13 +47,11 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge of X is discontinuous if the distance between the images of its ends exceeds both of two thresholds:
-# 0.1 times the square root of the area of Y, and 2 times the mean edge length of Y. On a mesh with thousands
-# of vertices the first threshold is the length of a few edges, and is short compared with a limb. On coarse
-# meshes the second threshold is larger.
+# An edge of X is discontinuous if the images of its ends are far apart on Y. The distance between the images
+# then exceeds both 0.1 times the square root of the area of Y and 2 times the mean edge length of Y.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
-# A region that discontinuous edges separate from the rest of X is an outlier if its area is less than this
-# share of the area of X.
+# The vertices of a region of X are outliers if the area of the region is less than this share of the area of
+# X.
 _SMALL_REGION = 0.05
 # The number of times that `_bijective_step` runs in one iteration, each time followed by `_improve_coverage`.
 _SPECTRAL_STEPS = 2
@@ -66,12 +66,12 @@ class _Surface:
     **Attributes:**
 
     - `vertices`: the indices of the n remaining vertices in the mesh (n,).
-    - `positions`: the positions (n, 3), scaled to area 1.
+    - `positions`: the positions of these vertices (n, 3), scaled such that the shape has area 1.
     - `edges`: the ends of each edge (e, 2).
     - `component`: the index of the connected component that contains each vertex (n,).
-    - `near`: a sparse Boolean matrix (n, n), True for two vertices whose distance along edges is at most 0.1
-      or at most twice the mean edge length. An edge of the other shape is continuous if the images of its
-      ends are two such vertices.
+    - `near`: a sparse Boolean matrix (n, n), True for two vertices whose distance along edges is at most the
+      larger of 0.1 and twice the mean edge length. An edge of the other shape is continuous if `near` is True
+      for the images of its ends.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -86,7 +86,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Returns the surface of a mesh, without unreferenced vertices or vertices that the spectrum masks.
+        """Returns the surface of a mesh, without unreferenced vertices and vertices masked by the spectrum.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -111,7 +111,7 @@ class _Surface:
         )
 
     def adjacency(self, kept: Bool[np.ndarray, " e"] | None = None) -> csr_array:
-        """Returns the adjacency matrix (n, n) of the graph of all edges, or only of the kept edges."""
+        """Returns the adjacency matrix (n, n) of the vertices, for all edges or only for the edges `kept`."""
         tail, head = (self.edges if kept is None else self.edges[kept]).T
         places = np.concatenate([tail, head]), np.concatenate([head, tail])
         return csr_array((np.ones(len(places[0])), places), shape=(len(self.areas), len(self.areas)))
@@ -130,8 +130,9 @@ def bcicp(
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
     """Refines the maps X -> Y and Y -> X together with BCICP (Ren et al. 2018, section 5).
 
-    The result is deterministic and does not depend on the signs of eigenvectors. JAX searches for nearest
-    neighbours, in the floating-point type of the spectra. All other computations run in NumPy and SciPy.
+    The result is deterministic and does not depend on the signs of eigenvectors. Searches for nearest
+    neighbours run in JAX, with the floating-point type of the spectra. All other computations run in NumPy
+    and SciPy.
 
     **Arguments:**
 
@@ -139,10 +140,11 @@ def bcicp(
       connected components, non-manifold edges and unreferenced vertices are allowed.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not, with the same number of eigenvectors.
       The benchmark uses 50 eigenvectors.
-    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. Padded maps may be longer.
+    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. Padded maps may have more
+      entries.
     - `iterations`: the number of iterations, at least 1.
-    - `smoothing`: the number of smoothing rounds in the first iteration, at least 0. The number decreases to
-      1 in the last iteration. If `smoothing` is 0, no map is smoothed.
+    - `smoothing`: the number of smoothing rounds in the first iteration, at least 0. The number of rounds
+      decreases to 1 in the last iteration. If `smoothing` is 0, no map is smoothed.
 
     **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and
     masked vertices keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
@@ -177,8 +179,8 @@ def bcicp(
 def _schedule(iterations: int, smoothing: int) -> list[int]:
     """Returns the number of smoothing rounds of each iteration.
 
-    The numbers decrease geometrically to one (our choice). Many rounds in the first iterations remove the
-    folds of a poor initial map. Many rounds in every iteration would shrink limbs.
+    The number of rounds decreases geometrically to 1 (our choice). Many rounds in the first iterations remove
+    the folds of a poor initial map. Many rounds in every iteration would shrink limbs.
     """
     if smoothing == 0:
         return [0] * iterations
@@ -241,17 +243,17 @@ def _bijective_step(
 
     There are four functional maps: one for each direction, and one for each of the cycles X -> Y -> X and
     Y -> X -> Y. Each functional map is replaced by the nearest orthogonal matrix. The step seeks pointwise
-    maps such that, for y = T(x),
+    maps T that satisfy four conditions for y = T(x):
 
         Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
-    The functional map of a closed cycle is the identity, so `C_XX = C_XY C_YX` should be the identity. The
-    second matrix in each line is the first matrix, rotated such that the cycle closes.
+    The functional map of a closed cycle is the identity, so `C_XX = C_XY C_YX` should be the identity. In
+    each of the two equations, the second C is a rotation times the first C. The rotation closes the cycle.
 
     The embeddings of the four conditions are concatenated with equal weights, and one search for nearest
-    neighbours gives the new map X -> Y. The same search with queries and targets exchanged gives the new map
-    Y -> X. The equal weights and the form of the cycle conditions are our choice. On six pairs the
+    neighbours gives the new map X -> Y. A second search, with queries and targets exchanged, gives the new
+    map Y -> X. The equal weights and the form of the cycle conditions are our choice. On six pairs the
     alternative condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps.
     """
     phi_x, phi_y = x.eigenvectors, y.eigenvectors
@@ -269,9 +271,9 @@ def _improve_coverage(
 ) -> Int64[np.ndarray, " m"]:
     """Changes the map X -> Y such that more vertices of Y have a preimage.
 
-    An uncovered vertex y (without a preimage) becomes the image of x = T_YX(y), if the current image of x has
-    another preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their
-    indices (our choice).
+    A vertex y without a preimage becomes the image of x = T_YX(y), if the current image of x has another
+    preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their indices (our
+    choice).
     """
     improved, preimages = t_xy.copy(), np.bincount(t_xy, minlength=len(y.areas))
     for uncovered in np.flatnonzero(preimages == 0):
@@ -284,11 +286,11 @@ def _improve_coverage(
 
 
 def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int) -> Int64[np.ndarray, " m"]:
-    """Averages the images of neighbouring vertices in space, then takes the nearest vertices of Y.
+    """Averages the positions of the images of neighbouring vertices, then takes the nearest vertices of Y.
 
-    In each round the point of every vertex becomes the mean of this point and the points of its neighbours.
-    Points are moved back to vertices of Y only after the last round. If they were moved back after every
-    round, displacements shorter than an edge would be lost. The uniform weights are our choice.
+    In each round, the position of every image becomes the mean of this position and the positions of the
+    images of neighbouring vertices. Positions are moved to vertices of Y only after the last round, because
+    displacements shorter than an edge would otherwise be lost. The uniform weights are our choice.
     """
     if rounds == 0:
         return t_xy
@@ -303,20 +305,19 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
     """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
-    Two vertices of Y are far apart if their distance along edges exceeds both 0.1 times the square root of
-    the area of Y and twice the mean edge length of Y, or if no path connects them. The thresholds and the
-    distance along edges are our choice.
+    Two vertices of Y are far apart if `y.near` is False for them. The thresholds and the distance along edges
+    are our choice.
     """
     tail, head = t_xy[x.edges].T
     return ~np.asarray(y.near[tail, head], dtype=bool).ravel()
 
 
 def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Returns a mask (m,) of the vertices in small regions that discontinuous edges separate from the rest.
+    """Returns a mask (m,) of the outliers, which are the vertices in small regions of X.
 
-    A region is a connected component of the graph of continuous edges. It is small if it has less than 5 % of
-    the area of X (our choice). Whole limbs are larger, and only `_bijective_step` corrects their images. The
-    largest region of a connected component of X is never an outlier.
+    A region is a connected component of the graph of continuous edges. A region is small if its area is less
+    than 5 % of the area of X (our choice). The region of a whole limb is larger, and is corrected only by
+    `_bijective_step`. The largest region of each connected component of X contains no outliers.
     """
     _, region = connected_components(x.adjacency(~_discontinuous_edges(x, y, t_xy)), directed=False)
     area = np.bincount(region, weights=x.areas)
@@ -330,9 +331,9 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
 def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Gives outliers new images, which are interpolated from the images of the surrounding vertices.
 
-    The interpolation is harmonic, in the spectral embedding of Y (our choice): the point of every outlier in
-    this embedding is the mean of its neighbours' points. The new image of the outlier is the vertex of Y that
-    is nearest to this point.
+    The interpolation in the spectral embedding of Y is harmonic (our choice): the interpolated point of each
+    outlier is the mean of its neighbours' points. The new image of the outlier is the vertex of Y that is
+    nearest to the interpolated point.
     """
     outlier = _outliers(x, y, t_xy)
     if not outlier.any():

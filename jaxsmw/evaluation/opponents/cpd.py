@@ -1,19 +1,20 @@
-r"""Pointwise maps by Coherent Point Drift: the recovery of Rodolà, Moeller and Cremers (2015).
+r"""Recovers pointwise maps by Coherent Point Drift, as proposed by Rodolà, Moeller and Cremers (2015).
 
-This module implements two papers: E. Rodolà, M. Moeller, D. Cremers, *Point-wise map recovery and refinement
-from functional correspondence*, VMV 2015, arXiv 1506.05603; and A. Myronenko, X. Song, *Point set
+This module implements the methods of two papers: Rodolà, Moeller, Cremers, *Point-wise map recovery and
+refinement from functional correspondence*, VMV 2015, arXiv 1506.05603; and Myronenko, Song, *Point set
 registration: Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
 A search for nearest neighbours recovers a good pointwise map if the functional map is nearly a rotation of
-one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. The
-first paper then recovers the map by a non-rigid registration of two point sets in k dimensions. The embedding
-of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed.
+one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. For such
+shapes, Rodolà et al. recover the pointwise map by a non-rigid registration of two point sets in k dimensions.
+The embedding of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data")
+stays fixed.
 
-In the statistical model, a data point is uniform noise with probability w. Otherwise it is drawn from a
-mixture of isotropic Gaussians around the centroids with a common variance s. All vertices have equal weight,
-and their areas are ignored. The displacement of the centroids is a linear combination of Gaussian kernels at
-the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d) contains the coefficients of this
-combination in d dimensions. The moved centroids are `T = Y + G W`.
+In the statistical model, a data point is uniform noise with probability w. Otherwise the data point is drawn
+from a mixture of isotropic Gaussians around the centroids, which have a common variance s. Vertex areas are
+ignored, so all vertices have equal weight. The displacement of the centroids is a linear combination of
+Gaussian kernels at the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d) contains the
+coefficients of the linear combination. The moved centroids are `T = Y + G W`.
 
 Expectation maximisation (EM) alternates between two steps. The E-step computes the probability `P_ji` that
 data point i was drawn from the Gaussian around centroid j:
@@ -35,8 +36,8 @@ regression of the displacements on the columns of L,
 
     (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
 
-This system follows from the M-step by Woodbury's identity, and contains no division by small numbers. It is
-equivalent to the M-step if `L L^T` equals G.
+By Woodbury's identity, this system is equivalent to the linear system above if `L L^T` equals G. Solving this
+system needs no division by small numbers.
 
 `CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a
 functional map and recovers a pointwise map.
@@ -66,7 +67,7 @@ from jaxsmw.evaluation.opponents.presets import Refined
 # The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
 # EM stops when the variance s falls below this threshold, which Myronenko's program also uses. For point sets
-# of unit variance, a smaller variance is a rounding error.
+# of unit variance, a variance below this threshold is a rounding error.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -77,8 +78,7 @@ class Drift(eqx.Module):
 
     - `centroids`: the moved centroids (n, d), in the coordinate system and unit of the data. Masked rows are
       meaningless.
-    - `variance`: the final variance s of the Gaussians. Its unit of length is the root mean square distance
-      of the data from their mean.
+    - `variance`: the final variance s of the Gaussians, for data that are scaled to unit variance.
     - `iterations`: the number of EM iterations that were run.
     """
 
@@ -104,11 +104,11 @@ def coherent_point_drift(
 
     Each point set is first shifted to zero mean and scaled to unit variance: the mean squared distance of its
     points from their mean is then 1. The docstring of this module contains the equations. The default values
-    are those of Myronenko's program, except for the rank. His program uses the exact kernel matrix by
-    default, or optionally an approximation of rank sqrt(n). Tests on a real pair with 5000 vertices show the
-    effect of the rank. With 30 eigenvectors, the mean geodesic errors for the ranks 70, 300 and 1200 are
-    22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors, the mean geodesic errors for the ranks 150, 600 and
-    1200 are 17.2, 11.4 and 11.3 x 10^-3.
+    are those of Myronenko's program, except for the rank. Myronenko's program uses the exact kernel matrix by
+    default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
+    5000 vertices show the effect of the rank. With 30 eigenvectors, the errors for the ranks 70, 300 and 1200
+    are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors, the errors for the ranks 150, 600 and 1200 are
+    17.2, 11.4 and 11.3 x 10^-3.
 
     **Arguments:**
 
@@ -145,11 +145,11 @@ def kernel_factor(
 ) -> Float[Array, "n rank"]:
     """Returns a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
 
-    Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. A pivoted Cholesky factorisation
-    that stops at the given rank computes L. Each step eliminates the point with the largest residual on the
-    diagonal. The result is a Nyström approximation from points that are spread over the whole set. The choice
-    of these points is deterministic. The factorisation computes `rank` rows of the kernel matrix, and needs
-    about `n rank^2` operations.
+    Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. L is computed by a pivoted
+    Cholesky factorisation that stops at the given rank. Each step eliminates the point with the largest
+    residual on the diagonal. The eliminated points are spread over the whole set, and their choice is
+    deterministic. The result is the Nyström approximation from these points. The factorisation computes
+    `rank` rows of the kernel matrix, and needs about `n rank^2` operations.
 
     **Arguments:**
 
@@ -194,10 +194,10 @@ def recover_by_drift(
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
     with the nearest unmasked vertex of Y.
 
-    The default number of iterations, 50, is taken from a published run of the method on FAUST, with 30
-    eigenvectors and a functional map from spectral ICP (`exp_teaser` of
-    github.com/daviddao/GPU-Programming-TUM). After 50 iterations the centroids hardly move. All settings
-    except `rank` and `iterations` have the defaults of `coherent_point_drift`.
+    The default of 50 iterations is taken from a published run of the method on FAUST (`exp_teaser` of
+    github.com/daviddao/GPU-Programming-TUM). This run used 30 eigenvectors and a functional map from spectral
+    ICP. After 50 iterations the centroids hardly move. All settings except `rank` and `iterations` have the
+    defaults of `coherent_point_drift`.
 
     **Arguments:**
 
@@ -225,13 +225,13 @@ def recover_by_drift(
 class DriftRecovery(WaveletPreservation):
     """A refiner for `jaxsmw.refine` that recovers pointwise maps by Coherent Point Drift.
 
-    By default there is no filter, and the functional map is the least-squares solution `Phi_X^+ P Phi_Y`,
-    which is not orthogonal. A single iteration is the recovery of the paper (Rodolà, Moeller and Cremers
-    2015). Several iterations are the refinement of the paper, which updates the functional map and the
-    pointwise map alternately. The paper's formula for the functional map was not available for this
-    reconstruction, so least squares is our choice.
+    Without a filter (the default), the functional map is the least-squares solution `Phi_X^+ P Phi_Y`, which
+    is not orthogonal. A single iteration performs the recovery of Rodolà, Moeller and Cremers (2015). Several
+    iterations perform the refinement in the same paper, which updates the functional map and the pointwise
+    map alternately. The paper's formula for the functional map was not available for this reconstruction, so
+    least squares is our choice.
 
-    **Arguments:** those of `WaveletPreservation`, and
+    **Arguments:** the arguments of `WaveletPreservation`, and the following arguments.
 
     - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
 
@@ -304,8 +304,8 @@ def _drift(
     infinite = jnp.asarray(jnp.inf, x.dtype)
     initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The initial variance is the mean squared distance between data and centroids, divided by d. This is
-        # 2 / d, because both sets have zero mean and a mean squared norm of 1.
+        # The initial variance is the mean squared distance between data and centroids, divided by d. The
+        # initial variance is 2 / d, because both sets have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,
@@ -401,7 +401,7 @@ def _maximization(
     factor: Float[Array, "n rank"],
     ridge: Float[Array, ""],
 ) -> Float[Array, "rank d"]:
-    """Computes the M-step. Returns the coefficients (rank, d) of the displacement in the kernel factor."""
+    """Computes the M-step, and returns the coefficients b (rank, d) of the displacement `L b`."""
     weights = expected.per_centroid[:, None]
     gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
     wanted = product(factor.T, expected.weighted_data - weights * centroids)

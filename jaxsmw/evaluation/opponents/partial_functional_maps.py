@@ -1,19 +1,18 @@
 r"""Partial functional maps: finds a functional map and the region of Y that X covers.
 
-E. Rodolà, L. Cosmo, M. M. Bronstein, A. Torsello, D. Cremers, *Partial functional correspondence*, Computer
-Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper was available for this
-reconstruction. This docstring therefore gives no equation numbers. The formula of the weights W was written
-from memory.
+This module reconstructs the method of Rodolà, Cosmo, Bronstein, Torsello, Cremers, *Partial functional
+correspondence*, Computer Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper
+was available for this reconstruction. The formula of the weights W was written from memory.
 
 X is the partial shape, and Y is the full shape. Functions F on X correspond to functions G on Y, but only
 inside the region of Y that X covers. A membership function v on Y describes the region: eta(v) is near 1
-inside the region and near 0 outside. The function eta and the coefficients A and B(v) of the functions in the
-eigenbases Phi_X and Phi_Y are
+inside the region and near 0 outside. The function eta is a smooth step. A and B(v) are the coefficients of
+the functions in the eigenbases Phi_X and Phi_Y:
 
     eta(t) = (tanh(6 (t - 1/2)) + 1) / 2,    A = Phi_X^+ F,    B(v) = Phi_Y^+ (eta(v) G).
 
 In the paper, the functional map C takes functions on X to functions on Y. In the code, C is the pullback,
-which is the transpose of this matrix. The paper minimises the following energy alternately over C and v:
+which is the transpose of the paper's C. The paper minimises the following energy alternately over C and v:
 
     ||C A - B(v)||_{2,1}
         + mu_1 ||C * W||^2 + mu_2 sum_{i != j} (C^T C)_ij^2 + mu_3 sum_i ((C^T C)_ii - d_i)^2
@@ -22,7 +21,8 @@ which is the transpose of this matrix. The paper minimises the following energy 
 The first line of the energy is the fidelity term. The second line regularises the functional map, and the
 third line regularises the region. The weights W grow with the distance from a slanted diagonal of C. The
 slope of this diagonal is `r / k`, where the r-th eigenvalue of X is about as large as the k-th eigenvalue of
-Y. This slope is about the ratio of the areas of X and Y. The number d_i is 1 for i <= r and 0 for larger i.
+Y. The slope of the diagonal is approximately the area of X divided by the area of Y. The number d_i is 1 for
+i <= r and 0 for larger i.
 
 The reconstruction differs from the paper in the following points.
 
@@ -30,18 +30,18 @@ The reconstruction differs from the paper in the following points.
   reconstruction, the first C is the functional map of the initial map, because all compared methods start
   from the initial map.
 - **Iterations.** A few steps of spectral ICP follow each minimisation over C. Each step makes the rows of C
-  orthonormal, like the refinement at the end of the paper. Without these steps, the computed regions are
-  wrong. The intersection over union of the computed and the true region on three real pairs is 39, 21 and
-  21 % without the steps, and 83, 81 and 43 % with the steps.
+  orthonormal, like the final refinement in the paper. Without steps of spectral ICP, the computed regions are
+  wrong. On three real pairs, the intersection over union of the computed and the true region is 39, 21 and
+  21 % without these steps, and 83, 81 and 43 % with these steps.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
-  [0, 1]. If a minimisation starts from v = 1 or from the previous v, wrong regions remain, because the
-  derivative of eta nearly vanishes where v is near 0 or 1.
+  [0, 1]. A minimisation that starts from v = 1 or from the previous v does not correct wrong regions, because
+  the derivative of eta nearly vanishes where v is near 0 or 1.
 - **Descriptors.** The last column of F and of G is the constant function 1. The other columns are the first
   principal components of the SHOT descriptors of both shapes, scaled to mean square 1. The paper uses all 352
-  entries of the SHOT descriptors as columns. These entries are nonnegative, so all columns of the paper have
-  a large constant part. In the reconstruction, the constant function has as much weight as all principal
-  components together. The results with 10 to 30 components differ little. With 100 components, the true
-  functional map and region have a higher energy than C = 0.
+  entries of the SHOT descriptors as columns. SHOT entries are nonnegative, so every column in the paper has a
+  large constant part. In the reconstruction, the constant function has as much weight as all principal
+  components together. The number of components has little effect between 10 and 30. With 100 components, the
+  energy of the true functional map and region is higher than the energy of C = 0.
 - **Rank.** Only the r nonzero columns of the paper's C are stored.
 - **Length.** The function xi is 1, so the term of mu_5 is the total variation of v. In the paper, xi(v)
   vanishes unless v is near 1/2.
@@ -101,8 +101,7 @@ _DECAY = 0.03
 # Norms of columns and of gradients are smoothed below this threshold. The threshold is 0.1 % of the norm of a
 # descriptor, and 0.1 % of the gradient of a function that changes by 1 across Y.
 _SMOOTHING = 1e-3
-# The largest numbers of L-BFGS steps in a minimisation over C and in a minimisation over v. Most
-# minimisations use most of these steps.
+# The largest numbers of L-BFGS steps in a minimisation over C and in a minimisation over v.
 _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
@@ -155,8 +154,8 @@ class SurfaceGradient(eqx.Module):
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
         """Returns the total variation of a function, the integral of the gradient's length over the surface.
 
-        This is the Mumford-Shah term of the paper with xi = 1. The length of the gradient is smoothed at
-        zero.
+        The Mumford-Shah term of the paper is the total variation if xi = 1. The length of the gradient is
+        smoothed at zero.
 
         **Arguments:**
 
@@ -201,15 +200,17 @@ def partial_functional_map(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the unit of length in which Y has area 1, cut to
-      their common range of eigenvalues (`jaxsmw.pair.common_range`). The number k_X of eigenvectors of X is
-      then the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors of X are used.
-      Both spectra need the same number of comparable descriptors, scaled to mean square 1.
-    - `gradient_y`: the gradient of functions on Y, in the same unit of length.
+      their common range of eigenvalues (`jaxsmw.pair.common_range`). After this cut, the number k_X of
+      eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors
+      of X are used. Both spectra need the same number of comparable descriptors, scaled to mean square 1.
+    - `gradient_y`: the gradient of functions on Y, in the unit of length in which Y has area 1.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
-    - `iterations`: the number of iterations, at least 1. Each iteration minimises over C, then over v.
+    - `iterations`: the number of iterations, at least 1. Each iteration minimises the energy over C, then
+      over v.
     - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
 
-    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check its status code `result`.
+    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check the status code in its
+    attribute `result`.
 
     **Raises:** `ValueError` if `iterations` is less than 1, if a spectrum has no descriptors, or if the
     numbers of descriptors differ.
@@ -248,9 +249,9 @@ class _Energies(eqx.Module):
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y. X has r eigenvectors, at most k_Y.
     - `gradient_y`: the gradient of functions on Y.
     - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
-    - `coefficients_x`: A, the coefficients of the descriptors and of the constant function on X (r,
-      functions).
-    - `functions_y`: G, the descriptors and the constant function on Y (n, functions).
+    - `coefficients_x`: A (r, functions), the coefficients of the descriptors and of the constant function on
+      X.
+    - `functions_y`: G (n, functions), the descriptors and the constant function on Y.
     """
 
     spectrum_x: Spectrum
@@ -301,7 +302,8 @@ class _Energies(eqx.Module):
     def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
         """Minimises the energy over the membership function for a fixed `c`, starting from `covered(c)`."""
         area_x = jnp.sum(self.spectrum_x.vertex_areas)
-        # The solver uses the variable u = v sqrt(vertex area), so the density of the mesh does not affect it.
+        # The solver minimises over u = v sqrt(vertex area), which makes the solver nearly independent of the
+        # mesh density.
         metric = jnp.sqrt(jnp.where(self.spectrum_y.mask, self.spectrum_y.vertex_areas, 1))
 
         def energy(scaled: Float[Array, " n"]) -> Float[Array, ""]:
@@ -341,9 +343,8 @@ def fidelity(
 ) -> Float[Array, ""]:
     """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
 
-    The last column of the matrix `C A - B` belongs to the constant function, and the other columns belong to
-    descriptors. The fidelity term is the mean norm of the descriptor columns of this matrix plus the norm of
-    its last column.
+    The last column of the matrix `C A - B` belongs to the constant function. The fidelity term is the norm of
+    this column plus the mean norm of all other columns, which belong to descriptors.
 
     **Arguments:**
 
@@ -357,7 +358,8 @@ def fidelity(
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
     """Returns the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
 
-    These terms keep the large entries of C near the slanted diagonal, and its rows nearly orthonormal.
+    These terms keep the large entries of C near the slanted diagonal, and keep the rows of C nearly
+    orthonormal.
 
     **Arguments:**
 
@@ -389,7 +391,7 @@ def region_energy(
 
     - `membership`: the membership function v on Y (n,).
     - `area_x`: the area of X, in the unit in which Y has area 1.
-    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient on Y, in the same unit.
+    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient on Y, in the unit in which Y has area 1.
     """
     area, length = REGION_WEIGHTS
     missing = area_x - jnp.sum(spectrum_y.vertex_areas * eta(membership))
@@ -411,7 +413,7 @@ def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, "
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """Refines C by `steps` steps of spectral ICP, the refinement at the end of the paper.
+    """Refines C by `steps` steps of spectral ICP, which is also the final refinement in the paper.
 
     Each step searches for nearest neighbours, encodes the matches as a functional map, and replaces this map
     by the nearest matrix with orthonormal rows.
@@ -434,7 +436,7 @@ def _minimum(
 ) -> Float[Array, " ..."]:
     """Minimises an energy by at most `steps` steps of L-BFGS, and returns the final point.
 
-    If the steps do not suffice to reach a minimum, no error is raised.
+    No error is raised if the minimum is not reached.
     """
     import optimistix as optx  # optimistix is imported here because its import is slow
 
@@ -446,7 +448,7 @@ def _minimum(
 class PartialFunctionalMaps(Method):
     """A method that matches a partial shape X with a full shape Y by `partial_functional_map`.
 
-    **Attributes:** those of `Method`, and
+    **Attributes:** the attributes of `Method`, and the following attribute.
 
     - `iterations`: the number of iterations; see `partial_functional_map`.
     """

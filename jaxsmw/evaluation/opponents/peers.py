@@ -1,14 +1,14 @@
-"""The ZoomOut implementations of other libraries, on the same spectra and initial maps as all other methods.
+"""The ZoomOut implementations of other libraries, as methods for `jaxsmw benchmark`.
 
 The methods need optional packages, and are available only if these packages are installed:
 
     pip install 'jaxsmw[benchmark,peers]'
 
-The methods run in the same process and on the same number of cores as all other methods. Both methods use the
-settings of the ZoomOut paper (see `zoomout`): the number of eigenvectors k is 20, 25, ..., 120, and every
-iteration uses all vertices.
+The methods receive the same spectra and initial maps as all other methods, and run on the same number of
+cores. Both methods use the settings of the ZoomOut paper (see `zoomout`): the number of eigenvectors k is 20,
+25, ..., 120, and every iteration uses all vertices.
 
-- `PyFM` calls the function `zoomout_refine` of pyFM by R. Magnet (`pyfmaps` on the package index) with
+- `PyFM` calls the function `zoomout_refine` of Robin Magnet's pyFM (`pyfmaps` on the package index) with
   `n_jobs=1`.
 - `Geomfum` uses the class `ZoomOut` of geomfum.
 """
@@ -96,7 +96,6 @@ class PyFM(Peer):
     package = "pyFM"
 
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Refines the initial map with `pyFM.refine.zoomout_refine`; see `Peer.refine`."""
         from pyFM.refine import zoomout_refine
         from pyFM.spectral import p2p_to_FM
         from scipy.sparse import diags_array
@@ -128,7 +127,6 @@ class Geomfum(Peer):
     package = "geomfum"
 
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Refines the initial map with `geomfum.refine.ZoomOut`; see `Peer.refine`."""
         from geomfum.basis import EigenBasis
         from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
         from geomfum.refine import ZoomOut
@@ -143,6 +141,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Returns a dictionary from names to the methods of this module whose packages are installed."""
+    """Returns a dictionary from name to method, with the methods whose packages are installed."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

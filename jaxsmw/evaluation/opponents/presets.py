@@ -28,7 +28,7 @@ class Refined(Method):
     **Attributes:**
 
     - `reference`: the publication and the settings, as text; see `Method`.
-    - `refiner`: the refiner; `WaveletPreservation()`, the refiner of MWP, by default.
+    - `refiner`: the refiner. The default is `WaveletPreservation()`, the refiner of MWP.
     - `number_of_eigenvectors`: the number of eigenvectors of both shapes.
     - `iterations`: the number of iterations.
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates; None for all

@@ -34,7 +34,7 @@ class PublishedMaps(Method):
 
     @property
     def reference(self) -> str:  # type: ignore[override]
-        """The text that is printed with the results. It contains the name of the directory."""
+        """The text that is printed with the results, which contains the name of the directory."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:

@@ -1,10 +1,10 @@
 """Spectral ICP, and refinement without any constraint on the functional map.
 
-Spectral ICP is the iterative refinement of M. Ovsjanikov, M. Ben-Chen, J. Solomon, A. Butscher, L. Guibas,
-*Functional maps: a flexible representation of maps between shapes*, ACM Transactions on Graphics 31(4), 2012.
-Each iteration encodes the pointwise map as a functional map, replaces the functional map by the nearest
-orthogonal matrix, and then searches for nearest neighbours. Both methods run in the loop of `jaxsmw.refine`
-with 100 eigenvectors, the number that MWP uses.
+Spectral ICP is the iterative refinement of Ovsjanikov, Ben-Chen, Solomon, Butscher, Guibas, *Functional maps:
+a flexible representation of maps between shapes*, ACM Transactions on Graphics 31(4), 2012. Each iteration
+encodes the pointwise map as a functional map, replaces the functional map by the nearest orthogonal matrix,
+and then searches for nearest neighbours. `SPECTRAL_ICP` and `NO_FILTER` run in the loop of `jaxsmw.refine`
+with 100 eigenvectors, like MWP.
 
 - `SPECTRAL_ICP`: spectral ICP with 10 iterations.
 - `NO_FILTER`: MWP without filters, with 3 iterations like MWP. The encoded functional map is used unchanged.

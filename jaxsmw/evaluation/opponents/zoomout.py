@@ -1,8 +1,8 @@
 """ZoomOut: iterative spectral upsampling.
 
-S. Melzi, J. Ren, E. Rodolà, A. Sharma, P. Wonka, M. Ovsjanikov, *ZoomOut: spectral upsampling for efficient
-shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration encodes the pointwise map as a
-functional map of size k, searches for nearest neighbours, and increases k.
+This module implements the method of Melzi, Ren, Rodolà, Sharma, Wonka, Ovsjanikov, *ZoomOut: spectral
+upsampling for efficient shape correspondence*, ACM Transactions on Graphics 38(6), 2019. Each iteration
+encodes the pointwise map as a functional map of size k, searches for nearest neighbours, and increases k.
 
 - `ZOOMOUT` uses the sizes k = 20, 25, ..., 120, and iterates on all vertices.
 - `ZOOMOUT_SAMPLED` uses the same sizes, and iterates on 1000 samples of each shape (section 4.3 of the
