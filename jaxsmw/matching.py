@@ -296,7 +296,7 @@ def match(
       `"exact"`.
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`. False, the default, for two full shapes.
-    - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
+    - `history`: whether to record a `History` of the last stage, as `refinement.history` of the result.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
     vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,

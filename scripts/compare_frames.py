@@ -81,7 +81,7 @@ def select_pairs(data: Path, count: int) -> list[PairName]:
     for data_set in DATA_SETS:
         listing = data / data_set / "test_pairs.txt"
         if not listing.is_file():
-            raise InputError(f"{listing}: is missing: give the directory that holds {data_set}.")
+            raise InputError(f"{listing}: does not exist: give the directory that holds {data_set}.")
         lines = [line.split() for line in listing.read_text("utf-8").splitlines() if line.strip()]
         if wrong := [line for line in lines if len(line) != 2]:
             raise InputError(f"{listing}: {' '.join(wrong[0])!r} does not name two shapes: correct the line.")

@@ -327,7 +327,8 @@ def falls_back(mesh, k):
     return bool(caught)
 
 
-# The cells of the subspace have a radius of one edge for (60, 40), and of three edges for (120, 10).
+# The approximate eigensolver divides the surface into cells. Their radius is about one edge length for the grid of
+# size 60 with k = 40, and about three edge lengths for size 120 with k = 10.
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "k"), [(60, 40), (120, 10)])
 @pytest.mark.parametrize("noise", [0, 0.1, 0.3])

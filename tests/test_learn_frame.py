@@ -37,7 +37,7 @@ def fake_pair(seed: int) -> tuple[SimpleNamespace, Sampled]:
 
 @pytest.fixture
 def pairs(monkeypatch):
-    # The vertices of random spectra are far from each other, so the soft maps need a high temperature.
+    # The embedded vertices of random spectra are far from each other, so the soft maps need a high temperature.
     monkeypatch.setattr(learn_frame, "TEMPERATURE", 1.0)
     made = [fake_pair(seed) for seed in range(3)]
     with jax.numpy_dtype_promotion("standard"):  # optax needs standard promotion

@@ -479,7 +479,7 @@ def test_presets_match_a_copy_accurately(pair):
 
 def test_presets_fit_small_meshes(monkeypatch):
     """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
-    # In a compilation thread, Beartype, which only tests use, would capture our warnings.
+    # Nothing is compiled in a thread here, because Beartype (used only in tests) captures warnings in threads.
     monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):

@@ -18,7 +18,7 @@ from jaxsmw.core.solutions import DescriptorPair, Filtering, LeastSquares, Regul
 from jaxsmw.core.spectrum import Spectrum
 
 M, K = 120, 8
-# These temperatures are high because the vertices of random spectra are far from each other.
+# These temperatures are high because the embedded vertices of random spectra are far from each other.
 RECOVERIES = {"softmax": Softmax(10.0), "few": NearestFew(5, 10.0), "sinkhorn": Sinkhorn(10.0, 6)}
 
 

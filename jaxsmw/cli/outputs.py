@@ -1,4 +1,4 @@
-"""The files that commands write: checks before the computation, and messages after a file is written."""
+"""Checks of output paths before the computation, and messages that name each written file."""
 
 from __future__ import annotations
 

@@ -406,7 +406,7 @@ def _bounds(
     """Computes lower bounds on the distances from queries to the points of patches.
 
     **Returns:** Three values for all patches and all queries of a block. The first value is an array of the
-    squared distances from the queries to the boxes, with all radii set to zero. The second value is an array
+    squared distances from the queries to the boxes around the patches. The second value is an array
     of lower bounds on the distances from the queries to the points of the patches. The third value is a list
     with one array per axis, which contains the coordinates of the queries along this axis of each patch.
     """

@@ -118,7 +118,7 @@ class _Body:
         self.joints: dict[str, int] = {}
         self.parents: list[int] = []
         self._pivots: list[np.ndarray] = []
-        self._guides: list[tuple[int, np.ndarray]] = []  # each joint with the two balls whose hull it moves
+        self._guides: list[tuple[int, np.ndarray]] = []  # joints, each with the two balls of its limb
         self._tubes: list[_Tube] = []
         self._scale = np.exp(0.05 * random.normal(size=4))
         self._frequencies = 1.5 * random.normal(size=(3, 4))
@@ -126,7 +126,7 @@ class _Body:
         self._amplitudes = 0.03 * random.normal(size=(4, 4))
 
     def _individual(self, balls: str) -> np.ndarray:
-        """Convert balls "x y z radius, ..." to an array (p, 4), and apply the individual's proportions."""
+        """Parse p balls, written as "x y z radius, ...", and scale them to this creature's proportions."""
         chain = np.array([ball.split() for ball in balls.split(",")], dtype=float)
         across, up, ahead = (
             chain[:, i, None] * self._frequencies[i] + (i > 0) * self._phases for i in range(3)

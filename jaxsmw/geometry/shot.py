@@ -19,8 +19,8 @@ SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The radius of SHOT neighbourhoods in the MWP paper, in units of the square root of the area."""
-# A block of vertices has about this number of pairs, each of a vertex and a neighbour. A pair takes about 300
-# bytes, so the histograms of a block stay in the processor's cache.
+# The approximate number of (vertex, neighbour) pairs in a block of vertices. A pair takes about 300 bytes,
+# so the histograms of a block stay in the processor's cache.
 _PAIRS_PER_BLOCK = 30_000
 
 

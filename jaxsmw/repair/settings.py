@@ -122,9 +122,9 @@ class RepairSettings:
       this value. The scores of a correct map and an upside-down map differ by more than this value.
     - `alternatives` (Table R13): the alternative initial maps from functional maps, as a tuple of pairs. Each
       pair contains a tuple of SHOT radii and a weight w from 0 to 1. The radii are positive integers, in
-      units of 0.06 times the square root of the area. Nearest neighbours of X's vertices on Y give one
-      functional map, with weight 1 - w. Nearest neighbours of Y's vertices on X give another functional map,
-      with weight w. The initial map is computed from the weighted mean of both functional maps.
+      units of 0.06 times the square root of the area. A functional map of weight 1 - w is
+      computed from the map X -> Y of nearest neighbours. A functional map of weight w is computed from the
+      reverse map Y -> X. The initial map is computed from the weighted mean of the two functional maps.
     - `alternative_eigenvectors`: the number of eigenvectors of the functional maps in `alternatives`.
     - `extremity_levels`: the levels (numbers of eigenvectors) of the feature regression that refines maps
       from pairings of extremities (entry R14).
