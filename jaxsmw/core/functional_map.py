@@ -173,10 +173,11 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
-    `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
-    energy of C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy; it needs a regular `gram` (`is_regular`).
-    `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of shape ().
+    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares `sum_i
+    ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the energy of
+    C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy; it needs
+    a regular `gram` (`is_regular`). `energy + other` adds two energies, and `weight * energy` multiplies an
+    energy by an array of shape ().
 
     **Attributes:**
 

@@ -44,8 +44,9 @@ class SoftMap(eqx.Module):
       area-weighted mean of the database is the origin.
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
       zero. The shares of a query of area zero are still computed from its position.
-    - `potentials`: g (n,), without unit. The higher the potential of a database row, the more each query gives it. The potential is
-      zero for rows of zero area, and for all rows of a map that `Softmax` computed.
+    - `potentials`: g (n,), without unit. The higher the potential of a database row, the more each query
+      gives it. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
+      computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
     - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
       areas. It is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
@@ -189,7 +190,8 @@ class Recovery(eqx.Module):
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
     The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
-    The areas are in any unit. Padded vertices have area zero and must receive share zero. The result is a `SoftMap` or a `SparseSoftMap` from the queries to the database.
+    The areas are in any unit. Padded vertices have area zero and must receive share zero. The result is a
+    `SoftMap` or a `SparseSoftMap` from the queries to the database.
     """
 
     @abc.abstractmethod

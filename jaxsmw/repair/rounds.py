@@ -46,10 +46,11 @@ def refine_in_stages(
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
     3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to and
-       including the repeated stage. The repeated stage then runs again in up to `rough_rounds` rounds. Up
-       to `finalists` different outcomes with the best scores go through all later stages and through repair. Among the outcomes that look right, the outcome with the best score is returned. If no
-       outcome looks right, but at least `agreeing` initial maps lead to the same map, this map is returned.
-       If fewer initial maps agree, the outcome with the best score is returned.
+       including the repeated stage. The repeated stage then runs again in up to `rough_rounds` rounds. Up to
+       `finalists` different outcomes with the best scores go through all later stages and through repair.
+       Among the outcomes that look right, the outcome with the best score is returned. If no outcome looks
+       right, but at least `agreeing` initial maps lead to the same map, this map is returned. If fewer
+       initial maps agree, the outcome with the best score is returned.
 
     **Arguments:**
 

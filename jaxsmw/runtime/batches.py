@@ -86,7 +86,8 @@ def refine_pairs(
 
     **Arguments:**
 
-    - `spectra`: a sequence of shapes, each a `Spectrum`.
+    - `spectra`: a sequence of shapes, each a `Spectrum`. Numbers of eigenvectors may differ. All shapes have
+      the same number of descriptors, or none.
     - `pairs`: for each pair, a tuple of two integers: the indices of source X and target Y in `spectra`,
       counted from 0. A pair may occur several times with different initial maps.
     - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one vertex of Y

@@ -16,10 +16,10 @@ class Warp(eqx.Module):
     """The base class of warps: monotone maps of the eigenvalue axis, for use in `Warped(bank, warp)`.
 
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
-    are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
-    `__call__(points, eigenvalues)`, which returns the warped points (p,). The warped points must be
-    non-negative and increase with the points; nothing checks this. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in
-    ascending order; the last one is lambda_max.
+    are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define `__call__(points,
+    eigenvalues)`, which returns the warped points (p,). The warped points must be non-negative and increase
+    with the points; nothing checks this. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,) are the
+    shape's eigenvalues in ascending order; the last one is lambda_max.
 
     A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
     on ratios of eigenvalues.
