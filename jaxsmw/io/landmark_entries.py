@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.landmarks import CoordinateSystem, Landmarks, name_fault, usable
+from jaxsmw.io.landmarks import CoordinateSystem, Landmarks, first_faulty_name, usable
 from jaxsmw.io.text import is_number
 
 _NOT_IN_NUMBERS = re.compile(r"[^0-9+\-.eE\n]")
@@ -41,16 +41,14 @@ class Entries(NamedTuple):
                 f"{self._place(int(wrong.argmax()))} has a coordinate that is not a finite number below "
                 "1e60: correct the position."
             )
-        first: dict[str, int] = {}
-        for i, name in enumerate(self.names):
-            fault = name_fault(name)
-            if fault:
-                raise InputError(f"the name in {self._place(i)} {fault}: rename the landmark.")
-            if first.setdefault(name, i) != i:
-                raise InputError(
-                    f"{self._place(first[name])} and {self._place(i)} have the same name {name[:40]!a}: "
-                    "give each landmark its own name."
-                )
+        if faulty := first_faulty_name(self.names):
+            place = self._place(faulty.index)
+            if faulty.earlier is None:
+                raise InputError(f"the name in {place} {faulty.fault}: rename the landmark.")
+            raise InputError(
+                f"{self._place(faulty.earlier)} and {place} have the same name "
+                f"{self.names[faulty.index][:40]!a}: give each landmark its own name."
+            )
         return Landmarks(tuple(self.names), self.positions, self.coordinates, path, self.notes)
 
     def _place(self, i: int) -> str:

@@ -38,7 +38,7 @@ _WRITERS: dict[str, Callable[[Landmarks], str]] = {
 _WITH_SYSTEM = (".mrk.json", ".fcsv")
 
 # The largest size of a file in bytes: 128 MiB, more than a million lines. JSON needs up to 25 times its size
-# in memory, so files of 32 MiB are the largest; they contain 60 000 control points of Slicer.
+# in memory, so files of 32 MiB are the largest; they contain 50 000 points of Slicer.
 _LARGEST, _LARGEST_JSON = 2**27, 2**25
 
 

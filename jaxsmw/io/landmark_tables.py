@@ -20,16 +20,17 @@ from jaxsmw.io.text import is_number
 
 _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
 _LONGEST_LINE = 2**16
-_FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID".split(",")
+_FCSV_COLUMNS = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc"]
+_FCSV_COLUMNS += ["associatedNodeID"]
 _SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
 
 
 class _Columns(NamedTuple):
-    """The 0-based columns of x, y, z and of the name (None without names), and the number of columns."""
+    """The 0-based columns of x, y, z and of the name (None without names), and the total of columns."""
 
     positions: list[int]
     name: int | None
-    count: int
+    total: int
 
 
 def parse_table(text: str) -> Entries:
@@ -56,9 +57,9 @@ def parse_table(text: str) -> Entries:
     if not has_header:
         rows = _rows(lines, separator)
     for number, cells in rows:
-        if len(cells) != columns.count:
+        if len(cells) != columns.total:
             raise InputError(
-                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.count}: correct the "
+                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}: correct the "
                 "line, and put names that contain the separator in double quotes."
             )
         numbers.append(number)
@@ -68,7 +69,7 @@ def parse_table(text: str) -> Entries:
 
 
 def _is_value(cell: str) -> bool:
-    """Return whether a cell is a number, perhaps not finite or with a decimal comma, and not a column name."""
+    """Return whether a cell is a number, also one that is not finite or has a decimal comma."""
     return is_number(cell.replace(",", "."), finite=False)
 
 
@@ -154,9 +155,9 @@ def parse_fcsv(text: str) -> Entries:
     x, y, z = columns.positions
     rows = _rows(["" if line.startswith("#") else line for line in lines], ",")
     for place, (number, cells) in enumerate(rows, start=1):
-        if len(cells) < columns.count:
+        if len(cells) < columns.total:
             raise InputError(
-                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.count}, so the file "
+                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}, so the file "
                 "is truncated or damaged: export the markups again."
             )
         if order == _FCSV_COLUMNS and cells[len(order) : len(order) + 1] in (["0"], ["1"]):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -69,11 +68,10 @@ class Landmarks:
                 f"{self.name}: a coordinate of {self.names[wrong.argmax()]!a} is not a finite number below "
                 f"{LARGEST_EXTENT:.0e}: correct the position."
             )
-        for name, count in Counter(self.names).items():
-            if (fault := name_fault(name)) or count > 1:
-                raise InputError(
-                    f"{self.name}: the name {name[:40]!a} {fault or 'is repeated'}: rename the landmark."
-                )
+        if faulty := first_faulty_name(self.names):
+            raise InputError(
+                f"{self.name}: the name {self.names[faulty.index][:40]!a} {faulty.fault}: rename the landmark."
+            )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -117,7 +115,28 @@ def usable(positions: Float64[np.ndarray, "*any"]) -> np.ndarray:
     return np.abs(positions) <= LARGEST_EXTENT
 
 
-def name_fault(name: str) -> str:
+class FaultyName(NamedTuple):
+    """The 0-based index of a name, the index of an equal name before it or None, and the fault in words."""
+
+    index: int
+    earlier: int | None
+    fault: str
+
+
+def first_faulty_name(names: Sequence[str]) -> FaultyName | None:
+    """Return the first name that is empty, repeated or not one line of text, or None."""
+    if len(set(names)) == len(names) and not any(map(_fault, names)):
+        return None
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if fault := _fault(name):
+            return FaultyName(i, None, fault)
+        if (earlier := first.setdefault(name, i)) != i:
+            return FaultyName(i, earlier, "is repeated")
+    return None
+
+
+def _fault(name: str) -> str:
     """Return what is wrong with the name of a landmark, or an empty string."""
     if not name:
         return "is empty"

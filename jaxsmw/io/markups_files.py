@@ -87,9 +87,10 @@ def _single_list(document: Any) -> dict[str, Any]:
             f"contains {count_of(len(markups), 'markup')} instead of one point list: save each point list in "
             "its own file."
         )
-    if markups[0].get("type") != "Fiducial":
+    kind = markups[0].get("type")
+    if kind != "Fiducial":
         raise InputError(
-            f"contains a markup of the type {str(markups[0].get('type'))[:40]!a}: convert it to a point list "
+            f"contains a markup of the type {_excerpt(kind)}: convert it to a point list "
             "(type 'Fiducial') in 3D Slicer."
         )
     return markups[0]
@@ -99,10 +100,11 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
     """Return the coordinate system of a markup, and a note if it is the default of the schema."""
     if "coordinateSystem" not in markup:
         return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
-    stated = str(markup["coordinateSystem"])
-    if stated not in _SYSTEMS:
+    stated = markup["coordinateSystem"]
+    if not isinstance(stated, str) or stated not in _SYSTEMS:
         raise InputError(
-            f"the coordinate system {stated[:40]!a} is neither LPS (1) nor RAS (0): export the markups again."
+            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0): export the markups "
+            "again."
         )
     return _SYSTEMS[stated], ()
 
@@ -111,8 +113,13 @@ def _is_defined(point: dict[str, Any], number: int) -> bool:
     """Return whether the position of a control point is defined. The default of the format is yes."""
     status = point.get("positionStatus", "defined")
     if status != "defined" and status not in _NOT_DEFINED:
-        _refuse(number, f"has the unknown position status {str(status)[:40]!a}")
+        _refuse(number, f"has the unknown position status {_excerpt(status)}")
     return status == "defined"
+
+
+def _excerpt(value: Any) -> str:
+    """Return the beginning of a text for messages. Other values can be long, so only their type is named."""
+    return ascii(value[:40]) if isinstance(value, str) else f"that is a {type(value).__name__}"
 
 
 def _refuse(number: int, fault: str) -> NoReturn:
@@ -120,7 +127,7 @@ def _refuse(number: int, fault: str) -> NoReturn:
 
 
 def format_markups(landmarks: Landmarks) -> str:
-    """Return landmarks as a Markups file. The coordinate system must be known.
+    """Return landmarks as a Markups file with one point per line. The coordinate system must be known.
 
     The file states no unit, because the unit of landmarks is not known; Slicer then assumes mm.
     """
@@ -150,7 +157,8 @@ def format_markups(landmarks: Landmarks) -> str:
         "fixedNumberOfControlPoints": False,
         "labelFormat": "%N-%d",
         "lastUsedControlPointNumber": len(points),
-        "controlPoints": points,
+        "controlPoints": [],
     }
-    document = {"@schema": _SCHEMA, "markups": [markup]}
-    return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps({"@schema": _SCHEMA, "markups": [markup]}, indent=2)
+    lines = ",\n".join(json.dumps(point, ensure_ascii=False, allow_nan=False) for point in points)
+    return text.replace('"controlPoints": []', f'"controlPoints": [\n{lines}\n]') + "\n"

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmark_entries import Entries, left_out, parse_positions
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
@@ -31,7 +30,7 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
     `on_start` receives the attributes of each element, when the element begins. `on_text` receives the text
     of each element without children, when the element ends.
     """
-    if re.search("<[^<]{%d}" % _LONGEST_TAG, text):
+    if re.search(f"<[^<]{{{_LONGEST_TAG}}}", text):
         raise InputError(f"has an element of more than {_LONGEST_TAG} characters: export the points again.")
     path: list[str] = []
     pieces: list[str] = []
@@ -128,32 +127,30 @@ def parse_point_set(text: str) -> Entries:
     """
     points: list[dict[str, str]] = []
     geometry: dict[str, dict[str, str]] = {}
-    times = 0
+    sets = {"point_set": 0, "time_series": 0}
 
     def on_start(path: list[str], attributes: dict[str, str]) -> None:
-        nonlocal times
-        if path[1:] == ["point_set", "time_series"] or path[1:] == ["point_set", "point"]:
-            times += path[2] == "time_series"
-        if path[-1] == "point":
+        if path[-1] in sets:
+            sets[path[-1]] += 1
+        elif path[-1] == "point":
             points.append({})
-        elif len(path) > 2 and path[-2] == "Geometry3D":
+        elif path[-2:-1] == ["Geometry3D"]:
             geometry[path[-1]] = attributes
 
     def on_text(path: list[str], content: str) -> None:
-        if len(path) > 2 and path[-2] == "point":
-            points[-1][path[-1]] = content
+        if path[-2:-1] == ["point"] and points[-1].setdefault(path[-1], content) != content:
+            _refuse(len(points), f"states its {path[-1][:40]!a} twice")
 
     _parse_xml(text, "point_set_file", on_start, on_text)
-    if times > 1:
-        raise InputError(
-            f"contains {count_of(times, 'point set')} (sets or time steps): save each in its own file."
-        )
+    if max(sets.values()) > 1:
+        raise InputError("contains several point sets or time steps: save each in its own file.")
     names = [_point_name(point, number) for number, point in enumerate(points, start=1)]
     numbers = range(1, len(points) + 1)
     positions = parse_positions([point[axis] for point in points for axis in "xyz"], "point", numbers)
     if geometry:
         matrix, offset = _index_to_world(geometry)
-        positions = positions @ matrix.T + offset
+        with np.errstate(all="ignore"):  # `Entries` refuses results that are not finite
+            positions = positions @ matrix.T + offset
     return Entries(names, positions, "point", numbers, "LPS")
 
 
