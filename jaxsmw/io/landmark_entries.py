@@ -42,12 +42,12 @@ class Entries(NamedTuple):
                 "1e60: correct the position."
             )
         if faulty := first_faulty_name(self.names):
-            place = self._place(faulty.index)
+            place = self._place(faulty.row)
             if faulty.earlier is None:
                 raise InputError(f"the name in {place} {faulty.fault}: rename the landmark.")
             raise InputError(
                 f"{self._place(faulty.earlier)} and {place} have the same name "
-                f"{self.names[faulty.index][:40]!a}: give each landmark its own name."
+                f"{self.names[faulty.row][:40]!a}: give each landmark its own name."
             )
         return Landmarks(tuple(self.names), self.positions, self.coordinates, path, self.notes)
 

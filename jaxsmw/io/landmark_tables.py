@@ -36,12 +36,13 @@ class _Columns(NamedTuple):
 def parse_table(text: str) -> Entries:
     """Parse rows of `name x y z` or `x y z`, with or without a line of column names.
 
-    Semicolons, tabs, commas or blanks separate the cells: the first of them that the first line contains.
+    Semicolons, tabs, commas or blanks separate the cells: the first of them
+    that the first line contains twice.
     """
     lines = _lines(text)
     first = next((line for line in lines if line.strip()), "")
     bare = re.sub('"[^"]*"', "", first)
-    separator = next((mark for mark in ";\t," if mark in bare), " ")
+    separator = next((mark for mark in ";\t," if bare.count(mark) >= 2), " ")
     if separator == " ":
         lines = [line.replace("\t", " ").strip() for line in lines]
     rows = _rows(lines, separator)

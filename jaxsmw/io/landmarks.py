@@ -69,9 +69,8 @@ class Landmarks:
                 f"{LARGEST_EXTENT:.0e}: correct the position."
             )
         if faulty := first_faulty_name(self.names):
-            raise InputError(
-                f"{self.name}: the name {self.names[faulty.index][:40]!a} {faulty.fault}: rename the landmark."
-            )
+            shown = ascii(self.names[faulty.row][:40])
+            raise InputError(f"{self.name}: the name {shown} {faulty.fault}: rename the landmark.")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -116,9 +115,9 @@ def usable(positions: Float64[np.ndarray, "*any"]) -> np.ndarray:
 
 
 class FaultyName(NamedTuple):
-    """The 0-based index of a name, the index of an equal name before it or None, and the fault in words."""
+    """The 0-based row of a name, the row of an equal name before it or None, and the fault in words."""
 
-    index: int
+    row: int
     earlier: int | None
     fault: str
 

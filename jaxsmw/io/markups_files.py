@@ -150,7 +150,7 @@ def format_markups(landmarks: Landmarks) -> str:
             zip(landmarks.names, landmarks.positions.tolist(), strict=True), start=1
         )
     ]
-    markup = {
+    markup: dict[str, Any] = {
         "type": "Fiducial",
         "coordinateSystem": landmarks.coordinates,
         "locked": False,

@@ -64,7 +64,7 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
         ) from None
 
 
-def _check_doctype(name: str, system: str | None, public: str | None, has_declarations: bool) -> None:
+def _check_doctype(name: str, system: str | None, public: str | None, has_declarations: int) -> None:
     """Refuse a DOCTYPE that declares entities, which can expand to gigabytes or refer to other files.
 
     MeshLab begins each file with `<!DOCTYPE PickedPoints>`, which declares nothing.
