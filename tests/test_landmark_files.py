@@ -186,7 +186,7 @@ HOSTILE = [
     ("p.csv", "name,x,y,z\n", "contains no landmarks"),
     ("p.csv", "a,1,2,3\nb,1,2\n", "line 2 has 3 values instead of 4"),
     ("p.csv", "a,1,2,3\nb,1,2,3,4\n", "line 2 has 5 values instead of 4"),
-    ("p.csv", "1,2\n3,4\n", "line 1 has 2 values"),
+    ("p.csv", "1 2\n3 4\n", "line 1 has 2 values"),
     ("p.csv", "a,1,2,3\n\na,4,5,6\n", "line 1 and line 3 have the same name 'a'"),
     ("p.csv", "2,1,2,3\n,4,5,6\n", "line 1 and line 2 have the same name '2'"),
     ("p.csv", "a,1,2,nan\n", "'nan' where a coordinate should be"),
@@ -198,7 +198,7 @@ HOSTILE = [
     ("p.csv", "a,1,2,\n", "has '' where a coordinate should be"),
     ("p.csv", "a;1,5;2,5;3,5\n", "write decimals with a point"),
     ("p.csv", 'a,1,2,3\n"b,1,2,3\n', "quotes near line"),
-    ("p.csv", '"a\nb",1,2,3\n', "line break"),
+    ("p.csv", 'c,1,2,3\n"a\nb",1,2,3\n', "the name in line 3 contains a line break"),
     ("p.csv", "a\x07b,1,2,3\n", "control character"),
     ("p.csv", "a,1,2,3\0\n", "null characters"),
     ("p.csv", b"\xff\xfea\x00,\x001\x00", "UTF-16"),
@@ -293,7 +293,7 @@ def test_no_truncated_file_is_read_with_a_wrong_position(tmp_path, suffix):
     else:
         write_landmark_file(path, landmarks)
     data = path.read_bytes().rstrip()
-    for length in range(len(data)):
+    for length in range(0, len(data), 1 if suffix in (".csv", ".txt") else 8):
         path.write_bytes(data[:length])
         try:
             read = read_landmark_file(path)
@@ -403,10 +403,9 @@ def test_single_landmarks_off_the_surface_cause_a_warning():
     assert len(check_frame(elsewhere, mesh)) == 2  # neither frame fits, so no change is suggested
 
 
-@pytest.mark.parametrize("name", ["PWK", "CAST_EIJ"])
-def test_real_skulls(shared, tmp_path, name):
-    landmarks = read_landmark_file(shared / f"data/mouse_skulls/{name}.mrk.json")
-    mesh = read_mesh(shared / f"data/mouse_skulls/{name}.ply")
+def test_a_real_skull(shared, tmp_path):
+    landmarks = read_landmark_file(shared / "data/mouse_skulls/CAST_EIJ.mrk.json")
+    mesh = read_mesh(shared / "data/mouse_skulls/CAST_EIJ.ply")
     assert len(landmarks) == 51 and landmarks.coordinates == "LPS" and landmarks.names[:2] == ("1", "2")
     assert check_frame(landmarks, mesh) == ()
     assert find_frame(landmarks, mesh).as_read < 0.002 * bounding_box_diagonal(mesh)

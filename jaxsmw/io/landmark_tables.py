@@ -36,8 +36,8 @@ class _Columns(NamedTuple):
 def parse_table(text: str) -> Entries:
     """Parse rows of `name x y z` or `x y z`, with or without a line of column names.
 
-    Semicolons, tabs, commas or blanks separate the cells: the first of them
-    that the first line contains twice.
+    Semicolons, tabs, commas or blanks separate the cells: the first of these that the first line contains at
+    least twice.
     """
     lines = _lines(text)
     first = next((line for line in lines if line.strip()), "")
@@ -88,7 +88,10 @@ def _lines(text: str) -> list[str]:
 
 def _rows(lines: list[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not empty."""
-    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True)
+    # Without line ends, the reader would join the lines of a name in quotes.
+    reader = csv.reader(
+        (f"{line}\n" for line in lines), delimiter=separator, skipinitialspace=True, strict=True
+    )
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
