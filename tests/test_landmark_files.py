@@ -264,6 +264,8 @@ HOSTILE = [
     ("p.mps", MPS.format(POINT.format(0, 1, 2, 3).replace("<z>3</z>", "<z>3</z><z>4</z>")), "states its 'z' twice"),
     ("p.mps", MPS.format("</time_series><time_series>"), "several point sets or time steps"),
     ("p.mps", MPS.format("<Geometry3D><Offset x='1'/></Geometry3D>" + PLACES), "Geometry3D lacks a number"),
+    ("p.txt", "1 2 3\n" * (2**20 + 1), "more than 1048576 landmarks"),
+    ("p.pp", "<PickedPoints>" + "<point />" * (2**20 + 1), "more than 1048576 landmarks"),
     ("p.vtk", "a,1,2,3\n", "suffix '.vtk'"),
     ("p.json", markups(A), "suffix '.json'"),
     ("p", "a,1,2,3\n", "suffix ''"),

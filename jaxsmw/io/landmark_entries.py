@@ -14,6 +14,9 @@ from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmarks import CoordinateSystem, Landmarks, first_faulty_name, usable
 from jaxsmw.io.text import is_number
 
+MOST_LANDMARKS = 2**20
+"""The largest number of landmarks in a file, so that no file can use gigabytes of memory."""
+
 _NOT_IN_NUMBERS = re.compile(r"[^0-9+\-.eE\n]")
 
 
@@ -53,6 +56,12 @@ class Entries(NamedTuple):
 
     def _place(self, i: int) -> str:
         return f"{self.noun} {self.numbers[i]}"
+
+
+def check_count(count: int) -> None:
+    """Refuse a number of landmarks that no file of landmarks has."""
+    if count > MOST_LANDMARKS:
+        raise InputError(f"contains more than {MOST_LANDMARKS} landmarks: give fewer landmarks.")
 
 
 def parse_positions(words: list[str], noun: str, numbers: Sequence[int]) -> Float64[np.ndarray, "l 3"]:

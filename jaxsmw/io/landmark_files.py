@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_entries import Entries
+from jaxsmw.io.landmark_entries import Entries, check_count
 from jaxsmw.io.landmark_tables import format_fcsv, format_table, parse_fcsv, parse_table
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.markups_files import format_markups, parse_markups
@@ -37,7 +37,7 @@ _WRITERS: dict[str, Callable[[Landmarks], str]] = {
 # Files of these formats always state a coordinate system.
 _WITH_SYSTEM = (".mrk.json", ".fcsv")
 
-# The largest size of a file in bytes: 128 MiB, more than a million lines. JSON needs up to 25 times its size
+# The largest size of a file in bytes: 128 MiB, about a million lines. JSON needs up to 25 times its size
 # in memory, so files of 32 MiB are the largest; they contain 50 000 points of Slicer.
 _LARGEST, _LARGEST_JSON = 2**27, 2**25
 
@@ -64,8 +64,8 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     has no defined position for them or because they are not active in MeshLab.
 
     **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, is larger
-    than 128 MiB (`.mrk.json`: 32 MiB) or contains no landmarks. `InputError` is also raised if a coordinate
-    is not finite, or if two landmarks have the same name.
+    than 128 MiB (`.mrk.json`: 32 MiB), or contains no landmarks or more than 2²⁰. `InputError` is also raised
+    if a coordinate is not finite, or if two landmarks have the same name.
     """
     suffix = _suffix(path, list(_PARSERS))
     _check_size(path, size_of_file(path), suffix)
@@ -98,6 +98,10 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
             f"{path}: {suffix} files state a coordinate system, but the one of {landmarks.name} is not "
             "known: state LPS or RAS, or write a .csv file."
         )
+    try:
+        check_count(len(landmarks))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     data = _WRITERS[suffix](landmarks).encode("utf-8")
     _check_size(path, len(data), suffix)
     with atomic_write(path) as temporary:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.landmark_entries import Entries, left_out, parse_positions
+from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
 from jaxsmw.io.landmarks import CoordinateSystem, Landmarks
 from jaxsmw.io.text import is_number
 
@@ -75,7 +75,8 @@ def _is_value(cell: str) -> bool:
 
 
 def _lines(text: str) -> list[str]:
-    """Split a text into lines, and refuse lines too long for a table of landmarks."""
+    """Split a text into lines, and refuse too many or too long lines for a table of landmarks."""
+    check_count(max(text.count("\n"), text.count("\r")))
     lines = re.split("\r\n|\r|\n", text)
     longest = max(range(len(lines)), key=lambda i: len(lines[i]))
     if len(lines[longest]) > _LONGEST_LINE:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_entries import Entries, left_out, parse_positions
+from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
 
@@ -32,6 +32,8 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
     """
     if re.search(f"<[^<]{{{_LONGEST_TAG}}}", text):
         raise InputError(f"has an element of more than {_LONGEST_TAG} characters: export the points again.")
+    # A point of MITK consists of five elements, each with a beginning and an end.
+    check_count(max(text.count("<point "), text.count("<point>"), text.count("<") // 16))
     path: list[str] = []
     pieces: list[str] = []
 
