@@ -5,6 +5,7 @@ from .geodesics import SurfacePoints, geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
 from .sampling import farthest_point_samples
 from .shot import shot_descriptors
+from .surface_distance import distances_to_surface
 
 __all__ = [
     "CreaturePair",
@@ -13,6 +14,7 @@ __all__ = [
     "compute_spectrum",
     "creature_pair",
     "diagnose",
+    "distances_to_surface",
     "farthest_point_samples",
     "geodesic_distances",
     "make_mesh",

@@ -1,15 +1,25 @@
+from .landmark_files import read_landmark_file, write_landmark_file
+from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .map_files import read_landmarks, read_pointwise_map, write_pointwise_map
 from .mesh_files import read_mesh, write_mesh
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
 
 __all__ = [
+    "FrameDistances",
+    "LandmarkMatch",
+    "Landmarks",
+    "check_frame",
+    "find_frame",
     "make_spectrum",
+    "match_landmarks",
     "read_functional_map",
+    "read_landmark_file",
     "read_landmarks",
     "read_mesh",
     "read_pointwise_map",
     "read_spectrum",
     "write_functional_map",
+    "write_landmark_file",
     "write_mesh",
     "write_pointwise_map",
     "write_spectrum",

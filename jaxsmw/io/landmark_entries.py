@@ -1,0 +1,92 @@
+"""The contents of a landmark file before the names are checked, and the numbers in its text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.landmarks import CoordinateSystem, Landmarks, first_faulty_name, usable
+from jaxsmw.io.text import is_number
+
+MOST_LANDMARKS = 2**20
+"""The largest number of landmarks in a file, so that no file can use gigabytes of memory."""
+
+_NOT_IN_NUMBERS = re.compile(r"[^0-9+\-.eE\n]")
+
+
+class Entries(NamedTuple):
+    """The landmarks of a file, in the order of the file.
+
+    `numbers` contains the place of each landmark in the file, such as a line number, and `noun` says what it
+    counts. Both are for messages.
+    """
+
+    names: list[str]
+    positions: Float64[np.ndarray, "l 3"]
+    noun: str
+    numbers: Sequence[int]
+    coordinates: CoordinateSystem | None = None
+    notes: tuple[str, ...] = ()
+
+    def landmarks(self, path: str) -> Landmarks:
+        """Check names and coordinates, and return the landmarks of the file `path`."""
+        if not self.names:
+            raise InputError("contains no landmarks: give a file with at least one.")
+        wrong = ~usable(self.positions).all(axis=1)
+        if wrong.any():
+            raise InputError(
+                f"{self._place(int(wrong.argmax()))} has a coordinate that is not a finite number below "
+                "1e60: correct the position."
+            )
+        if faulty := first_faulty_name(self.names):
+            place = self._place(faulty.row)
+            if faulty.earlier is None:
+                raise InputError(f"the name in {place} {faulty.fault}: rename the landmark.")
+            raise InputError(
+                f"{self._place(faulty.earlier)} and {place} have the same name "
+                f"{self.names[faulty.row][:40]!a}: give each landmark its own name."
+            )
+        return Landmarks(tuple(self.names), self.positions, self.coordinates, path, self.notes)
+
+    def _place(self, i: int) -> str:
+        return f"{self.noun} {self.numbers[i]}"
+
+
+def check_count(count: int) -> None:
+    """Refuse a number of landmarks that no file of landmarks has."""
+    if count > MOST_LANDMARKS:
+        raise InputError(f"contains more than {MOST_LANDMARKS} landmarks: give fewer landmarks.")
+
+
+def parse_positions(words: list[str], noun: str, numbers: Sequence[int]) -> Float64[np.ndarray, "l 3"]:
+    """Parse the coordinates of all landmarks. `noun` and `numbers` are as in `Entries`.
+
+    **Raises:** `InputError` if a word is not a number. The message names the first such landmark.
+    """
+    try:
+        # `float` accepts more than decimal numbers, such as underscores and `nan`.
+        if _NOT_IN_NUMBERS.search("\n".join(words)):
+            raise ValueError
+        values = np.array(list(map(float, words)), dtype=np.float64)
+    except ValueError:
+        at = next(i for i, word in enumerate(words) if not is_number(word))
+        cure = "write decimals with a point" if "," in words[at] else "correct the number"
+        raise InputError(
+            f"{noun} {numbers[at // 3]} has {words[at][:40]!a} where a coordinate should be, which is not a "
+            f"finite number: {cure}."
+        ) from None
+    return values.reshape(-1, 3)
+
+
+def left_out(numbers: Sequence[int], total: int, why: str) -> tuple[str, ...]:
+    """Return a note about the landmarks that were left out (by their numbers in the file), or no note."""
+    if not numbers:
+        return ()
+    listed = ", ".join(map(str, numbers[:10])) + (", …" if len(numbers) > 10 else "")
+    return (f"{len(numbers)} of {count_of(total, 'point')} left out because {why}: number {listed}.",)

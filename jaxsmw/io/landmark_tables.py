@@ -1,0 +1,226 @@
+"""Parsers and writers of landmarks in tables: `.csv` and `.txt` files, and the `.fcsv` files of 3D Slicer.
+
+The standard library splits the lines into cells, because its errors are specific and no cell is converted by
+a guess.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
+from jaxsmw.io.landmarks import CoordinateSystem, Landmarks
+from jaxsmw.io.text import is_number
+
+_NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
+_LONGEST_LINE = 2**16
+_FCSV_COLUMNS = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc"]
+_FCSV_COLUMNS += ["associatedNodeID"]
+_SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
+
+
+class _Columns(NamedTuple):
+    """The 0-based columns of x, y, z and of the name (None without names), and the total of columns."""
+
+    positions: list[int]
+    name: int | None
+    total: int
+
+
+def parse_table(text: str) -> Entries:
+    """Parse rows of `name x y z` or `x y z`, with or without a line of column names.
+
+    Semicolons, tabs, commas or blanks separate the cells: the first of these that the first line contains at
+    least twice.
+    """
+    lines = _lines(text)
+    first = next((line for line in lines if line.strip()), "")
+    bare = re.sub('"[^"]*"', "", first)
+    separator = next((mark for mark in ";\t," if bare.count(mark) >= 2), " ")
+    if separator == " ":
+        lines = [line.replace("\t", " ").strip() for line in lines]
+    rows = _rows(lines, separator)
+    number, cells = next(rows, (0, []))
+    if not cells:
+        raise InputError("is empty: give a file with one landmark per line.")
+    has_header = not any(_is_value(cell) for cell in cells[-3:])
+    columns = _named_columns(number, cells) if has_header else _usual_columns(number, cells)
+    names: list[str] = []
+    words: list[str] = []
+    numbers: list[int] = []
+    x, y, z = columns.positions
+    if not has_header:
+        rows = _rows(lines, separator)
+    for number, cells in rows:
+        if len(cells) != columns.total:
+            raise InputError(
+                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}: correct the "
+                "line, and put names that contain the separator in double quotes."
+            )
+        numbers.append(number)
+        words += (cells[x], cells[y], cells[z])
+        names.append((cells[columns.name] if columns.name is not None else "") or str(len(numbers)))
+    return Entries(names, parse_positions(words, "line", numbers), "line", numbers)
+
+
+def _is_value(cell: str) -> bool:
+    """Return whether a cell is a number, also one that is not finite or has a decimal comma."""
+    return is_number(cell.replace(",", "."), finite=False)
+
+
+def _lines(text: str) -> list[str]:
+    """Split a text into lines, and refuse too many or too long lines for a table of landmarks."""
+    check_count(max(text.count("\n"), text.count("\r")))
+    lines = re.split("\r\n|\r|\n", text)
+    longest = max(range(len(lines)), key=lambda i: len(lines[i]))
+    if len(lines[longest]) > _LONGEST_LINE:
+        raise InputError(
+            f"line {longest + 1} has more than {_LONGEST_LINE} characters, so this is not a table of "
+            "landmarks: give one landmark per line."
+        )
+    return lines
+
+
+def _rows(lines: list[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the cells of each line that is not empty."""
+    # Without line ends, the reader would join the lines of a name in quotes.
+    reader = csv.reader(
+        (f"{line}\n" for line in lines), delimiter=separator, skipinitialspace=True, strict=True
+    )
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                yield reader.line_num, cells
+    except csv.Error:
+        raise InputError(
+            f"the quotes near line {reader.line_num} are not closed or not doubled: correct the line."
+        ) from None
+
+
+def _usual_columns(number: int, cells: list[str]) -> _Columns:
+    """Return the columns of a table without column names."""
+    count = len(cells)
+    if count not in (3, 4):
+        raise InputError(
+            f"line {number} has {count_of(count, 'value')}: give x, y and z, or a name, x, y and z, and put "
+            "names that contain the separator in double quotes."
+        )
+    return _Columns([count - 3, count - 2, count - 1], 0 if count == 4 else None, count)
+
+
+def _named_columns(number: int, cells: list[str]) -> _Columns:
+    """Return the columns of a table whose first line contains their names."""
+    titles = [cell.lower() for cell in cells]
+    if any(titles.count(axis) != 1 for axis in "xyz"):
+        raise InputError(
+            f"line {number} is neither a landmark nor a list of columns with x, y and z: give x, y and z, or "
+            "a name, x, y and z in each line."
+        )
+    others = [title for title in titles if title not in ("x", "y", "z")]
+    surplus = next((title for title in others if title not in _NAME_COLUMNS), "")
+    if surplus or len(others) > 1:
+        raise InputError(
+            f"line {number} has the column {surplus or others[1]!a} besides one name and x, y and z: give "
+            "the landmarks of one mesh in only these columns."
+        )
+    name = titles.index(others[0]) if others else None
+    return _Columns([titles.index(axis) for axis in "xyz"], name, len(titles))
+
+
+def format_table(landmarks: Landmarks, separator: str) -> str:
+    """Return landmarks as a table with the columns name, x, y and z."""
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+    writer.writerow(["name", "x", "y", "z"])
+    for name, position in zip(landmarks.names, landmarks.positions.tolist(), strict=True):
+        writer.writerow([name, *map(repr, position)])
+    return text.getvalue()
+
+
+def parse_fcsv(text: str) -> Entries:
+    """Parse an `.fcsv` file of 3D Slicer (vtkMRMLMarkupsFiducialStorageNode in Slicer's source code).
+
+    Newer versions append the status of the position (0 undefined, 1 preview, 2 defined) as a 15th value,
+    without a column name.
+    """
+    lines = _lines(text)
+    stated = dict(_setting(line) for line in lines if line.startswith("#"))
+    columns, order = _fcsv_columns(stated)
+    names: list[str] = []
+    words: list[str] = []
+    numbers: list[int] = []
+    undefined: list[int] = []
+    x, y, z = columns.positions
+    rows = _rows(["" if line.startswith("#") else line for line in lines], ",")
+    for place, (number, cells) in enumerate(rows, start=1):
+        if len(cells) < columns.total:
+            raise InputError(
+                f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}, so the file "
+                "is truncated or damaged: export the markups again."
+            )
+        if order == _FCSV_COLUMNS and cells[len(order) : len(order) + 1] in (["0"], ["1"]):
+            undefined.append(place)
+            continue
+        numbers.append(number)
+        words += (cells[x], cells[y], cells[z])
+        names.append((cells[columns.name] if columns.name is not None else "") or str(place))
+    notes = left_out(undefined, len(undefined) + len(names), "Slicer has no defined position for them")
+    coordinates = None
+    if "coordinatesystem" in stated:
+        coordinates = _SYSTEMS.get(stated["coordinatesystem"])
+        if coordinates is None:
+            raise InputError(
+                f"the coordinate system {stated['coordinatesystem'][:40]!a} is neither LPS (1) nor RAS (0): "
+                "export the markups again."
+            )
+    else:
+        notes += ("The file states no coordinate system.",)
+    return Entries(names, parse_positions(words, "line", numbers), "line", numbers, coordinates, notes)
+
+
+def _setting(line: str) -> tuple[str, str]:
+    """Return the key, in lower case, and the value of a comment of the form `# key = value`."""
+    key, _, value = line[1:].partition("=")
+    return key.strip().lower(), value.strip()
+
+
+def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:
+    """Return the positions of the columns, and the names of all columns, of an `.fcsv` file."""
+    if "columns" in stated:
+        order = [title.strip() for title in stated["columns"].split(",")]
+    elif "markups fiducial file version" in stated:
+        order = _FCSV_COLUMNS
+    else:
+        raise InputError(
+            "lacks the line '# columns = id,x,y,z,…' of 3D Slicer: export the markups again, or rename a "
+            "plain table to .csv."
+        )
+    if any(order.count(axis) != 1 for axis in "xyz") or order.count("label") > 1:
+        raise InputError(
+            "the line '# columns = …' does not name x, y and z once each: export the markups again."
+        )
+    name = order.index("label") if "label" in order else None
+    return _Columns([order.index(axis) for axis in "xyz"], name, len(order)), order
+
+
+def format_fcsv(landmarks: Landmarks) -> str:
+    """Return landmarks as an `.fcsv` file of 3D Slicer. The coordinate system must be known."""
+    text = io.StringIO()
+    text.write(
+        "# Markups fiducial file version = 4.11\n"
+        f"# CoordinateSystem = {landmarks.coordinates}\n"
+        f"# columns = {','.join(_FCSV_COLUMNS)}\n"
+    )
+    writer = csv.writer(text, lineterminator="\n")
+    for number, name in enumerate(landmarks.names, start=1):
+        position = map(repr, landmarks.positions[number - 1].tolist())
+        # The orientation (0, 0, 0, 1) and the flags visible, selected and not locked are Slicer's defaults.
+        writer.writerow([number, *position, 0, 0, 0, 1, 1, 1, 0, name, "", ""])
+    return text.getvalue()

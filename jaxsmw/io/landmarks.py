@@ -1,0 +1,255 @@
+"""Landmarks: named points on one mesh, their coordinate system, and their distance to the mesh."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.mesh import LARGEST_EXTENT, Mesh
+from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to_surface
+
+CoordinateSystem = Literal["LPS", "RAS"]
+"""The names of the coordinate systems of medical images; the letters say where x, y and z increase.
+
+LPS means left, posterior (back), superior (up); RAS means right, anterior (front), superior. A change between
+them reverses the signs of x and y.
+"""
+
+# Mean distances to the surface, as fractions of the diagonal of the mesh. Landmarks in the wrong coordinate
+# system are above `FAR`. Landmarks in the right one are below `NEAR`, like all landmarks of the data sets.
+FAR, NEAR = 0.05, 0.02
+
+# Control characters, line separators, and characters that UTF-8 or XML cannot represent.
+_NOT_IN_NAMES = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Named points on one mesh.
+
+    **Attributes:**
+
+    - `names`: l different names, in the order of the file. A name is one line of text that neither begins nor
+      ends with a blank.
+    - `positions`: positions (l, 3), float64, in the unit and the coordinate system of the file.
+    - `coordinates`: the coordinate system, `"LPS"` or `"RAS"`, or None if the file does not state one.
+    - `name`: the name of the landmarks in messages. The name of landmarks from a file is the file's path.
+    - `notes`: a tuple of sentences about points that were left out, and about what the file does not state.
+
+    **Raises:** `InputError` if there are no landmarks, a name is empty, repeated or not one line of text, the
+    positions are not an array (l, 3), or a coordinate is not finite or above 1e60.
+    """
+
+    names: tuple[str, ...]
+    positions: Float64[np.ndarray, "l 3"]
+    coordinates: CoordinateSystem | None = None
+    name: str = "landmarks"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            raise InputError(f"{self.name}: there are no landmarks: give at least one.")
+        if self.coordinates is not None:
+            check_choice(self.coordinates, CoordinateSystem, "a coordinate system")
+        if self.positions.shape != (len(self.names), 3):
+            raise InputError(
+                f"{self.name}: positions have the shape {self.positions.shape} instead of "
+                f"({len(self.names)}, 3): give one position for each name."
+            )
+        wrong = ~usable(self.positions).all(axis=1)
+        if wrong.any():
+            raise InputError(
+                f"{self.name}: a coordinate of {self.names[wrong.argmax()]!a} is not a finite number below "
+                f"{LARGEST_EXTENT:.0e}: correct the position."
+            )
+        if faulty := first_faulty_name(self.names):
+            shown = ascii(self.names[faulty.row][:40])
+            raise InputError(f"{self.name}: the name {shown} {faulty.fault}: rename the landmark.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def flipped(self) -> Landmarks:
+        """Return the landmarks in the other coordinate system: the signs of x and y are reversed.
+
+        LPS becomes RAS, and RAS becomes LPS. An unknown coordinate system stays unknown.
+        """
+        other: dict[str | None, CoordinateSystem | None] = {"LPS": "RAS", "RAS": "LPS", None: None}
+        positions = np.stack([-self.positions[:, 0], -self.positions[:, 1], self.positions[:, 2]], axis=1)
+        return replace(self, positions=positions, coordinates=other[self.coordinates])
+
+    def in_coordinates(self, coordinates: CoordinateSystem) -> Landmarks:
+        """Return the landmarks in a coordinate system, `"LPS"` or `"RAS"`.
+
+        **Raises:** `InputError` if the coordinate system of the landmarks is not known.
+        """
+        check_choice(coordinates, CoordinateSystem, "a coordinate system")
+        if self.coordinates is None:
+            raise InputError(
+                f"{self.name}: the coordinate system of the landmarks is not known, so they cannot be "
+                f"converted to {coordinates}: use them as they are, or state their coordinate system."
+            )
+        return self if self.coordinates == coordinates else self.flipped()
+
+    def select(self, names: Sequence[str]) -> Landmarks:
+        """Return the landmarks with the given names, in the order of the names.
+
+        **Raises:** `InputError` if a name does not exist, or if no name is given.
+        """
+        row = {name: i for i, name in enumerate(self.names)}
+        missing = [name for name in names if name not in row]
+        if missing:
+            raise InputError(f"{self.name}: no landmark has the name {missing[0][:40]!a}: choose another.")
+        return replace(self, names=tuple(names), positions=self.positions[[row[name] for name in names]])
+
+
+def usable(positions: Float64[np.ndarray, "*any"]) -> np.ndarray:
+    """Return which coordinates are finite and at most 1e60, so that their squares do not overflow."""
+    return np.abs(positions) <= LARGEST_EXTENT
+
+
+class FaultyName(NamedTuple):
+    """The 0-based row of a name, the row of an equal name before it or None, and the fault in words."""
+
+    row: int
+    earlier: int | None
+    fault: str
+
+
+def first_faulty_name(names: Sequence[str]) -> FaultyName | None:
+    """Return the first name that is empty, repeated or not one line of text, or None."""
+    if len(set(names)) == len(names) and not any(map(_fault, names)):
+        return None
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if fault := _fault(name):
+            return FaultyName(i, None, fault)
+        if (earlier := first.setdefault(name, i)) != i:
+            return FaultyName(i, earlier, "is repeated")
+    return None
+
+
+def _fault(name: str) -> str:
+    """Return what is wrong with the name of a landmark, or an empty string."""
+    if not name:
+        return "is empty"
+    if name != name.strip():
+        return "begins or ends with a blank"
+    return "contains a line break or another control character" if _NOT_IN_NAMES.search(name) else ""
+
+
+class LandmarkMatch(NamedTuple):
+    """The result of `match_landmarks`.
+
+    **Attributes:**
+
+    - `names`: the names that both have, in the order of the first landmarks.
+    - `only_first`: the names that only the first landmarks have, in their order.
+    - `only_second`: the names that only the second landmarks have, in their order.
+    """
+
+    names: tuple[str, ...]
+    only_first: tuple[str, ...]
+    only_second: tuple[str, ...]
+
+
+def match_landmarks(first: Landmarks, second: Landmarks) -> LandmarkMatch:
+    """Match the landmarks of two meshes by their names.
+
+    **Arguments:**
+
+    - `first`, `second`: the `Landmarks` of two meshes. `Landmarks.select` returns the positions of the names
+      that both have.
+
+    **Returns:** A `LandmarkMatch` with the attributes `names`, `only_first` and `only_second`, each a tuple.
+
+    **Raises:** `InputError` if no name is in both. Upper and lower case differ.
+    """
+    in_first, in_second = set(first.names), set(second.names)
+    common = tuple(name for name in first.names if name in in_second)
+    if not common:
+        raise InputError(
+            f"{first.name}: has no landmark with the name of a landmark of {second.name} "
+            f"({first.names[0][:40]!a} and {second.names[0][:40]!a} come first): give equal names to "
+            "corresponding landmarks."
+        )
+    return LandmarkMatch(
+        names=common,
+        only_first=tuple(name for name in first.names if name not in in_second),
+        only_second=tuple(name for name in second.names if name not in in_first),
+    )
+
+
+class FrameDistances(NamedTuple):
+    """The result of `find_frame`, in the unit of the mesh.
+
+    **Attributes:**
+
+    - `as_read`: the mean distance from the landmarks to the surface.
+    - `flipped`: the same distance after the signs of x and y are reversed, as between LPS and RAS.
+    """
+
+    as_read: float
+    flipped: float
+
+
+def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
+    """Measure how far landmarks are from a surface, as they are and in the other coordinate system.
+
+    **Arguments:**
+
+    - `landmarks`: `Landmarks` in the unit of the mesh.
+    - `mesh`: the `Mesh` to which the landmarks belong.
+
+    **Returns:** `FrameDistances` with the attributes `as_read` and `flipped`, in the unit of the mesh.
+    """
+    as_read, flipped = (
+        float(distances_to_surface(points.positions, mesh).mean())
+        for points in (landmarks, landmarks.flipped())
+    )
+    return FrameDistances(as_read, flipped)
+
+
+def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
+    """Check that landmarks lie on a surface, and find a change between LPS and RAS that is missing.
+
+    **Arguments:**
+
+    - `landmarks`: `Landmarks` in the unit of the mesh.
+    - `mesh`: the `Mesh` to which the landmarks belong.
+
+    **Returns:** A sentence for each landmark that is further from the surface than 2 % of the diagonal of the
+    box around the mesh.
+
+    **Raises:** `InputError` if the landmarks are on average further from the surface than 5 % of the
+    diagonal, but nearer than 2 % in the other coordinate system.
+    """
+    diagonal = bounding_box_diagonal(mesh)
+    distances = distances_to_surface(landmarks.positions, mesh)
+    as_read = float(distances.mean())
+    if as_read > FAR * diagonal:
+        flipped = find_frame(landmarks, mesh).flipped
+        if flipped < NEAR * diagonal:
+            raise InputError(_flip_message(landmarks, mesh, as_read, flipped))
+    return tuple(
+        f"{landmarks.name}: the landmark {landmarks.names[i]!a} is {distances[i]:.3g} from the surface of "
+        f"{mesh.name}, which is {distances[i] / diagonal:.0%} of the diagonal of the mesh."
+        for i in np.flatnonzero(distances > NEAR * diagonal).tolist()
+    )
+
+
+def _flip_message(landmarks: Landmarks, mesh: Mesh, as_read: float, flipped: float) -> str:
+    """Return the message for landmarks in the wrong coordinate system. Distances have the mesh's unit."""
+    here, other = landmarks.coordinates, landmarks.flipped().coordinates
+    change = f"after a change from {here} to {other}" if other else "with the signs of x and y reversed"
+    cure = f"give --coordinates {other}" if other else "reverse the signs of x and y in the file"
+    return (
+        f"{landmarks.name}: the landmarks are on average {as_read:.3g} from the surface of {mesh.name} as "
+        f"read, and {flipped:.3g} {change}: {cure}."
+    )

@@ -1,0 +1,164 @@
+"""Parser and writer of landmarks in the Markups files (`.mrk.json`) of 3D Slicer.
+
+The format is version 1.0.3 of the Markups schema
+(https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NoReturn
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.landmark_entries import Entries, left_out
+from jaxsmw.io.landmarks import CoordinateSystem, Landmarks
+
+_SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+# Versions of Slicer before 4.11 used numbers as names.
+_SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
+_NOT_DEFINED = ("undefined", "preview", "missing")
+
+
+def parse_markups(text: str) -> Entries:
+    """Parse the control points of a Markups file. The file must contain a single list of points."""
+    markup = _single_list(_parse_json(text))
+    coordinates, notes = _coordinate_system(markup)
+    points = markup.get("controlPoints", [])
+    if not isinstance(points, list):
+        raise InputError("controlPoints is not a list: export the markups again.")
+    names: list[str] = []
+    positions: list[list[float]] = []
+    numbers: list[int] = []
+    undefined: list[int] = []
+    for number, point in enumerate(points, start=1):
+        if not isinstance(point, dict):
+            _refuse(number, "is not an object")
+        if not _is_defined(point, number):
+            undefined.append(number)
+            continue
+        label, position = point.get("label", ""), point.get("position")
+        if not isinstance(label, str):
+            _refuse(number, "has a label that is not text")
+        # All numbers are floats here, because `_parse_json` also parses integers as floats.
+        if not isinstance(position, list) or [type(value) for value in position] != [float] * 3:
+            _refuse(number, "has a position that is not a list of three numbers")
+        numbers.append(number)
+        positions.append(position)
+        names.append(label.strip() or str(number))
+    notes += left_out(undefined, len(points), "Slicer has no defined position for them")
+    table = np.array(positions, dtype=np.float64).reshape(-1, 3)
+    return Entries(names, table, "control point", numbers, coordinates, notes)
+
+
+def _parse_json(text: str) -> Any:
+    """Parse JSON with all numbers as floats, and refuse objects that repeat a key."""
+    try:
+        # Python refuses long integers and nested lists of great depth with other errors than syntax errors.
+        return json.loads(text, parse_int=float, object_pairs_hook=_object)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        place = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise InputError(
+            f"is not a complete JSON file (the error is{place or ' its depth'}): export the markups again."
+        ) from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise InputError("states a property twice, so its meaning is not clear: export the markups again.")
+    return found
+
+
+def _single_list(document: Any) -> dict[str, Any]:
+    """Return the only element of `markups`, which must be a list of points."""
+    markups = document.get("markups") if isinstance(document, dict) else None
+    if not isinstance(markups, list) or not all(isinstance(markup, dict) for markup in markups):
+        raise InputError("is not a Markups file of 3D Slicer: export a point list as .mrk.json.")
+    if len(markups) != 1:
+        raise InputError(
+            f"contains {count_of(len(markups), 'markup')} instead of one point list: save each point list in "
+            "its own file."
+        )
+    kind = markups[0].get("type")
+    if kind != "Fiducial":
+        raise InputError(
+            f"contains a markup of the type {_excerpt(kind)}: convert it to a point list "
+            "(type 'Fiducial') in 3D Slicer."
+        )
+    return markups[0]
+
+
+def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[str, ...]]:
+    """Return the coordinate system of a markup, and a note if it is the default of the schema."""
+    if "coordinateSystem" not in markup:
+        return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
+    stated = markup["coordinateSystem"]
+    if not isinstance(stated, str) or stated not in _SYSTEMS:
+        raise InputError(
+            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0): export the markups "
+            "again."
+        )
+    return _SYSTEMS[stated], ()
+
+
+def _is_defined(point: dict[str, Any], number: int) -> bool:
+    """Return whether the position of a control point is defined. The default of the format is yes."""
+    status = point.get("positionStatus", "defined")
+    if status != "defined" and status not in _NOT_DEFINED:
+        _refuse(number, f"has the unknown position status {_excerpt(status)}")
+    return status == "defined"
+
+
+def _excerpt(value: Any) -> str:
+    """Return the beginning of a text for messages. Other values can be long, so only their type is named."""
+    return ascii(value[:40]) if isinstance(value, str) else f"that is a {type(value).__name__}"
+
+
+def _refuse(number: int, fault: str) -> NoReturn:
+    raise InputError(f"control point {number} {fault}: export the markups again.")
+
+
+def format_markups(landmarks: Landmarks) -> str:
+    """Return landmarks as a Markups file with one point per line. The coordinate system must be known.
+
+    The file states no unit, because the unit of landmarks is not known; Slicer then assumes mm.
+    """
+    # In Slicer's RAS axes, the orientation is the identity.
+    sign = -1.0 if landmarks.coordinates == "LPS" else 1.0
+    points = [
+        {
+            "id": str(number),
+            "label": name,
+            "description": "",
+            "associatedNodeID": "",
+            "position": position,
+            "orientation": [sign, 0.0, 0.0, 0.0, sign, 0.0, 0.0, 0.0, 1.0],
+            "selected": True,
+            "locked": False,
+            "visibility": True,
+            "positionStatus": "defined",
+        }
+        for number, (name, position) in enumerate(
+            zip(landmarks.names, landmarks.positions.tolist(), strict=True), start=1
+        )
+    ]
+    markup: dict[str, Any] = {
+        "type": "Fiducial",
+        "coordinateSystem": landmarks.coordinates,
+        "locked": False,
+        "fixedNumberOfControlPoints": False,
+        "labelFormat": "%N-%d",
+        "lastUsedControlPointNumber": len(points),
+        "controlPoints": [],
+    }
+    text = json.dumps({"@schema": _SCHEMA, "markups": [markup]}, indent=2)
+    lines = ",\n".join(json.dumps(point, ensure_ascii=False, allow_nan=False) for point in points)
+    return text.replace('"controlPoints": []', f'"controlPoints": [\n{lines}\n]') + "\n"

@@ -1,0 +1,179 @@
+"""Parsers of landmarks in XML: `.pp` files of MeshLab and `.mps` files of MITK; a writer of `.pp` files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import NoReturn
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
+from jaxsmw.io.landmarks import Landmarks
+from jaxsmw.io.text import is_number
+
+# Limits far above any file of points, so that a malicious file cannot use gigabytes of memory.
+_DEEPEST, _LONGEST_TAG = 20, 2**16
+
+# A function that receives the names of an element and of all its ancestors, and its attributes or its text.
+_OnStart = Callable[[list[str], dict[str, str]], None]
+_OnText = Callable[[list[str], str], None]
+
+
+def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None = None) -> None:
+    """Parse XML whose outermost element is `root`, and call a function for each element.
+
+    `on_start` receives the attributes of each element, when the element begins. `on_text` receives the text
+    of each element without children, when the element ends.
+    """
+    if re.search(f"<[^<]{{{_LONGEST_TAG}}}", text):
+        raise InputError(f"has an element of more than {_LONGEST_TAG} characters: export the points again.")
+    # A point of MITK consists of five elements, each with a beginning and an end.
+    check_count(max(text.count("<point "), text.count("<point>"), text.count("<") // 16))
+    path: list[str] = []
+    pieces: list[str] = []
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        if not path and name != root:
+            raise InputError(f"is not a {root} file, because it begins with {name[:40]!a}: check the suffix.")
+        if len(path) == _DEEPEST:
+            raise InputError(f"has more than {_DEEPEST} nested elements: export the points again.")
+        path.append(name)
+        pieces.clear()
+        on_start(path, attributes)
+
+    def end(name: str) -> None:
+        if on_text is not None:
+            on_text(path, "".join(pieces).strip())
+        pieces.clear()
+        path.pop()
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.StartDoctypeDeclHandler = _check_doctype
+    if on_text is not None:
+        parser.CharacterDataHandler = pieces.append
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise InputError(
+            f"is not a complete XML file (the error is in line {error.lineno}): export the points again."
+        ) from None
+
+
+def _check_doctype(name: str, system: str | None, public: str | None, has_declarations: int) -> None:
+    """Refuse a DOCTYPE that declares entities, which can expand to gigabytes or refer to other files.
+
+    MeshLab begins each file with `<!DOCTYPE PickedPoints>`, which declares nothing.
+    """
+    if has_declarations or system is not None or public is not None:
+        raise InputError("has a DOCTYPE with declarations, which are not read: remove the DOCTYPE.")
+
+
+def parse_picked_points(text: str) -> Entries:
+    """Parse a `.pp` file of MeshLab (the class PickedPoints in MeshLab's source code).
+
+    Positions are in the coordinate system of the mesh. Points with `active="0"` are names of a template that
+    nobody has placed, so they are left out.
+    """
+    names: list[str] = []
+    words: list[str] = []
+    numbers: list[int] = []
+    inactive: list[int] = []
+
+    def on_start(path: list[str], attributes: dict[str, str]) -> None:
+        if path[1:] != ["point"]:
+            return
+        number = len(numbers) + len(inactive) + 1
+        if attributes.get("active", "1").strip() == "0":
+            inactive.append(number)
+            return
+        for axis in "xyz":
+            if axis not in attributes:
+                _refuse(number, f"has no {axis}")
+            words.append(attributes[axis].strip())
+        numbers.append(number)
+        names.append(attributes.get("name", "").strip() or str(number))
+
+    _parse_xml(text, "PickedPoints", on_start)
+    notes = left_out(inactive, len(numbers) + len(inactive), "they are not active in MeshLab")
+    return Entries(names, parse_positions(words, "point", numbers), "point", numbers, None, notes)
+
+
+def _refuse(number: int, fault: str) -> NoReturn:
+    raise InputError(f"point {number} {fault}: export the points again.")
+
+
+def format_picked_points(landmarks: Landmarks) -> str:
+    """Return landmarks as a `.pp` file of MeshLab, which states no coordinate system."""
+    points = "".join(
+        f' <point x="{x!r}" y="{y!r}" z="{z!r}" active="1" name={quoteattr(name)}/>\n'
+        for name, (x, y, z) in zip(landmarks.names, landmarks.positions.tolist(), strict=True)
+    )
+    head = ' <DocumentData>\n  <templateName name=""/>\n </DocumentData>\n'
+    return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{head}{points}</PickedPoints>\n"
+
+
+def parse_point_set(text: str) -> Entries:
+    """Parse an `.mps` file of MITK (PointSetReaderService in MITK's source code).
+
+    The file contains index coordinates; its element Geometry3D takes them to world coordinates. MITK's world
+    coordinates (https://docs.mitk.org/2024.12/GeometryOverviewPage.html) are the physical coordinates of ITK
+    and DICOM, which are LPS in mm. The points have no names. Each is named by its number, from 1: this is
+    `id` + 1, because MITK counts from 0.
+    """
+    points: list[dict[str, str]] = []
+    geometry: dict[str, dict[str, str]] = {}
+    sets = {"point_set": 0, "time_series": 0}
+
+    def on_start(path: list[str], attributes: dict[str, str]) -> None:
+        if path[-1] in sets:
+            sets[path[-1]] += 1
+        elif path[-1] == "point":
+            points.append({})
+        elif path[-2:-1] == ["Geometry3D"]:
+            geometry[path[-1]] = attributes
+
+    def on_text(path: list[str], content: str) -> None:
+        if path[-2:-1] == ["point"] and points[-1].setdefault(path[-1], content) != content:
+            _refuse(len(points), f"states its {path[-1][:40]!a} twice")
+
+    _parse_xml(text, "point_set_file", on_start, on_text)
+    if max(sets.values()) > 1:
+        raise InputError("contains several point sets or time steps: save each in its own file.")
+    names = [_point_name(point, number) for number, point in enumerate(points, start=1)]
+    numbers = range(1, len(points) + 1)
+    positions = parse_positions([point[axis] for point in points for axis in "xyz"], "point", numbers)
+    if geometry:
+        matrix, offset = _index_to_world(geometry)
+        with np.errstate(all="ignore"):  # `Entries` refuses results that are not finite
+            positions = positions @ matrix.T + offset
+    return Entries(names, positions, "point", numbers, "LPS")
+
+
+def _point_name(point: dict[str, str], number: int) -> str:
+    """Return the name of a point of an `.mps` file, after a check that the point is complete."""
+    for key in ("id", "x", "y", "z"):
+        if key not in point:
+            _refuse(number, f"has no {key}")
+    if not re.fullmatch("[0-9]{1,9}", point["id"]):
+        _refuse(number, f"has the id {point['id'][:40]!a}, which is not a whole number")
+    return str(int(point["id"]) + 1)
+
+
+def _index_to_world(
+    geometry: dict[str, dict[str, str]],
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
+    """Return the matrix and the offset that take index coordinates to world coordinates."""
+    matrix, offset = geometry.get("IndexToWorld", {}), geometry.get("Offset", {})
+    words = [matrix.get(f"m_{row}_{column}", "") for row in range(3) for column in range(3)]
+    words += [offset.get(axis, "") for axis in "xyz"]
+    if not all(is_number(word) for word in words):
+        raise InputError("the Geometry3D lacks a number in IndexToWorld or Offset: export the points again.")
+    values = np.array(words, dtype=np.float64)
+    return values[:9].reshape(3, 3), values[9:]
