@@ -5,7 +5,7 @@ from .geodesics import SurfacePoints, geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
 from .sampling import farthest_point_samples
 from .shot import shot_descriptors
-from .surface_distance import distances_to_surface
+from .surface_distance import distances_to_surface, nearest_surface_points
 
 __all__ = [
     "CreaturePair",
@@ -18,6 +18,7 @@ __all__ = [
     "farthest_point_samples",
     "geodesic_distances",
     "make_mesh",
+    "nearest_surface_points",
     "one_to_one_map",
     "shot_descriptors",
 ]

@@ -1,0 +1,72 @@
+"""Transfer of landmarks from the source to the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.io.landmarks import Landmarks, check_frame
+from jaxsmw.transfer.registered_mesh import RegisteredMesh
+
+
+@dataclass(frozen=True, eq=False)
+class TransferredLandmarks:
+    """The result of `transfer_landmarks`: l landmarks on the target.
+
+    **Attributes:**
+
+    - `landmarks`: the `Landmarks` on the surface of Y, with the names of the source's landmarks, in the unit
+      of Y.
+    - `source_distances`: the distance from each landmark on X to the surface of X (l,), in the unit of X.
+    - `expected_errors`: the expected error of each landmark on Y (l,), in the unit of Y; None if no expected
+      errors were given.
+    - `notes`: a tuple with a sentence for each landmark that was far from the surface of X.
+    """
+
+    landmarks: Landmarks
+    source_distances: Float64[np.ndarray, " l"]
+    expected_errors: Float64[np.ndarray, " l"] | None
+    notes: tuple[str, ...] = ()
+
+
+def transfer_landmarks(
+    landmarks: Landmarks,
+    registered: RegisteredMesh,
+    *,
+    expected_error: Float64[np.ndarray, " m"] | None = None,
+) -> TransferredLandmarks:
+    """Move landmarks from X to the surface of Y.
+
+    Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected onto Y.
+
+    **Arguments:**
+
+    - `landmarks`: l `Landmarks` on X, in the unit and the coordinate system of X.
+    - `registered`: the `RegisteredMesh` of X on Y.
+    - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
+      see `Correspondence.expected_error`.
+
+    **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y.
+
+    **Raises:** `InputError` if the landmarks lie off the surface of X, but on it in the other coordinate
+    system (`jaxsmw.io.check_frame`), or if there is not one expected error for each vertex of X.
+    """
+    mesh_x, mesh_y = registered.mesh_x, registered.mesh_y
+    if expected_error is not None and expected_error.shape != (len(mesh_x.vertices),):
+        raise InputError(
+            f"{mesh_x.name}: there are expected errors of shape {expected_error.shape} for "
+            f"{len(mesh_x.vertices)} vertices: give one for each vertex."
+        )
+    notes = check_frame(landmarks, mesh_x)
+    points, distances = nearest_surface_points(landmarks.positions, mesh_x)
+    images, _ = nearest_surface_points(registered.carry(points), mesh_y)
+    errors = None
+    if expected_error is not None:
+        at_corners = expected_error[mesh_x.faces[points.faces]]
+        errors = np.sqrt(mesh_y.area) * (points.weights * at_corners).sum(axis=1)
+    moved = replace(landmarks, positions=images.positions(mesh_y), name=f"landmarks on {mesh_y.name}", notes=())
+    return TransferredLandmarks(moved, distances, errors, notes)

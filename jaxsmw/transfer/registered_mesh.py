@@ -1,0 +1,244 @@
+"""The registered mesh: the source's triangulation with positions on the target's surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import cg
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.geodesics import SurfacePoints, check_points
+from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
+
+DEFAULT_STIFFNESS = 0.003
+"""The default stiffness of a registered mesh, a length in units of the square root of the target's area."""
+
+# The neighbourhoods whose similarity transformations the mesh follows are averaged this number of times. With
+# fewer averagings, the transformations follow the noise of the map. (Entry R21 of docs/research_log.md)
+_AVERAGINGS = 8
+# The transformations are fitted to the map, and once again to the result. (Entry R21)
+_FITS = 2
+# Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to _REDUCTIONS
+# times. (Entry R21)
+_REDUCED, _REDUCTIONS = 0.2, 4
+# The relative residual at which the linear solver stops.
+_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredMesh:
+    """A deformed source mesh that lies on the target: the result of `register_mesh`.
+
+    **Attributes:**
+
+    - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
+    - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
+      X, they form the registered mesh.
+    - `similarities`: the rotation and the scale of the neighbourhood of each vertex, from X to the registered
+      mesh.
+    """
+
+    mesh_x: Mesh
+    mesh_y: Mesh
+    vertices: Float64[np.ndarray, "m 3"]
+    similarities: Similarities
+
+    def __repr__(self) -> str:
+        return f"RegisteredMesh({self.mesh_x.name} on {self.mesh_y.name}: {len(self.vertices)} vertices)"
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The registered mesh, with the faces of X in the order of X."""
+        return Mesh(self.vertices, self.mesh_x.faces, name=f"{self.mesh_x.name} on {self.mesh_y.name}")
+
+    @cached_property
+    def surface_points(self) -> SurfacePoints:
+        """The nearest point of Y for each vertex of the registered mesh: m `SurfacePoints` on Y."""
+        return self._nearest[0]
+
+    @cached_property
+    def distances(self) -> Float64[np.ndarray, " m"]:
+        """The distance from each vertex of the registered mesh to Y (m,), in Y's unit of length."""
+        return self._nearest[1]
+
+    @cached_property
+    def _nearest(self) -> tuple[SurfacePoints, Float64[np.ndarray, " m"]]:
+        return nearest_surface_points(self.vertices, self.mesh_y)
+
+    @cached_property
+    def flipped_faces(self) -> Bool[np.ndarray, " f"]:
+        """A mask (f,), True for faces that are turned over relative to their neighbourhoods.
+
+        The normal of such a face of the registered mesh opposes the normal of the face of X, rotated with its
+        neighbourhood.
+        """
+        return _flipped_faces(self.mesh_x, self.vertices, self.similarities)
+
+    @cached_property
+    def area_ratios(self) -> Float64[np.ndarray, " f"]:
+        """The area of each registered face divided by its area on X (f,), if both meshes have area 1.
+
+        The ratio is 1 where the map preserves area up to a common factor. The ratio of a face without area on
+        X is 1.
+        """
+        own = self.mesh_x.face_areas / self.mesh_x.area
+        return np.divide(self.mesh.face_areas / self.mesh.area, own, out=np.ones(len(own)), where=own > 0)
+
+    @cached_property
+    def angle_distortions(self) -> Float64[np.ndarray, " f"]:
+        """The mean change of the three angles of each face, from X to the registered mesh (f,), in degrees."""
+        changes = _angles(self.mesh.vertices[self.mesh.faces]) - _angles(
+            self.mesh_x.vertices[self.mesh_x.faces]
+        )
+        return np.degrees(np.abs(changes).mean(axis=1))
+
+    def carry(self, points: SurfacePoints) -> Float64[np.ndarray, "p 3"]:
+        """Move points on X to the registered mesh.
+
+        **Arguments:**
+
+        - `points`: p `SurfacePoints` on X.
+
+        **Returns:** The positions (p, 3) of the points on the registered mesh, in Y's unit of length.
+
+        **Raises:** `InputError` if a point is not on X.
+        """
+        return check_points(points, self.mesh_x, "points").positions(self.mesh)
+
+    @cached_property
+    def points_of_target(self) -> SurfacePoints:
+        """The point of X for each vertex of Y: n `SurfacePoints` on X, a map Y -> X.
+
+        The point of a vertex of Y is the nearest point of the registered mesh.
+        """
+        return nearest_surface_points(self.mesh_y.vertices, self.mesh)[0]
+
+    @cached_property
+    def target_distances(self) -> Float64[np.ndarray, " n"]:
+        """The distance from each vertex of Y to the registered mesh (n,), in Y's unit of length."""
+        return nearest_surface_points(self.mesh_y.vertices, self.mesh)[1]
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return sentences about the quality of the registered mesh, with lengths in percent of sqrt(area)."""
+        unit = np.sqrt(self.mesh_y.area) / 100
+        far = np.quantile(self.distances, 0.99) / unit
+        flipped = int(self.flipped_faces.sum())
+        areas = np.quantile(self.area_ratios, [0.05, 0.95])
+        return (
+            f"distance to the target: mean {self.distances.mean() / unit:.3f} %, 99th percentile {far:.3f} % of "
+            "the square root of the target's area.",
+            f"{count_of(flipped, 'flipped triangle')} of {len(self.mesh_x.faces)} "
+            f"({flipped / len(self.mesh_x.faces):.3%}).",
+            f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area on "
+            f"the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
+        )
+
+
+def register_mesh(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    points: SurfacePoints,
+    *,
+    stiffness: float = DEFAULT_STIFFNESS,
+    same_unit: bool = False,
+) -> RegisteredMesh:
+    """Deform X onto Y, so that its vertices follow a map and its triangles keep their shapes.
+
+    The positions minimise the squared distances to the points of the map, plus the squared stiffness times
+    the squared differences of edge vectors from rotated and scaled edge vectors of X. The rotations and scales
+    are those of neighbourhoods, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007), with a scale.
+    Where faces would flip, the map receives less weight.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
+    - `points`: the map X -> Y, as m `SurfacePoints` on Y; see `Correspondence.surface_points`.
+    - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with shorter
+      wavelengths is smoothed. The default is 0.003. With 0.03, a noisy map gives a smooth mesh that is farther
+      away from the target.
+    - `same_unit`: whether X and Y have the same unit of length, as partial shapes do. If False (the default),
+      X is first scaled to the area of Y.
+
+    **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
+
+    **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive and finite.
+    """
+    if not 0 < stiffness < np.inf:
+        raise InputError(f"the stiffness is {stiffness}: give a positive number, such as {DEFAULT_STIFFNESS}.")
+    points = check_points(points, mesh_y, "points")
+    if len(points) != len(mesh_x.vertices):
+        raise InputError(
+            f"{mesh_x.name}: there are {len(points)} points for {len(mesh_x.vertices)} vertices: give one point "
+            "for each vertex."
+        )
+    root = np.sqrt(mesh_y.area)
+    # Positions relative to the middle of Y keep the digits of meshes far from the origin.
+    middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
+    targets = points.positions(mesh_y) - middle
+    around = Neighborhoods(mesh_x, 1.0 if same_unit else root / np.sqrt(mesh_x.area))
+    areas = around.size**2 * mesh_x.vertex_areas
+    # A vertex of no or little area still follows the map.
+    areas = np.maximum(areas, 1e-3 * np.median(areas[areas > 0]))
+    positions, similarities = targets, around.similarities(targets, _AVERAGINGS)
+    weights = areas.copy()
+    for _ in range(_FITS):
+        edge_vectors = around.transformed(similarities)
+        for reduction in range(_REDUCTIONS + 1):
+            positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
+            similarities = around.similarities(positions, _AVERAGINGS)
+            flipped = _flipped_faces(mesh_x, positions, similarities)
+            if reduction == _REDUCTIONS or not flipped.any():
+                break
+            corners = np.zeros(len(weights))
+            corners[mesh_x.faces[flipped]] = 1
+            weights = np.where(around.averaging @ corners > 0, _REDUCED * weights, weights)
+    return RegisteredMesh(mesh_x, mesh_y, positions + middle, similarities)
+
+
+def _follow(
+    around: Neighborhoods,
+    edge_vectors: Float64[np.ndarray, "e 3"],
+    weights: Float64[np.ndarray, " m"],
+    targets: Float64[np.ndarray, "m 3"],
+    squared_stiffness: float,
+    guess: Float64[np.ndarray, "m 3"],
+) -> Float64[np.ndarray, "m 3"]:
+    """Return the positions that follow the weighted targets and the edge vectors in the least-squares sense."""
+    system = csr_array(diags_array(weights) + squared_stiffness * around.laplacian)
+    forces = squared_stiffness * (around.incidence @ (around.weights[:, None] * edge_vectors))
+    right = forces + weights[:, None] * targets
+    preconditioner = diags_array(1 / system.diagonal())
+    columns = [
+        cg(system, b, x0=x, rtol=_TOLERANCE, M=preconditioner, maxiter=10 * len(weights))[0]
+        for b, x in zip(right.T, guess.T, strict=True)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _flipped_faces(
+    mesh_x: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
+) -> Bool[np.ndarray, " f"]:
+    """Return True for faces whose normal opposes the rotated normal of the source's face."""
+    rotations = similarities.rotations
+    hand = np.sign(np.linalg.det(rotations[0]))
+    expected = hand * np.einsum("fij,fj->fi", rotations[mesh_x.faces].sum(axis=1), _normals(mesh_x.vertices, mesh_x))
+    return (expected * _normals(positions, mesh_x)).sum(axis=1) < 0
+
+
+def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:
+    """Return normals of the faces of a mesh whose vertices have other positions, in any length."""
+    corners = vertices[mesh.faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _angles(corners: Float64[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, "f 3"]:
+    """Return the angles of triangles, given by the positions of their corners, in radians."""
+    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    crossed = np.linalg.norm(np.cross(ahead, behind), axis=2)
+    return np.arctan2(crossed, (ahead * behind).sum(axis=2))
