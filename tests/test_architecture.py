@@ -20,6 +20,7 @@ LAYERS = (
     "runtime",
     "geometry",
     "io",
+    "transfer",
     "pair",
     "descriptors",
     "initial_maps",

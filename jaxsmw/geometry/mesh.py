@@ -16,6 +16,7 @@ from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.scans import between_neighbors, in_small_components, lost_vertices
 
 # A mesh of another library, in one of the forms that `make_mesh` lists. Such meshes are recognised by their
 # attributes, because the other libraries are not imported.
@@ -338,6 +339,12 @@ def make_mesh(
     The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
     Vertices are never dropped or renumbered.
 
+    Scans may contain vertices without a usable position, and small components such as dust. If at most one
+    vertex in 1000 is not finite or very far away, such vertices are moved between their neighbours, and their
+    faces are dropped. Faces of components with less than 1 % of the area are dropped if another component has
+    at least half of the area. Like all unreferenced vertices, the vertices of dropped faces receive the match
+    of the nearest vertex.
+
     **Arguments:**
 
     - `vertices`: positions (n, 3) of any integer or float type, in any unit. The array is copied. If `faces`
@@ -372,9 +379,12 @@ def make_mesh(
     position = _numeric(vertices, "vertices", name)
     with np.errstate(over="ignore"):  # wider float types can overflow; `_check_extent` reports infinities
         position = np.array(position, dtype=np.float64, order="C")
-    _check_extent(position, name)
     triangles = _indices(_numeric(faces, "faces", name), len(position), name)
     notes = list(notes)
+    lost = lost_vertices(position)
+    if lost.any():
+        position = between_neighbors(position, triangles, lost)
+    _check_extent(position, name)
 
     if weld:
         lowest = first_equal_rows(position)
@@ -387,13 +397,30 @@ def make_mesh(
         )
     number, dropped = _distinct_faces(triangles)
     notes += dropped
-    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
+    if lost.any():
+        with_lost = lost[triangles[number]].any(axis=1)
+        number = number[~with_lost]
+        notes.append(
+            f"{count_of(int(lost.sum()), 'vertex')} without a usable position (not finite, or very far "
+            f"away), the first of them number {lost.argmax()} (counted from 0): "
+            f"{count_of(int(with_lost.sum()), 'face')} dropped."
+        )
+    mesh = Mesh(position, triangles[number], name)
     if mesh.degenerate_faces.all():
         raise InputError(
             f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
             "check the positions and the faces."
         )
     _check_resolution(mesh)
+    small, count = in_small_components(mesh.edges, mesh.faces, mesh.face_areas, len(position))
+    if count:
+        notes.append(
+            f"{count_of(count, 'small component')} with {mesh.face_areas[small].sum() / mesh.area:.1%} of "
+            f"the area ignored ({count_of(int(small.sum()), 'face')}): the vertices receive the match of the "
+            "nearest vertex."
+        )
+    number = number[~small]
+    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 

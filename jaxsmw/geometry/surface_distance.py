@@ -20,8 +20,8 @@ def nearest_surface_points(
     - `points`: positions (p, 3), in the unit and the coordinate system of the mesh.
     - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
 
-    **Returns:** The nearest points, p `SurfacePoints`, and the Euclidean distances to them (p,), in the unit of
-    the mesh.
+    **Returns:** The nearest points, p `SurfacePoints`, and the Euclidean distances to them (p,), in the
+    unit of the mesh.
     """
     if not len(points):
         return SurfacePoints(np.empty(0, np.int64), np.empty((0, 3))), np.empty(0)

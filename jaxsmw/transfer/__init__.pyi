@@ -1,3 +1,4 @@
+from .landmarks import TransferredLandmarks, transfer_landmarks
 from .registered_mesh import RegisteredMesh, register_mesh
 
-__all__ = ["RegisteredMesh", "register_mesh"]
+__all__ = ["RegisteredMesh", "TransferredLandmarks", "register_mesh", "transfer_landmarks"]

@@ -41,7 +41,8 @@ def transfer_landmarks(
 ) -> TransferredLandmarks:
     """Move landmarks from X to the surface of Y.
 
-    Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected onto Y.
+    Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected
+    onto Y.
 
     **Arguments:**
 
@@ -68,5 +69,7 @@ def transfer_landmarks(
     if expected_error is not None:
         at_corners = expected_error[mesh_x.faces[points.faces]]
         errors = np.sqrt(mesh_y.area) * (points.weights * at_corners).sum(axis=1)
-    moved = replace(landmarks, positions=images.positions(mesh_y), name=f"landmarks on {mesh_y.name}", notes=())
+    moved = replace(
+        landmarks, positions=images.positions(mesh_y), name=f"landmarks on {mesh_y.name}", notes=()
+    )
     return TransferredLandmarks(moved, distances, errors, notes)

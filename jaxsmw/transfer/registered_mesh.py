@@ -24,8 +24,8 @@ DEFAULT_STIFFNESS = 0.003
 _AVERAGINGS = 8
 # The transformations are fitted to the map, and once again to the result. (Entry R21)
 _FITS = 2
-# Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to _REDUCTIONS
-# times. (Entry R21)
+# Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to
+# _REDUCTIONS times. (Entry R21)
 _REDUCED, _REDUCTIONS = 0.2, 4
 # The relative residual at which the linear solver stops.
 _TOLERANCE = 1e-7
@@ -92,7 +92,7 @@ class RegisteredMesh:
 
     @cached_property
     def angle_distortions(self) -> Float64[np.ndarray, " f"]:
-        """The mean change of the three angles of each face, from X to the registered mesh (f,), in degrees."""
+        """The mean change of the angles of each face, from X to the registered mesh (f,), in degrees."""
         changes = _angles(self.mesh.vertices[self.mesh.faces]) - _angles(
             self.mesh_x.vertices[self.mesh_x.faces]
         )
@@ -125,18 +125,18 @@ class RegisteredMesh:
         return nearest_surface_points(self.mesh_y.vertices, self.mesh)[1]
 
     def sentences(self) -> tuple[str, ...]:
-        """Return sentences about the quality of the registered mesh, with lengths in percent of sqrt(area)."""
+        """Return sentences about the quality of the registered mesh."""
         unit = np.sqrt(self.mesh_y.area) / 100
         far = np.quantile(self.distances, 0.99) / unit
         flipped = int(self.flipped_faces.sum())
         areas = np.quantile(self.area_ratios, [0.05, 0.95])
         return (
-            f"distance to the target: mean {self.distances.mean() / unit:.3f} %, 99th percentile {far:.3f} % of "
-            "the square root of the target's area.",
+            f"distance to the target: mean {self.distances.mean() / unit:.3f} %, 99th percentile {far:.3f} % "
+            "of the square root of the target's area.",
             f"{count_of(flipped, 'flipped triangle')} of {len(self.mesh_x.faces)} "
             f"({flipped / len(self.mesh_x.faces):.3%}).",
-            f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area on "
-            f"the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
+            f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
+            f"on the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
         )
 
 
@@ -151,31 +151,33 @@ def register_mesh(
     """Deform X onto Y, so that its vertices follow a map and its triangles keep their shapes.
 
     The positions minimise the squared distances to the points of the map, plus the squared stiffness times
-    the squared differences of edge vectors from rotated and scaled edge vectors of X. The rotations and scales
-    are those of neighbourhoods, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007), with a scale.
-    Where faces would flip, the map receives less weight.
+    the squared differences of edge vectors from rotated and scaled edge vectors of X. The rotations and
+    scales are those of neighbourhoods, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007), with a
+    scale. Where faces would flip, the map receives less weight.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
     - `points`: the map X -> Y, as m `SurfacePoints` on Y; see `Correspondence.surface_points`.
     - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with shorter
-      wavelengths is smoothed. The default is 0.003. With 0.03, a noisy map gives a smooth mesh that is farther
-      away from the target.
-    - `same_unit`: whether X and Y have the same unit of length, as partial shapes do. If False (the default),
-      X is first scaled to the area of Y.
+      wavelengths is smoothed. The default is 0.003. With 0.03, a noisy map gives a smooth mesh that is
+      farther away from the target.
+    - `same_unit`: whether X and Y have the same unit of length, as partial shapes do. If False (the
+      default), X is first scaled to the area of Y.
 
     **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
 
     **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive and finite.
     """
     if not 0 < stiffness < np.inf:
-        raise InputError(f"the stiffness is {stiffness}: give a positive number, such as {DEFAULT_STIFFNESS}.")
+        raise InputError(
+            f"the stiffness is {stiffness}: give a positive number, such as {DEFAULT_STIFFNESS}."
+        )
     points = check_points(points, mesh_y, "points")
     if len(points) != len(mesh_x.vertices):
         raise InputError(
-            f"{mesh_x.name}: there are {len(points)} points for {len(mesh_x.vertices)} vertices: give one point "
-            "for each vertex."
+            f"{mesh_x.name}: there are {len(points)} points for {len(mesh_x.vertices)} vertices: give one "
+            "point for each vertex."
         )
     root = np.sqrt(mesh_y.area)
     # Positions relative to the middle of Y keep the digits of meshes far from the origin.
@@ -209,7 +211,7 @@ def _follow(
     squared_stiffness: float,
     guess: Float64[np.ndarray, "m 3"],
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the positions that follow the weighted targets and the edge vectors in the least-squares sense."""
+    """Return the positions that follow weighted targets and edge vectors in the least-squares sense."""
     system = csr_array(diags_array(weights) + squared_stiffness * around.laplacian)
     forces = squared_stiffness * (around.incidence @ (around.weights[:, None] * edge_vectors))
     right = forces + weights[:, None] * targets
@@ -227,7 +229,9 @@ def _flipped_faces(
     """Return True for faces whose normal opposes the rotated normal of the source's face."""
     rotations = similarities.rotations
     hand = np.sign(np.linalg.det(rotations[0]))
-    expected = hand * np.einsum("fij,fj->fi", rotations[mesh_x.faces].sum(axis=1), _normals(mesh_x.vertices, mesh_x))
+    expected = hand * np.einsum(
+        "fij,fj->fi", rotations[mesh_x.faces].sum(axis=1), _normals(mesh_x.vertices, mesh_x)
+    )
     return (expected * _normals(positions, mesh_x)).sum(axis=1) < 0
 
 

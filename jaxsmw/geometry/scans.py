@@ -1,0 +1,61 @@
+"""Parts of raw scans that do not belong to the scanned surface: lost vertices and small components."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import coo_array, csgraph
+
+# Up to this share of the vertices of a mesh may be lost. Meshes with more lost vertices are refused, because
+# they are damaged.
+_MOST_LOST = 1e-3
+# A vertex is lost if its distance from the median position is above this multiple of the 90th percentile of
+# all distances. Scans contain vertices of size 1e30 where a program wrote uninitialised memory.
+_FAR = 100.0
+# A component is small if it has less than this share of the area of the mesh, and the largest component has
+# at least _LARGEST of the area. Such components of scans are dust and enclosed bubbles.
+_SMALL, _LARGEST = 0.01, 0.5
+
+
+def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the vertices without a usable position, or an empty mask if there are too many.
+
+    A position is not usable if a coordinate is not finite, or if the vertex is very far from all others.
+    """
+    most = int(_MOST_LOST * len(position))
+    lost = ~np.isfinite(position).all(axis=1)
+    if 0 < most >= lost.sum():
+        with np.errstate(over="ignore", invalid="ignore"):
+            distances = np.abs(position - np.median(position[~lost], axis=0)).max(axis=1)
+            lost |= distances > _FAR * np.quantile(distances[~lost], 0.9)
+    return lost if lost.sum() <= most else np.zeros(len(position), dtype=bool)
+
+
+def between_neighbors(
+    position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"], lost: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Move each lost vertex to the mean of the usable vertices in its faces, or of all usable vertices."""
+    placed = position.copy()
+    for vertex in np.flatnonzero(lost):
+        around = np.unique(triangles[(triangles == vertex).any(axis=1)])
+        around = around[~lost[around]]
+        placed[vertex] = position[around if len(around) else ~lost].mean(axis=0)
+    return placed
+
+
+def in_small_components(
+    edges: Int64[np.ndarray, "e 2"],
+    triangles: Int64[np.ndarray, "f 3"],
+    face_areas: Float64[np.ndarray, " f"],
+    n: int,
+) -> tuple[Bool[np.ndarray, " f"], int]:
+    """Return a mask of the triangles in small components, and the number of small components."""
+    graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    count, component = csgraph.connected_components(graph, directed=False)
+    component = component[triangles[:, 0]]
+    areas = np.bincount(component, weights=face_areas, minlength=count)
+    has_faces = np.bincount(component, minlength=count) > 0
+    small = (areas < _SMALL * areas.sum()) & has_faces
+    if areas.max() < _LARGEST * areas.sum():
+        small[:] = False
+    return small[component], int(small.sum())
