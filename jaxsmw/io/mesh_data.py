@@ -20,6 +20,8 @@ from jaxtyping import Int64
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of, make_mesh
 from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Texture, Written
+from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
+from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
 from jaxsmw.io.formats.mat import format_mat, parse_mat
 from jaxsmw.io.formats.npz import format_npz, parse_npz
 from jaxsmw.io.formats.obj import format_obj, parse_obj
@@ -40,6 +42,7 @@ _PARSERS: dict[str, Callable[[bytes], Polygons]] = {
     ".mat": parse_mat,
     ".vtk": parse_vtk,
     ".vtp": parse_vtp,
+    ".glb": parse_glb,
     ".npz": parse_npz,
 }
 _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
@@ -50,6 +53,8 @@ _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
     ".mat": format_mat,
     ".vtk": format_vtk,
     ".vtp": format_vtp,
+    ".gltf": format_gltf,
+    ".glb": format_glb,
     ".npz": format_npz,
 }
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
@@ -64,8 +69,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.off`: colours of vertices and faces, normals, and texture coordinates (COFF, NOFF, STOFF).
     - `.obj`: the `vt` lines as texture. The `g`, `o` and `usemtl` lines as the face data `group`, `object`
       and `material`. Colours after the positions.
-    - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an array
-      `a`. The lists `texcoord` of faces, or the properties `s` and `t` of vertices, become the texture.
+    - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
+      array `a`. The lists `texcoord` of faces, or the properties `s` and `t` of vertices, become the texture.
     - `.stl`: none.
     - `.mat`: the further fields of the struct that `write_mesh_data` writes.
     - `.vtk`: VTK legacy files up to version 5.1, text or binary, with a POLYDATA or an UNSTRUCTURED_GRID of
@@ -107,7 +112,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
             f"mesh to one of {', '.join(_FORMATTERS)}."
         )
     try:
-        polygons = _PARSERS[suffix](data)
+        polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
         at, polygon = _fans(polygons.sizes)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -72,8 +72,8 @@ def write_mesh(
     - `colors`: the red, green and blue components of the colour of each vertex (n, 3), as floats from 0 to 1
         or as uint8. None, the default, writes no colours. An OFF file with colours begins with COFF.
 
-    **Returns:** Sentences about what the format cannot hold, such as colours in an STL file; an empty tuple if
-    the file contains everything.
+    **Returns:** Sentences about what the format cannot hold, such as colours in an STL file; an empty tuple
+    if the file contains everything.
 
     **Raises:**
 

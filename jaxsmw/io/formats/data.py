@@ -15,7 +15,6 @@ from jaxsmw.geometry.mesh import Mesh, count_of
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 COLORS, NORMALS, TEXTURE_OF_CORNERS = "colors", "normals", "texcoord"
-LARGEST_WEIGHTS = 2**26
 
 
 class Texture(NamedTuple):
@@ -306,7 +305,17 @@ def is_texture_of_vertices(data: MeshData) -> bool:
 
 def unique_name(name: str, taken: Iterable[str]) -> str:
     """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
-    taken, number, chosen = set(taken), 2, name
-    while chosen in taken:
-        chosen, number = f"{name} ({number})", number + 1
-    return chosen
+    return unique_names([*taken, name])[-1]
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Return the names, with numbers in parentheses after repeated names."""
+    chosen: dict[str, None] = {}
+    numbers: dict[str, int] = {}
+    for name in names:
+        one = name
+        while one in chosen:
+            numbers[name] = numbers.get(name, 1) + 1
+            one = f"{name} ({numbers[name]})"
+        chosen[one] = None
+    return list(chosen)

@@ -52,7 +52,7 @@ def parse_npz(data: bytes) -> Polygons:
         np.full(len(faces), 3),
         vertex_data=folders["vertex_data"],
         face_data=folders["face_data"],
-        texture=_texture(*texture, faces.shape) if texture else None,
+        texture=_texture(texture[0], texture[1], faces.shape) if texture else None,
         blend_shapes=folders["blend_shapes"],
         skin=Skin(tuple(map(str, skin[0].ravel())), skin[1]) if skin else None,
         label_names={name: tuple(map(str, names.ravel())) for name, names in folders["label_names"].items()},

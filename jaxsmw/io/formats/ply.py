@@ -135,9 +135,9 @@ def _numbers_of(table: Mapping[str, _Column], properties: Mapping[str, _Property
 def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Join the components of colours and normals, and properties a_0, a_1, …, into arrays with columns."""
     columns: dict[str, list[str]] = {}
-    for group, names in _COLUMNS_OF.items():
-        if all(name in data for name in names[:3]):
-            columns[group] = [name for name in names if name in data]
+    for group, components in _COLUMNS_OF.items():
+        if all(name in data for name in components[:3]):
+            columns[group] = [name for name in components if name in data]
     for name in data:
         stem = name.removesuffix("_0")
         if stem != name and stem and f"{stem}_1" in data and stem not in data:
