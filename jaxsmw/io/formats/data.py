@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -225,37 +225,40 @@ class Written(NamedTuple):
     notes: tuple[str, ...]
 
 
-def omissions(
-    data: MeshData,
-    form: str,
-    *,
-    vertex: Callable[[str, np.ndarray], bool] = lambda name, values: False,
-    face: Callable[[str, np.ndarray], bool] = lambda name, values: False,
-    holds: Iterable[str] = (),
-) -> tuple[str, ...]:
+def always(name: str, values: Any) -> bool:
+    """A value for arguments of `omissions`: the format can hold everything of this kind."""
+    return True
+
+
+def never(name: str, values: Any) -> bool:
+    """A value for arguments of `omissions`: the format can hold nothing of this kind."""
+    return False
+
+
+def omissions(data: MeshData, form: str, **holds: Callable[[str, Any], bool]) -> tuple[str, ...]:
     """Return a sentence for each kind of data that a format cannot hold.
 
     **Arguments:**
 
     - `form`: the name of the format.
-    - `vertex`, `face`: functions of the name and the values of an array of vertex data or face data. They
-      return whether the format can hold the array.
-    - `holds`: the other attributes of a `MeshData` that the format can hold.
+    - `holds`: a function for each attribute of `MeshData`. The function returns whether the format can hold
+      an element of the attribute with a given name and value. Missing functions mean `never`.
     """
-    holds = set(holds)
-    lost = {
-        "vertex data": [name for name, values in data.vertex_data.items() if not vertex(name, values)],
-        "face data": [name for name, values in data.face_data.items() if not face(name, values)],
-        "blend shapes": [] if "blend_shapes" in holds else list(data.blend_shapes),
-        "joints": [] if "skin" in holds or data.skin is None else list(data.skin[0]),
-        "names of the labels": [] if "label_names" in holds else list(data.label_names),
+    skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
+    kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "vertex_data": ("the vertex data ", data.vertex_data),
+        "face_data": ("the face data ", data.face_data),
+        "blend_shapes": ("the blend shapes ", data.blend_shapes),
+        "skin": ("the joints ", skin),
+        "label_names": ("the names of the labels ", data.label_names),
     }
-    notes = [
-        f"{form} files cannot hold the {what} {', '.join(map(ascii, names[:5]))}"
-        f"{f' and {len(names) - 5} more' if len(names) > 5 else ''}, so the file does not contain them."
-        for what, names in lost.items()
-        if names
-    ]
+    notes = []
+    for attribute, (what, values) in kinds.items():
+        fits = holds.get(attribute, never)
+        names = [name for name, value in values.items() if not fits(name, value)]
+        listed = ", ".join(map(ascii, names[:5])) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        if names:
+            notes.append(f"{form} files cannot hold {what}{listed}, so the file does not contain them.")
     if data.texture is not None and "texture" not in holds:
         notes.append(f"{form} files cannot hold texture coordinates, so the file does not contain them.")
     return tuple(notes)
@@ -303,9 +306,13 @@ def is_texture_of_vertices(data: MeshData) -> bool:
     )
 
 
-def unique_name(name: str, taken: Iterable[str]) -> str:
+def unique_name(name: str, taken: Collection[str]) -> str:
     """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
-    return unique_names([*taken, name])[-1]
+    chosen, number = name, len(taken)  # a smaller first number would take long if many names are equal
+    while chosen in taken:
+        number += 1
+        chosen = f"{name} ({number})"
+    return chosen
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

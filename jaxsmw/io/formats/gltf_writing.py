@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Written, is_color, omissions
+from jaxsmw.io.formats.data import MeshData, Written, always, is_color, omissions
 from jaxsmw.io.formats.gltf import RECORD
 from jaxsmw.io.formats.gltf_accessors import TYPES
 
@@ -162,8 +162,10 @@ class _File:
         return omissions(
             self.data,
             "glTF",
-            vertex=lambda name, values: _storable(name, values) is not None,
-            holds=("texture", "blend_shapes", "skin"),
+            vertex_data=lambda name, values: _storable(name, values) is not None,
+            blend_shapes=always,
+            skin=always,
+            texture=always,
         )
 
 

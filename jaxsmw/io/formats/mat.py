@@ -12,7 +12,7 @@ import scipy.io
 from scipy.io.matlab import MatWriteError
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import NOTHING, MeshData, Polygons, Skin, Written, omissions
+from jaxsmw.io.formats.data import NOTHING, MeshData, Polygons, Skin, Written, always, omissions
 from jaxsmw.io.mat_files import find_structs, is_real, parse_variables
 
 
@@ -97,7 +97,7 @@ def _skin(struct: Mapping[str, Any], n: int) -> Skin:
     return Skin(tuple(_words(struct.get("joints", []))), _rows(struct.get("weights", []), n))
 
 
-def _is_field(name: str) -> bool:
+def _is_field(name: str, _: Any = None) -> bool:
     """Return whether MATLAB accepts a name as the field of a struct."""
     return bool(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name))
 
@@ -125,14 +125,15 @@ def format_mat(data: MeshData) -> Written:
         raise InputError(
             "an array is larger than 4 GiB, the limit of .mat files: write a .npz file."
         ) from None
-    holds = {"texture", "skin"}
-    holds |= {part for part in ("blend_shapes", "label_names") if all(map(_is_field, parts[part]))}
     notes = omissions(
         data,
         "MATLAB",
-        vertex=lambda name, _: _is_field(name),
-        face=lambda name, _: _is_field(name),
-        holds=holds,
+        vertex_data=_is_field,
+        face_data=_is_field,
+        blend_shapes=_is_field,
+        label_names=_is_field,
+        texture=always,
+        skin=always,
     )
     return Written(file.getvalue(), notes)
 

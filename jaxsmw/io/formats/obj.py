@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, is_color, omissions
+from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, always, is_color, omissions
 from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
 
 # The statements that apply to all following faces, and the names of the labels that they become.
@@ -157,9 +157,10 @@ def format_obj(data: MeshData) -> Written:
     notes = omissions(
         data,
         "OBJ",
-        vertex=_fits_vertices,
-        face=lambda name, _: _fits_faces(data, name),
-        holds=("texture", *(["label_names"] if set(data.label_names) <= set(_LABELS) else [])),
+        vertex_data=_fits_vertices,
+        face_data=lambda name, _: _fits_faces(data, name),
+        label_names=lambda name, _: _fits_faces(data, name),
+        texture=always,
     )
     return Written("\n".join([*lines, *faces, ""]).encode(), notes)
 

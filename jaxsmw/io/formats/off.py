@@ -121,7 +121,7 @@ def format_off(data: MeshData) -> Written:
     if is_color(COLORS, colors := data.face_data.get(COLORS, _NONE)):
         faces = _with_colors(faces, colors)
     content = "\n".join([keyword, f"{len(vertices)} {len(faces)} 0", *vertices, *faces, ""])
-    return Written(content.encode(), omissions(data, "OFF", vertex=is_color, face=is_color))
+    return Written(content.encode(), omissions(data, "OFF", vertex_data=is_color, face_data=is_color))
 
 
 _NONE = np.empty(0)

@@ -16,6 +16,7 @@ from jaxsmw.io.formats.data import (
     MeshData,
     Polygons,
     Written,
+    always,
     is_color,
     is_texture_of_vertices,
     omissions,
@@ -321,9 +322,9 @@ def format_ply(data: MeshData) -> Written:
     notes = omissions(
         data,
         "PLY",
-        vertex=lambda name, _: name not in lost_of_vertices,
-        face=lambda name, _: name not in lost_of_faces,
-        holds=("texture",),
+        vertex_data=lambda name, _: name not in lost_of_vertices,
+        face_data=lambda name, _: name not in lost_of_faces,
+        texture=always,
     )
     return Written("\n".join(header).encode() + vertices.tobytes() + faces.tobytes(), notes)
 

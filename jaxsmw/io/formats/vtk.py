@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions
+from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.formats.vtk_cells import (
     DAMAGED,
@@ -293,12 +293,8 @@ def format_vtk(data: MeshData) -> Written:
     parts += _field(point_data)
     if cell_data:
         parts += [f"CELL_DATA {f}\n".encode(), *_field(cell_data)]
-    notes = omissions(data, "VTK", vertex=_all, face=_all, holds=("texture",))
+    notes = omissions(data, "VTK", vertex_data=always, face_data=always, texture=always)
     return Written(b"".join(parts), notes)
-
-
-def _all(name: str, values: np.ndarray) -> bool:
-    return True
 
 
 def _field(arrays: dict[str, np.ndarray]) -> list[bytes]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions, unique_name
+from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions, unique_name
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.formats.vtk_cells import (
     DAMAGED,
@@ -286,14 +286,13 @@ def format_vtp(data: MeshData) -> Written:
         "</Polys></Piece></PolyData></VTKFile>",
         "",
     ]
-    notes = omissions(
-        data,
-        "VTP",
-        vertex=lambda name, _: name.isprintable(),
-        face=lambda name, _: name.isprintable(),
-        holds=("texture",),
-    )
+    notes = omissions(data, "VTP", vertex_data=_fits, face_data=_fits, texture=always)
     return Written("\n".join(lines).encode(), notes)
+
+
+def _fits(name: str, _: np.ndarray) -> bool:
+    """Return whether XML can contain a name."""
+    return name.isprintable()
 
 
 def _array(name: str, values: np.ndarray) -> str:
