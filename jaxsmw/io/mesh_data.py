@@ -75,8 +75,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.mat`: the further fields of the struct that `write_mesh_data` writes.
     - `.vtk`: VTK legacy files up to version 5.1, text or binary, with a POLYDATA or an UNSTRUCTURED_GRID of
       triangles, polygons and triangle strips: all arrays on points and cells.
-    - `.vtp`: VTK XML files in all encodings, also compressed with zlib or LZMA: all arrays on points and
-      cells.
+    - `.vtp`: VTK XML files in all encodings, also compressed: all arrays on points and cells. Compression
+      with LZ4 needs the extra `vtk`.
     - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
       Further attributes, morph targets and skins are read as well.
     - `.npz`: arrays with the names of the attributes of a `MeshData`.

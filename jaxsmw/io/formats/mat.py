@@ -39,6 +39,7 @@ def parse_mat(data: bytes) -> Polygons:
     if len(given) == 1 + len(columns) and len({len(surface[field]) for field in columns}) == 1:
         vertices = np.column_stack([surface[field] for field in columns]).astype(np.float64)
         faces = surface["TRIV"].astype(np.float64)
+        faces = faces[None] if faces.shape == (3,) else faces  # one face
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(
             "contains no struct 'surface' with X, Y, Z (or VERT) and TRIV, as in the TOSCA data set: save "

@@ -130,6 +130,8 @@ class _File:
                 add_array(data, unquote(name), values)
             case ["COLOR_SCALARS", name, columns]:
                 values = self.take(self.rows, _count(columns), "unsigned_char" if self.binary else "float")
+                if not self.binary:  # text has floats from 0 to 1
+                    values = np.rint(255 * np.clip(np.nan_to_num(values), 0, 1)).astype(np.uint8)
                 add_array(data, unquote(name), values)
             case ["LOOKUP_TABLE", _, size]:
                 self.take(_count(size), 4, "unsigned_char" if self.binary else "float")

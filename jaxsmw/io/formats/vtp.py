@@ -40,7 +40,7 @@ _TYPES = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 # The groups of cells in the order in which the data of cells lists them.
 _KINDS = {"Verts": VERTEX, "Lines": LINE, "Polys": POLYGON, "Strips": STRIP}
-_COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor"}
+_COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCompressor"}
 
 
 def parse_vtp(data: bytes) -> Polygons:
@@ -120,8 +120,8 @@ class _File:
             raise InputError(f"has the unknown byte order {order!a} or header type {header!a}, {DAMAGED}")
         if self.compressor and self.compressor not in _COMPRESSORS:
             raise InputError(
-                f"is compressed with {excerpt(self.compressor)}, which is not supported: save it with ZLib "
-                "or without compression."
+                f"is compressed with {excerpt(self.compressor)}, which is not supported: save it with "
+                "ZLib or without compression."
             )
         self.order, self.header = orders[order], np.dtype(orders[order] + headers[header])
 
@@ -215,13 +215,30 @@ class _File:
         try:
             if self.compressor == "vtkZLibDataCompressor":
                 unpacked = zlib.decompressobj().decompress(packed, size or 1)
-            else:
+            elif self.compressor == "vtkLZMADataCompressor":
                 unpacked = lzma.LZMADecompressor(memlimit=2**28).decompress(packed, size or 1)
+            else:
+                unpacked = _unpack_lz4(packed, size)
         except (zlib.error, lzma.LZMAError, EOFError):
             unpacked = b""
         if len(unpacked) != size:
             raise InputError(f"a compressed array cannot be unpacked, {DAMAGED}")
         return unpacked
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes:
+    """Unpack a block that is compressed with LZ4; return nothing if the block is damaged."""
+    try:
+        import lz4.block
+    except ImportError:
+        raise InputError(
+            "is compressed with LZ4, which needs the package lz4: run pip install "
+            "'jaxsmw[vtk]', or save the file with ZLib."
+        ) from None
+    try:
+        return lz4.block.decompress(packed, uncompressed_size=min(size, 255 * len(packed)))
+    except (lz4.block.LZ4BlockError, ValueError):
+        return b""
 
 
 class _Stream:
