@@ -164,7 +164,7 @@ def test_colors_of_both_types_and_with_alpha_are_kept(tmp_path, suffix, channels
     write_mesh_data(tmp_path / f"m{suffix}", data)
     again = read_mesh_data(tmp_path / f"m{suffix}").vertex_data["colors"]
     is_plain = suffix == ".ply" and kind == np.float64 and channels == 3
-    assert again.shape == colors.shape and again.dtype.kind == colors.dtype.kind or is_plain
+    assert (again.shape == colors.shape and again.dtype.kind == colors.dtype.kind) or is_plain
     assert np.allclose(again, colors, atol=1e-7)
 
 
@@ -183,12 +183,12 @@ def test_trimesh_opens_written_files(tmp_path, suffix):
     if suffix in (".ply", ".glb", ".gltf"):
         assert np.array_equal(other.visual.vertex_colors[:, :3], data.vertex_data["colors"])
     if suffix in (".glb", ".gltf"):
-        assert np.allclose(other.vertex_attributes["_temperature"], data.vertex_data["temperature"])
+        assert np.allclose(other.vertex_attributes["_temperature"].ravel(), data.vertex_data["temperature"])
         assert np.array_equal(other.vertex_attributes["_short"], data.vertex_data["short"])
 
 
 @pytest.mark.parametrize("seam", [False, True])
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".gltf"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
 def test_trimesh_opens_written_textures(tmp_path, suffix, seam):
     data = replace(sample(seam=seam), vertex_data={})
     write_mesh_data(tmp_path / f"m{suffix}", data)
@@ -361,7 +361,7 @@ def test_unstructured_grids_of_vtk_are_read(tmp_path, is_binary, version):
     grid.InsertNextCell(10, 4, [0, 1, 2, 3])
     grid.GetCellData().Initialize()
     writer.Write()
-    with pytest.raises(InputError, match="cells of type 10.*extract the surface"):
+    with pytest.raises(InputError, match=r"cells of type 10.*extract the surface"):
         read_mesh(tmp_path / "m.vtk")
 
 
@@ -524,7 +524,7 @@ def test_booleans_and_single_columns_become_plain_arrays():
 @pytest.mark.parametrize("suffix", [".gltf", ".glb"])
 def test_numbers_beyond_float32_write_nothing(tmp_path, suffix):
     mesh = make_mesh(TRIANGLE.vertices * 1e40, FACES)
-    with pytest.raises(InputError, match="too large for glTF files.*another unit"):
+    with pytest.raises(InputError, match=r"too large for glTF files.*another unit"):
         write_mesh(tmp_path / f"m{suffix}", mesh)
     assert list(tmp_path.iterdir()) == []
 

@@ -122,7 +122,8 @@ class _Scene:
         if isinstance(extras, dict):  # extras may have any type
             listed = extras.get("targetNames")
             names = [str(name) for name in listed] if isinstance(listed, list) else []
-            self.record = document.dict_of(extras, RECORD)
+            record = extras.get(RECORD)
+            self.record = record if isinstance(record, dict) else {}
         nodes_of_joints = None
         if "skin" in node:
             nodes_of_joints = document.list_of(document.item("skins", node["skin"]), "joints")

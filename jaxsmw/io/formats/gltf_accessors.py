@@ -123,7 +123,8 @@ class Document:
         """Return an element of a list at the top level, such as an accessor."""
         items = self.list_of(self.json, key)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
-            raise InputError(f"uses number {excerpt(str(index)[:40])} of {len(items)} {key}, {DAMAGED}")
+            number = index if isinstance(index, int) and abs(index) < 2**63 else excerpt(str(index)[:99])
+            raise InputError(f"uses number {number} of {len(items)} {key}, {DAMAGED}")
         if not isinstance(items[index], dict):
             self.refuse(key)
         return items[index]

@@ -122,7 +122,11 @@ class _File:
         self.json["nodes"][0]["skin"] = 0
         self.json["nodes"] += [{"name": "joints", "children": nodes}, *({"name": name} for name in names)]
         self.json["scenes"][0]["nodes"].append(1)
-        self.json["skins"] = [{"joints": nodes}]
+        identity = np.tile(np.eye(4, dtype=np.float32).ravel(), (len(names), 1))
+        matrices = {"bufferView": self.view(identity), "componentType": _COMPONENTS["f4"]}
+        self.json["accessors"].append(matrices | {"count": len(names), "type": "MAT4"})
+        # The matrices may be missing, but VTK 9.7 ends the process then.
+        self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
 
     def view(self, values: np.ndarray, target: int | None = None) -> int:
         """Add a buffer view, whose rows begin at multiples of four bytes."""
