@@ -59,8 +59,8 @@ def _with_data(polygons: Polygons, surface: Mapping[str, Any]) -> Polygons:
         blend_shapes={
             name: _rows(values, n) for name, values in _struct(surface.get("blend_shapes")).items()
         },
-        texture=_texture(_struct(texture), f) if texture is not None else None,
-        skin=_skin(_struct(skin), n) if skin is not None else None,
+        texture=_texture(texture, f) if isinstance(texture, dict) else None,
+        skin=_skin(skin, n) if isinstance(skin, dict) else None,
         label_names=names,
     )
 

@@ -256,11 +256,10 @@ class _File:
             return Cells(
                 np.full(count, kind), np.full(count, width - 1), stream.reshape(count, width)[:, 1:].ravel()
             )
-        starts, position = [], 0
-        for _ in range(count):
+        starts: list[int] = []
+        position = 0
+        while len(starts) < count and position < size and 0 <= stream[position] < size:
             starts.append(position)
-            if position >= size or not 0 <= stream[position] < size:
-                break
             position += int(stream[position]) + 1
         if position != size or len(starts) != count:
             raise InputError(
