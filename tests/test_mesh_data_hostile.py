@@ -272,8 +272,8 @@ def test_files_that_end_anywhere_are_refused(tmp_path, suffix):
         path.write_bytes(content[:length])
         if (
             suffix == ".vtk"
-            and content[length - 1 : length] == b"\n"
             and length > content.index(b"POINT_DATA") - 2
+            and b"\n" in content[length - 1 : length + 1]
         ):
             continue  # a file may end after any section
         with pytest.raises(InputError, match=f"cut{suffix}: "):
