@@ -491,6 +491,16 @@ def test_files_that_end_anywhere_are_refused(tmp_path):
         refusal(tmp_path / "m.glb")
 
 
+@pytest.mark.parametrize("key", ["vertices", "texture"])
+@pytest.mark.parametrize("wrong", [2**31 - 1, -(2**31), -2, 5])
+def test_records_of_copies_with_gaps_are_refused(tmp_path, key, wrong):
+    file = square()
+    good, bad = np.arange(4, dtype="i4"), np.array([0, 1, 2, wrong], "i4")
+    record = {one: file.view((bad if one == key else good).tobytes()) for one in ("vertices", "texture")}
+    file.json["meshes"][0]["extras"] = {"jaxsmw": record}
+    assert "record of duplicate vertices is not valid" in refusal(file.save(tmp_path))
+
+
 def test_repeated_primitives_cannot_fill_the_memory(tmp_path):
     file = Builder()
     position = file.add(np.random.default_rng(0).normal(size=(30000, 3)).astype("f4"))

@@ -345,13 +345,12 @@ def _without_copies(polygons: Polygons, record: dict[str, Any], document: Docume
         document.view(record.get(key), 0, n, "i4", 1)[:, 0].astype(np.int64)
         for key in ("vertices", "texture")
     )
-    t = int(texture.max()) + 1
     known = texture >= 0
     vertices, first = np.unique(original, return_index=True)
     textures, first_texture = np.unique(texture[known], return_index=True)
     if (
         not np.array_equal(vertices, np.arange(len(vertices)))
-        or not np.array_equal(textures, np.arange(t))
+        or not np.array_equal(textures, np.arange(len(textures)))
         or (texture < -1).any()
     ):
         raise InputError(f"the record of duplicate vertices is not valid, {DAMAGED}")

@@ -21,7 +21,9 @@ def parse_stl(data: bytes) -> Polygons:
     # Both text files and some binary files begin with "solid". Therefore a file is treated as binary if its
     # length fits its header.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
-        corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3).astype(np.float64)
+        corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3)
+        with np.errstate(invalid="ignore"):  # some bit patterns of NaN cause a warning
+            corners = corners.astype(np.float64)
     elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
         content = text(data).lower()
         corners = numbers(
