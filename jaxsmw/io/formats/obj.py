@@ -81,6 +81,8 @@ def _texture(
     content: str, lines: Sequence[str], sizes: np.ndarray, face_at: Callable[[], list[int]]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the texture coordinates, and the texture vertex of each corner, -1 for none."""
+    if not re.search(r"[^/\s]/[^/\s]", "\n".join(lines)):  # no corner vertex/texture, only vertex//normal
+        return None
     # A corner begins with the number of its vertex.
     words = [word.split("/") for line in lines for word in line.split() if word[0] != "/"]
     texts = [word[1] if len(word) > 1 else "" for word in words]
