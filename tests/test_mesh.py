@@ -928,7 +928,7 @@ def test_invalid_colors_write_nothing(tmp_path, colors):
 
 
 @pytest.mark.parametrize(
-    "name", ["m.obj", "m.stl", "m", "m.off.gz", "no/such/m.off", "file/m.off", "directory.off"]
+    "name", ["m.xyz", "m.3mf", "m", "m.off.gz", "no/such/m.off", "file/m.off", "directory.off"]
 )
 def test_invalid_output_paths_write_nothing(tmp_path, name):
     (tmp_path / "file").touch()

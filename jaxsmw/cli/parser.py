@@ -48,8 +48,8 @@ def make_parser() -> Parser:
     """Return the parser of all commands. Parsed options contain the command's function as attribute `run`."""
     parser = Parser(
         prog="jaxsmw",
-        description="Match two triangle meshes (OFF, OBJ, PLY, STL or MATLAB's MAT) of the same kind of body "
-        "in different poses: find for every vertex of one mesh the same point on the other.",
+        description="Match two triangle meshes (OFF, OBJ, PLY, STL, VTK, glTF or MATLAB's MAT) of the same "
+        "kind of body in different poses: find for every vertex of one mesh the same point on the other.",
     )
     parser.add_argument("--version", action=_Version)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)

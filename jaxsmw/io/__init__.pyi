@@ -1,6 +1,7 @@
 from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .map_files import read_landmarks, read_pointwise_map, write_pointwise_map
+from .mesh_data import MeshData, Skin, Texture, read_mesh_data, write_mesh_data
 from .mesh_files import read_mesh, write_mesh
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
 
@@ -8,6 +9,9 @@ __all__ = [
     "FrameDistances",
     "LandmarkMatch",
     "Landmarks",
+    "MeshData",
+    "Skin",
+    "Texture",
     "check_frame",
     "find_frame",
     "make_spectrum",
@@ -16,11 +20,13 @@ __all__ = [
     "read_landmark_file",
     "read_landmarks",
     "read_mesh",
+    "read_mesh_data",
     "read_pointwise_map",
     "read_spectrum",
     "write_functional_map",
     "write_landmark_file",
     "write_mesh",
+    "write_mesh_data",
     "write_pointwise_map",
     "write_spectrum",
 ]

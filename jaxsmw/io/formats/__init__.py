@@ -1,0 +1,1 @@
+"""One module per format of mesh files. Each module parses and formats the bytes of a file."""

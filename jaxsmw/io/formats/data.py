@@ -1,0 +1,328 @@
+"""The contents of a mesh file: the parsed polygons, and the mesh together with its data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh, count_of
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+COLORS, NORMALS, TEXTURE_OF_CORNERS = "colors", "normals", "texcoord"
+
+
+class Texture(NamedTuple):
+    """Texture coordinates of a mesh.
+
+    Along a seam, one vertex has several texture vertices.
+
+    **Attributes:**
+
+    - `coordinates`: the coordinates (u, v) of the texture vertices (t, 2), float64. The origin of the picture
+      is its lower left corner.
+    - `corners`: the 0-based texture vertex of each corner of each triangle (f, 3), int64. The number -1 marks
+      a corner without a texture vertex.
+    """
+
+    coordinates: np.ndarray
+    corners: np.ndarray
+
+
+class Skin(NamedTuple):
+    """The weights that bind the vertices of a mesh to the joints of a skeleton.
+
+    **Attributes:**
+
+    - `joints`: the names of the joints, a tuple of distinct strings.
+    - `weights`: the weight of each joint at each vertex (n, joints), float64.
+    """
+
+    joints: tuple[str, ...]
+    weights: np.ndarray
+
+
+class Polygons(NamedTuple):
+    """The polygons of a file, and the data on them.
+
+    `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
+    of each face. `face_data` has one row per polygon. `texture` consists of texture coordinates (t, 2) and
+    the texture vertex of each entry of `corners`. `weld` is True if the format duplicates vertices at seams.
+    """
+
+    vertices: Float64[np.ndarray, "n 3"]
+    corners: np.ndarray
+    sizes: Int64[np.ndarray, " f"]
+    notes: tuple[str, ...] = ()
+    vertex_data: Mapping[str, np.ndarray] = NOTHING
+    face_data: Mapping[str, np.ndarray] = NOTHING
+    texture: tuple[np.ndarray, np.ndarray] | None = None
+    blend_shapes: Mapping[str, np.ndarray] = NOTHING
+    skin: Skin | None = None
+    label_names: Mapping[str, tuple[str, ...]] = NOTHING
+    weld: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MeshData:
+    """A mesh together with everything that a file says about its vertices and faces.
+
+    Use `read_mesh_data` to read a `MeshData` from a file. The constructor checks all lengths, types and
+    indices, so a `MeshData` is always consistent.
+
+    **Attributes:**
+
+    - `mesh`: the `Mesh` with n vertices that matching uses.
+    - `faces`: all triangles (f, 3) of the file in the order of the file, before cleaning and welding; 0-based
+      indices of the vertices of `mesh`, int64. Polygons are split into fans of triangles.
+    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. Colours
+      are called `colors`; they are uint8, or floats from 0 to 1. Normals are called `normals`.
+    - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle.
+    - `texture`: a `Texture`, or None.
+    - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
+      the vertices, in the unit of the vertices.
+    - `skin`: a `Skin`, or None.
+    - `label_names`: a dictionary from names in `vertex_data` or `face_data` to the names of the labels 0, 1,
+      … in the array. For example, `face_data["group"]` of an OBJ file contains the number of each triangle's
+      group, and `label_names["group"]` contains the names of all groups.
+
+    **Raises:** `InputError` if an array has a wrong length or type, an index is out of range, or a
+    displacement, weight or texture coordinate is not finite.
+    """
+
+    mesh: Mesh
+    faces: np.ndarray
+    vertex_data: Mapping[str, np.ndarray] = field(default_factory=dict)
+    face_data: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texture: tuple[np.ndarray, np.ndarray] | None = None
+    blend_shapes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    skin: tuple[tuple[str, ...], np.ndarray] | None = None
+    label_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.mesh.vertices)
+        faces = _indices(self.faces, n, "faces", "vertices", self._fail)
+        f = len(faces)
+        checked = {
+            "faces": faces,
+            "vertex_data": self._rows(self.vertex_data, "vertex data", n, "vertex"),
+            "face_data": self._rows(self.face_data, "face data", f, "face"),
+            "blend_shapes": {
+                name: self._real(values, f"the blend shape {name!a}", (n, 3))
+                for name, values in self.blend_shapes.items()
+            },
+            "texture": self._checked_texture(f),
+            "skin": self._checked_skin(n),
+            "label_names": {name: tuple(map(str, names)) for name, names in self.label_names.items()},
+        }
+        for attribute, value in checked.items():
+            object.__setattr__(self, attribute, value)
+        self._check_labels()
+
+    def _fail(self, fault: str) -> InputError:
+        return InputError(f"{self.mesh.name}: {fault}")
+
+    def _rows(self, data: Mapping[str, Any], what: str, count: int, noun: str) -> dict[str, np.ndarray]:
+        """Check data with one row per vertex or face. Integers and floats keep their types."""
+        checked = {}
+        for name, values in data.items():
+            array = np.asarray(values)
+            if not name or array.ndim not in (1, 2) or array.dtype.kind not in "biuf" or not array.shape[-1]:
+                raise self._fail(
+                    f"the {what} {name!a} are {array.dtype.name} of shape {array.shape}: give each array a "
+                    "name, and one number or one row of numbers per row."
+                )
+            if len(array) != count:
+                raise self._fail(
+                    f"the {what} {name!a} have {count_of(len(array), 'row')}, but need {count}: give one row "
+                    f"for each {noun}."
+                )
+            checked[name] = _canonical(array[:, 0] if array.shape[1:] == (1,) else array)
+        return checked
+
+    def _real(self, values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, ...]:
+        array = np.asarray(values)
+        if array.shape != shape or array.dtype.kind not in "biuf":
+            raise self._fail(
+                f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
+                "give an array of this shape."
+            )
+        array = array.astype(np.float64)
+        if not np.isfinite(array).all():
+            raise self._fail(f"{what} contains a number that is not finite: repair the numbers.")
+        return array
+
+    def _checked_texture(self, f: int) -> Texture | None:
+        if self.texture is None:
+            return None
+        coordinates, corners = self.texture
+        coordinates = self._real(coordinates, "the texture", (*np.shape(coordinates)[:1], 2))
+        corners = _indices(
+            corners, len(coordinates), "the texture's corners", "texture vertices", self._fail, -1
+        )
+        if len(corners) != f:
+            raise self._fail(
+                f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
+                f"{count_of(f, 'face')}: give one row for each face."
+            )
+        return Texture(coordinates, corners)
+
+    def _checked_skin(self, n: int) -> Skin | None:
+        if self.skin is None:
+            return None
+        joints, weights = self.skin
+        if len(set(joints)) != len(joints) or not joints:
+            raise self._fail("the names of the joints are not distinct: give each joint its own name.")
+        return Skin(tuple(map(str, joints)), self._real(weights, "the skin", (n, len(joints))))
+
+    def _check_labels(self) -> None:
+        for name, names in self.label_names.items():
+            arrays = [data[name] for data in (self.vertex_data, self.face_data) if name in data]
+            if not arrays or any(
+                array.ndim != 1 or array.dtype.kind not in "iu" or not _within(array, len(names))
+                for array in arrays
+            ):
+                raise self._fail(
+                    f"the labels {name!a} are not integers from 0 to {len(names) - 1}: give an array of "
+                    "labels with this name, and one name for each label."
+                )
+
+
+def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
+    return not array.size or bool(array.min() >= first and array.max() < count)
+
+
+def _canonical(array: np.ndarray) -> np.ndarray:
+    """Return a contiguous copy in native byte order. Types that few formats know become wider types."""
+    kind = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
+    wanted = kind.get(array.dtype.str[1:], kind.get(array.dtype.kind, array.dtype.newbyteorder("=")))
+    return np.array(array, dtype=wanted, order="C")
+
+
+def _indices(
+    values: Any, count: int, what: str, whole: str, fail: Callable[[str], InputError], first: int = 0
+) -> Int64[np.ndarray, "f 3"]:
+    array = np.asarray(values)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+        raise fail(
+            f"{what} are {array.dtype.name} of shape {array.shape}: give integers of shape (number of faces, "
+            "3)."
+        )
+    if not _within(array, count, first):
+        raise fail(f"{what} use a number outside the {count} {whole}: correct the indices.")
+    return array.astype(np.int64)
+
+
+class Written(NamedTuple):
+    """The content of a file to write, and sentences about the data that the file does not contain."""
+
+    content: bytes
+    notes: tuple[str, ...]
+
+
+def always(name: str, values: Any) -> bool:
+    """A value for arguments of `omissions`: the format can hold everything of this kind."""
+    return True
+
+
+def never(name: str, values: Any) -> bool:
+    """A value for arguments of `omissions`: the format can hold nothing of this kind."""
+    return False
+
+
+def omissions(data: MeshData, form: str, **holds: Callable[[str, Any], bool]) -> tuple[str, ...]:
+    """Return a sentence for each kind of data that a format cannot hold.
+
+    **Arguments:**
+
+    - `form`: the name of the format.
+    - `holds`: a function for each attribute of `MeshData`. The function returns whether the format can hold
+      an element of the attribute with a given name and value. Missing functions mean `never`.
+    """
+    skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
+    kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "vertex_data": ("the vertex data ", data.vertex_data),
+        "face_data": ("the face data ", data.face_data),
+        "blend_shapes": ("the blend shapes ", data.blend_shapes),
+        "skin": ("the joints ", skin),
+        "label_names": ("the names of the labels ", data.label_names),
+    }
+    notes = []
+    for attribute, (what, values) in kinds.items():
+        fits = holds.get(attribute, never)
+        names = [name for name, value in values.items() if not fits(name, value)]
+        listed = ", ".join(map(ascii, names[:5])) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        if names:
+            notes.append(f"{form} files cannot hold {what}{listed}, so the file does not contain them.")
+    if data.texture is not None and "texture" not in holds:
+        notes.append(f"{form} files cannot hold texture coordinates, so the file does not contain them.")
+    return tuple(notes)
+
+
+def is_color(name: str, values: np.ndarray) -> bool:
+    """Return whether an array contains colours: bytes, or floats from 0 to 1, in three or four columns."""
+    if name != COLORS or values.ndim != 2 or values.shape[1] not in (3, 4):
+        return False
+    return values.dtype == np.uint8 or (values.dtype.kind == "f" and _unit(values))
+
+
+def _unit(values: np.ndarray) -> bool:
+    return bool(((values >= 0) & (values <= 1)).all())
+
+
+def texture_at_corners(texture: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, "f 6"]:
+    """Return the texture coordinates (u0, v0, u1, v1, u2, v2) of each triangle, NaN where there are none."""
+    coordinates, corners = texture
+    return np.vstack([coordinates, [[np.nan, np.nan]]])[corners].reshape(-1, 6)
+
+
+def texture_of_corners(
+    corners: np.ndarray, at_corners: Float64[np.ndarray, "c 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return texture vertices, and the texture vertex of each corner, from the coordinates of each corner.
+
+    Corners of one vertex with equal coordinates share a texture vertex. The texture vertices are numbered in
+    the order of their vertices. Corners at NaN have no texture vertex.
+    """
+    known = np.isfinite(at_corners).all(axis=1)
+    rows = np.column_stack([corners, at_corners])[known]
+    distinct, number = np.unique(rows, axis=0, return_inverse=True)
+    of_corner = np.full(len(corners), -1)
+    of_corner[known] = number.ravel()
+    return distinct[:, 1:], of_corner
+
+
+def is_texture_of_vertices(data: MeshData) -> bool:
+    """Return whether texture vertex i belongs to vertex i for all i, so that there is no seam."""
+    return (
+        data.texture is not None
+        and len(data.texture[0]) == len(data.mesh.vertices)
+        and np.array_equal(data.texture[1], data.faces)
+    )
+
+
+def unique_name(name: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
+    chosen, number = name, len(taken)  # a smaller first number would take long if many names are equal
+    while chosen in taken:
+        number += 1
+        chosen = f"{name} ({number})"
+    return chosen
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Return the names, with numbers in parentheses after repeated names."""
+    chosen: dict[str, None] = {}
+    numbers: dict[str, int] = {}
+    for name in names:
+        one = name
+        while one in chosen:
+            numbers[name] = numbers.get(name, 1) + 1
+            one = f"{name} ({numbers[name]})"
+        chosen[one] = None
+    return list(chosen)

@@ -1,0 +1,233 @@
+"""A writer of glTF 2.0 files (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html)."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.data import MeshData, Written, always, is_color, omissions
+from jaxsmw.io.formats.gltf import RECORD
+from jaxsmw.io.formats.gltf_accessors import TYPES
+
+_VERTICES, _INDICES = 34962, 34963
+_COMPONENTS = {kind: number for number, kind in TYPES.items()}
+_SHAPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
+_LARGEST_EXACT = 2**24  # float32 represents all integers up to this number
+
+
+def format_gltf(data: MeshData) -> Written:
+    """Format a JSON file whose buffer is a data URI, so that it needs no other file."""
+    file = _File(data)
+    uri = b"data:application/octet-stream;base64," + base64.b64encode(file.buffer)
+    file.json["buffers"] = [{"byteLength": len(file.buffer), "uri": uri.decode()}]
+    return Written(json.dumps(file.json, ensure_ascii=False, indent=1).encode(), file.notes())
+
+
+def format_glb(data: MeshData) -> Written:
+    """Format a binary file."""
+    file = _File(data)
+    file.json["buffers"] = [{"byteLength": len(file.buffer)}]
+    text = json.dumps(file.json, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [(b"JSON", text), (b"BIN\0", bytes(file.buffer))]
+    body = b"".join(len(content).to_bytes(4, "little") + kind + content for kind, content in chunks)
+    content = b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
+    return Written(content, file.notes())
+
+
+class _File:
+    """The JSON part and the buffer of a file with one mesh of one primitive."""
+
+    def __init__(self, data: MeshData) -> None:
+        self.data = data
+        self.buffer = bytearray()
+        self.json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "jaxsmw"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"name": "mesh", "mesh": 0}],
+            "meshes": [],
+            "bufferViews": [],
+            "accessors": [],
+        }
+        self.original, texture, faces = _split(data)
+        attributes = self.attributes(texture)
+        primitive = {"attributes": attributes, "mode": 4}
+        primitive["indices"] = self.accessor(faces.ravel().astype("u4"), _INDICES)
+        mesh: dict[str, Any] = {"primitives": [primitive]}
+        extras: dict[str, Any] = {}
+        if not np.array_equal(self.original, texture) and data.texture is not None:
+            record = {"vertices": self.original, "texture": texture}
+            extras[RECORD] = {key: self.view(values.astype("i4")) for key, values in record.items()}
+        if data.blend_shapes:
+            primitive["targets"] = [self.target(moves) for moves in data.blend_shapes.values()]
+            mesh["weights"] = [0.0] * len(data.blend_shapes)
+            extras["targetNames"] = list(data.blend_shapes)
+        if extras:
+            mesh["extras"] = extras
+        self.json["meshes"].append(mesh)
+        if data.skin is not None:
+            self.add_skin(attributes)
+
+    def attributes(self, texture: np.ndarray) -> dict[str, int]:
+        """Add the attributes of the vertices, except the skin."""
+        data = self.data
+        positions = _single(data.mesh.vertices)[self.original]
+        attributes = {"POSITION": self.accessor(positions, _VERTICES, limits=True)}
+        if data.texture is not None:
+            coordinates = np.vstack([data.texture[0], [[0, 1]]])[texture]
+            coordinates[:, 1] = 1 - coordinates[:, 1]  # glTF counts v from the top of the picture
+            attributes["TEXCOORD_0"] = self.accessor(_single(coordinates), _VERTICES)
+        for name, values in data.vertex_data.items():
+            if (stored := _storable(name, values)) is not None:
+                is_fraction = is_color(name, values) and stored.dtype == np.uint8
+                semantic = _semantic(name, stored)
+                attributes[semantic] = self.accessor(
+                    stored[self.original], _VERTICES, is_fraction=is_fraction
+                )
+        return attributes
+
+    def target(self, moves: np.ndarray) -> dict[str, int]:
+        return {"POSITION": self.accessor(_single(moves)[self.original], _VERTICES, limits=True)}
+
+    def add_skin(self, attributes: dict[str, int]) -> None:
+        """Add a skin whose joints are nodes below one root. Each set of attributes has four joints."""
+        assert self.data.skin is not None
+        names, weights = self.data.skin
+        if len(names) > 65535:
+            raise InputError("has more than 65535 joints, the limit of glTF files: write a .npz file.")
+        order = np.argsort(-np.abs(weights), axis=1, kind="stable")
+        used = max(int((weights != 0).sum(axis=1).max()), 1)
+        order = order[:, : 4 * -(-used // 4)]
+        # Joints without weight must have the number 0, and the number of columns is a multiple of four.
+        largest = np.take_along_axis(weights, order, axis=1)
+        columns = -order.shape[1] % 4
+        joints = np.pad(np.where(largest != 0, order, 0), ((0, 0), (0, columns)))
+        largest = np.pad(largest, ((0, 0), (0, columns)))
+        for number in range(joints.shape[1] // 4):
+            part = slice(4 * number, 4 * number + 4)
+            attributes[f"JOINTS_{number}"] = self.accessor(
+                joints[self.original, part].astype(np.uint16), _VERTICES
+            )
+            attributes[f"WEIGHTS_{number}"] = self.accessor(
+                largest[self.original, part].astype(np.float32), _VERTICES
+            )
+        nodes = list(range(2, 2 + len(names)))
+        self.json["nodes"][0]["skin"] = 0
+        self.json["nodes"] += [{"name": "joints", "children": nodes}, *({"name": name} for name in names)]
+        self.json["scenes"][0]["nodes"].append(1)
+        identity = np.tile(np.eye(4, dtype=np.float32).ravel(), (len(names), 1))
+        matrices = {"bufferView": self.view(identity), "componentType": _COMPONENTS["f4"]}
+        self.json["accessors"].append(matrices | {"count": len(names), "type": "MAT4"})
+        # The matrices may be missing, but VTK 9.7 ends the process then.
+        self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
+
+    def view(self, values: np.ndarray, target: int | None = None) -> int:
+        """Add a buffer view, whose rows begin at multiples of four bytes."""
+        rows = values.reshape(len(values), -1)
+        width = rows.dtype.itemsize * rows.shape[1]
+        stride = width + -width % 4 if target == _VERTICES else width
+        content = np.zeros((len(rows), stride), np.uint8)
+        content[:, :width] = np.ascontiguousarray(rows.astype(rows.dtype.newbyteorder("<"))).view(np.uint8)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": content.size}
+        if target is not None:
+            view["target"] = target
+        if stride != width:
+            view["byteStride"] = stride
+        self.buffer += content.tobytes() + bytes(-content.size % 4)
+        self.json["bufferViews"].append(view)
+        return len(self.json["bufferViews"]) - 1
+
+    def accessor(
+        self, values: np.ndarray, target: int, *, limits: bool = False, is_fraction: bool = False
+    ) -> int:
+        """Add an accessor and its buffer view."""
+        columns = values.shape[1] if values.ndim == 2 else 1
+        accessor: dict[str, Any] = {
+            "bufferView": self.view(values, target),
+            "componentType": _COMPONENTS[values.dtype.str[1:]],
+            "count": len(values),
+            "type": _SHAPES[columns - 1],
+        }
+        if limits:
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        if is_fraction:
+            accessor["normalized"] = True
+        self.json["accessors"].append(accessor)
+        return len(self.json["accessors"]) - 1
+
+    def notes(self) -> tuple[str, ...]:
+        return omissions(
+            self.data,
+            "glTF",
+            vertex_data=lambda name, values: _storable(name, values) is not None,
+            blend_shapes=always,
+            skin=always,
+            texture=always,
+        )
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    """Return numbers as float32."""
+    with np.errstate(over="ignore"):
+        single = values.astype(np.float32)
+    if not np.isfinite(single).all():
+        raise InputError("a number is too large for glTF files, which have float32: choose another unit.")
+    return single
+
+
+def _split(
+    data: MeshData,
+) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " s"], Int64[np.ndarray, "f 3"]]:
+    """Split vertices along texture seams, because glTF has one texture vertex per vertex.
+
+    Return the vertex and the texture vertex (-1 for none) of each new vertex, and the faces of new vertices.
+    Texture vertices without faces belong to vertex 0.
+    """
+    n = len(data.mesh.vertices)
+    if data.texture is None:
+        return np.arange(n), np.arange(n), data.faces
+    t = len(data.texture[0])
+    pairs = np.column_stack([data.faces.ravel(), data.texture[1].ravel()])
+    alone = np.setdiff1d(np.arange(n), data.faces)
+    # Without seams, texture vertices have the numbers of their vertices.
+    pairs = np.vstack([pairs, np.column_stack([alone, alone if t == n else np.full(len(alone), -1)])])
+    unused = np.setdiff1d(np.arange(t), pairs[:, 1])
+    pairs = np.vstack([pairs, np.column_stack([np.zeros_like(unused), unused])])
+    distinct, number = np.unique(pairs, axis=0, return_inverse=True)
+    return distinct[:, 0], distinct[:, 1], number.ravel()[: data.faces.size].reshape(-1, 3)
+
+
+def _semantic(name: str, values: np.ndarray) -> str:
+    """Return the name of the attribute for vertex data. Names of applications begin with an underscore."""
+    if is_color(name, values):
+        return "COLOR_0"
+    columns = values.shape[1] if values.ndim == 2 else 1
+    is_texture = re.fullmatch(r"TEXCOORD_[1-9]", name) and columns == 2
+    return name if is_texture and values.dtype == np.float32 else f"_{name}"
+
+
+def _storable(name: str, values: np.ndarray) -> np.ndarray | None:
+    """Return values in a type of glTF attributes, or None if there is none without loss.
+
+    Floats become float32. Long integers become float32 if it represents them exactly.
+    """
+    if values.ndim == 2 and values.shape[1] > 4:
+        return None
+    if values.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            stored = values.astype(np.float32)
+        return stored if np.isfinite(stored).all() else None
+    if values.dtype.itemsize <= 2:
+        return values
+    return (
+        values.astype(np.float32)
+        if -_LARGEST_EXACT <= values.min() <= values.max() <= _LARGEST_EXACT
+        else None
+    )

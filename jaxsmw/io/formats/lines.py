@@ -1,0 +1,66 @@
+"""Numbers in lines of text files."""
+
+from __future__ import annotations
+
+import codecs
+import re
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.text import is_number
+
+
+def text(data: bytes) -> str:
+    """Decode the text of a file, convert all line ends to newlines, and remove comments."""
+    # Latin-1 can decode every byte, and the parsers need only ASCII characters.
+    text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
+    return re.sub("#[^\n]*", "", text) if "#" in text else text
+
+
+def numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines columns"]:
+    """Return the numbers in the first columns of each line."""
+    if not lines:
+        return np.empty((0, columns))
+    try:
+        if "" in lines:  # loadtxt would skip an empty line
+            raise ValueError
+        return np.loadtxt(lines, usecols=range(columns), comments=None, ndmin=2)
+    except ValueError:
+        culprit = next((line for line in lines if not _starts_with_numbers(line, columns)), lines[0])
+        raise InputError(
+            f"{excerpt(culprit)} is written where {count_of(columns, 'number')} should be, so the file is "
+            "damaged or its header is wrong: export the mesh again."
+        ) from None
+
+
+def _starts_with_numbers(line: str, columns: int) -> bool:
+    words = line.split()[:columns]
+    return len(words) == columns and all(is_number(word, finite=False) for word in words)
+
+
+def excerpt(line: str) -> str:
+    """Return the first 40 characters of a line, escaped for a message."""
+    return ascii(" ".join(line.split())[:40])
+
+
+def polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], Int64[np.ndarray, " f"]]:
+    """Parse lines of the form `size corner corner …`, one per face, into corners and sizes."""
+    sizes = numbers(lines, 1)[:, 0]
+    longest = max(map(len, lines), default=0)
+    possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
+    if not possible.all():
+        raise InputError(
+            f"{excerpt(lines[int(possible.argmin())])} does not begin with the number of corners of a face, "
+            "so the file is damaged or its header is wrong: export the mesh again."
+        )
+    sizes = sizes.astype(np.int64)
+    starts = np.cumsum(sizes) - sizes
+    rows_of_size = {size: np.flatnonzero(sizes == size) for size in np.unique(sizes).tolist()}
+    tables = {size: numbers([lines[i] for i in rows], size + 1) for size, rows in rows_of_size.items()}
+    corners = np.empty(sizes.sum())
+    for size, rows in rows_of_size.items():
+        corners[starts[rows][:, None] + np.arange(size)] = tables[size][:, 1:]
+    return corners, sizes

@@ -1,0 +1,121 @@
+"""NumPy's `.npz` files with the arrays of a mesh and its data."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from typing import Any
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Written
+from jaxsmw.runtime.files import largest_contents
+
+_FOLDERS = "vertex_data", "face_data", "blend_shapes", "label_names"
+
+
+def parse_npz(data: bytes) -> Polygons:
+    """Parse the arrays that `format_npz` writes. Other arrays are ignored."""
+    try:
+        arrays = _arrays(data)
+    except InputError:
+        raise
+    except Exception:  # NumPy and zipfile can raise any exception for damaged files
+        raise InputError("is damaged or not a .npz file: write the file again.") from None
+    missing = [name for name in ("vertices", "faces") if name not in arrays]
+    if missing:
+        raise InputError(f"contains no array called {missing[0]}: save the vertices and the faces.")
+    vertices, faces = arrays["vertices"], arrays["faces"]
+    if (
+        vertices.shape[1:] != (3,)
+        or faces.shape[1:] != (3,)
+        or {vertices.dtype.kind, faces.dtype.kind} - {*"iuf"}
+    ):
+        raise InputError(
+            f"vertices have the shape {vertices.shape} and faces the shape {faces.shape}: save numbers with "
+            "three columns."
+        )
+    folders: dict[str, dict[str, np.ndarray]] = {folder: {} for folder in _FOLDERS}
+    for name, array in arrays.items():
+        folder, _, rest = name.partition("/")
+        if folder in folders and rest:
+            folders[folder][rest] = array
+    texture = [arrays[name] for name in ("texture_coordinates", "texture_corners") if name in arrays]
+    skin = [arrays[name] for name in ("skin_joints", "skin_weights") if name in arrays]
+    if len(texture) == 1 or len(skin) == 1:
+        raise InputError("contains only half of a texture or of a skin: save both arrays.")
+    return Polygons(
+        vertices.astype(np.float64),
+        faces.ravel(),
+        np.full(len(faces), 3),
+        vertex_data=folders["vertex_data"],
+        face_data=folders["face_data"],
+        texture=_texture(texture[0], texture[1], faces.shape) if texture else None,
+        blend_shapes=folders["blend_shapes"],
+        skin=Skin(tuple(map(str, skin[0].ravel())), skin[1]) if skin else None,
+        label_names={name: tuple(map(str, names.ravel())) for name, names in folders["label_names"].items()},
+    )
+
+
+def _texture(
+    coordinates: np.ndarray, corners: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    if corners.shape != shape:
+        raise InputError(
+            f"the texture's corners have the shape {corners.shape}, but the faces have the shape {shape}: "
+            "save one row for each face."
+        )
+    return coordinates, corners.ravel()
+
+
+def _arrays(data: bytes) -> dict[str, np.ndarray]:
+    """Return all arrays of the file, after a check of their sizes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        members = [member for member in file.infolist() if member.filename.endswith(".npy")]
+        if sum(member.file_size for member in members) > largest_contents(len(data)):
+            raise InputError(
+                "would take more than 1 GiB of memory and more than four times the size of the file: write "
+                "the file again, without other arrays."
+            )
+        arrays = {}
+        for member in members:
+            with file.open(member) as stream:
+                _check_header(stream, member.file_size)
+            with file.open(member) as stream:
+                arrays[member.filename.removesuffix(".npy")] = np.lib.format.read_array(stream)
+    return arrays
+
+
+def _check_header(stream: Any, size: int) -> None:
+    """Refuse an array that declares more numbers than its member of the archive contains.
+
+    **Raises:** `ValueError` for such an array.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(stream)
+    if kind.hasobject or math.prod(shape) * kind.itemsize > size or min(shape, default=0) < 0:
+        raise ValueError("the array is larger than its file")
+
+
+def format_npz(data: MeshData) -> Written:
+    """Format everything as arrays, without any loss."""
+    arrays: dict[str, Any] = {"vertices": data.mesh.vertices, "faces": data.faces}
+    for folder in _FOLDERS:
+        for name, values in getattr(data, folder).items():
+            arrays[f"{folder}/{name}"] = np.asarray(values)
+    if data.texture is not None:
+        arrays |= {"texture_coordinates": data.texture[0], "texture_corners": data.texture[1]}
+    if data.skin is not None:
+        arrays |= {"skin_joints": np.array(data.skin[0]), "skin_weights": data.skin[1]}
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            # `numpy.savez` would refuse names that are also the names of its arguments.
+            member = zipfile.ZipInfo(f"{name}.npy")
+            member.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(member, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, array, allow_pickle=False)
+    return Written(file.getvalue(), ())

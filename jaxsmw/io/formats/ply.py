@@ -1,0 +1,384 @@
+"""PLY files in the Polygon File Format (https://paulbourke.net/dataformats/ply/)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.data import (
+    COLORS,
+    NORMALS,
+    TEXTURE_OF_CORNERS,
+    MeshData,
+    Polygons,
+    Written,
+    always,
+    is_color,
+    is_texture_of_vertices,
+    omissions,
+    texture_at_corners,
+    texture_of_corners,
+)
+from jaxsmw.io.formats.lines import excerpt
+from jaxsmw.io.text import is_number
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class _Property(NamedTuple):
+    """A property of a PLY element, which has one number or one list of numbers per row.
+
+    `type` is the type of the numbers in the body, and `declared` is their type in the header. `length` is the
+    type of the lengths of the lists, or None for a property with one number per row.
+    """
+
+    type: np.dtype
+    length: np.dtype | None
+    declared: np.dtype
+
+
+class _Column(NamedTuple):
+    """The values of a property in all rows, one row after another, and the number of values in each row."""
+
+    values: np.ndarray
+    sizes: np.ndarray
+
+
+def parse_ply(data: bytes) -> Polygons:
+    """Parse a text file, or a binary file in either byte order."""
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    if first is None:
+        raise InputError("does not begin with ply: export the mesh again as a PLY file.")
+    newline = first[1]
+    last = re.search(newline + rb"end_header[ \t]*" + newline, data)
+    if last is None:
+        raise InputError(
+            "the header has no end_header line, so the file is truncated or damaged: export the mesh again."
+        )
+    header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
+    encoding, elements = _ply_header(header)
+    body = data[last.end() :]
+    if encoding == "ascii":
+        # Text is converted to a binary body of float64 numbers, so one parser serves both encodings.
+        words = body.split()
+        try:
+            if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
+                raise ValueError
+            body = np.array(words, dtype=np.float64).tobytes()
+        except ValueError:
+            texts = (word.decode("latin-1") for word in words)
+            culprit = excerpt(next(text for text in texts if not is_number(text, finite=False)))
+            raise InputError(
+                f"{culprit} is written where a number should be: export the mesh again."
+            ) from None
+
+    tables, offset = {}, 0
+    for name, (count, properties) in elements.items():
+        try:
+            tables[name], offset = _ply_table(body, offset, count, properties)
+        except EOFError:
+            raise InputError(
+                f"the header declares {count} rows of {excerpt(name)}, but the file ends within these rows, "
+                "so the file is truncated or its header is wrong: export the mesh again."
+            ) from None
+    if body[offset:].strip():
+        raise InputError(
+            "continues after the last declared row, so the header is wrong: export the mesh again."
+        )
+
+    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
+    if len(position) < 3:
+        raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
+    corners = face.get("vertex_indices", face.get("vertex_index"))
+    if corners is None:
+        raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
+    vertices = np.stack(position, axis=1, dtype=np.float64)
+    vertex_data, face_data = (
+        _numbers_of(tables.get(name, {}), elements.get(name, (0, {}))[1]) for name in ("vertex", "face")
+    )
+    texture = _texture(face.get(TEXTURE_OF_CORNERS), corners, vertex_data)
+    return Polygons(
+        vertices, *corners, vertex_data=_grouped(vertex_data), face_data=_grouped(face_data), texture=texture
+    )
+
+
+# Properties that become the columns of one array.
+_COLUMNS_OF = {COLORS: ("red", "green", "blue", "alpha"), NORMALS: ("nx", "ny", "nz")}
+_TEXTURES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
+
+
+def _numbers_of(table: Mapping[str, _Column], properties: Mapping[str, _Property]) -> dict[str, np.ndarray]:
+    """Return the properties with one number per row, except positions, in the declared types."""
+    found = {}
+    for name, column in table.items():
+        if properties[name].length is None and name not in ("x", "y", "z"):
+            with np.errstate(all="ignore"):
+                values = column.values.astype(properties[name].declared)
+            # Text can contain numbers that the declared type cannot hold.
+            found[name] = (
+                values
+                if np.array_equal(values, column.values, equal_nan=True) or (values.dtype.kind == "f")
+                else column.values
+            )
+    return found
+
+
+def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Join the components of colours and normals, and properties a_0, a_1, …, into arrays with columns."""
+    columns: dict[str, list[str]] = {}
+    for group, components in _COLUMNS_OF.items():
+        if all(name in data for name in components[:3]):
+            columns[group] = [name for name in components if name in data]
+    for name in data:
+        stem = name.removesuffix("_0")
+        if stem != name and stem and f"{stem}_1" in data and stem not in data:
+            numbered = (f"{stem}_{i}" for i in range(len(data)))
+            columns[stem] = [one for one in numbered if one in data]
+    grouped = {}
+    for group, names in columns.items():
+        if group not in data and len({data[name].dtype for name in names}) == 1:
+            grouped[group] = names
+    first = {names[0]: group for group, names in grouped.items()}
+    others = {name for names in grouped.values() for name in names[1:]}
+    return {
+        first.get(name, name): np.stack([data[one] for one in grouped[first[name]]], axis=1)
+        if name in first
+        else values
+        for name, values in data.items()
+        if name not in others
+    }
+
+
+def _texture(
+    of_corners: _Column | None, faces: _Column, vertex_data: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the texture of the faces' lists `texcoord`, or of two properties of the vertices."""
+    corners = faces.values
+    if of_corners is not None and of_corners.sizes.any():
+        given = of_corners.sizes > 0
+        if (of_corners.sizes[given] != 2 * faces.sizes[given]).any():
+            raise InputError(
+                "a face does not have two texture coordinates for each corner: export the mesh again."
+            )
+        at_corners = np.full((len(corners), 2), np.nan)
+        at_corners[np.repeat(given, faces.sizes)] = of_corners.values.reshape(-1, 2)
+        return texture_of_corners(corners, at_corners)
+    for u, v in _TEXTURES:
+        n = len(vertex_data.get(u, ()))
+        if v in vertex_data and n and ((corners >= 0) & (corners < n) & (corners == np.floor(corners))).all():
+            return np.stack([vertex_data.pop(u), vertex_data.pop(v)], axis=1), corners.astype(np.int64)
+    return None
+
+
+def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
+    """Return the encoding, and a dictionary from element names to row counts and properties."""
+    formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
+    if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
+        raise InputError(
+            f"the header does not name exactly one of the formats {', '.join(_PLY_BYTE_ORDERS)} in version "
+            "1.0: export the mesh again."
+        )
+    encoding = formats[0][0]
+
+    def number(name: str) -> np.dtype:
+        return np.dtype(np.float64 if encoding == "ascii" else _PLY_BYTE_ORDERS[encoding] + _PLY_TYPES[name])
+
+    elements: dict[str, tuple[int, dict[str, _Property]]] = {}
+    properties: dict[str, _Property] | None = None
+    for line in lines:
+        match line.split():
+            case [] | ["comment" | "obj_info" | "format", *_]:
+                pass
+            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count) and name not in elements:
+                properties = {}
+                elements[name] = int(count), properties
+            case ["property", "list", length, kind, name] if (
+                _PLY_TYPES.get(length, "f")[0] in "iu"
+                and kind in _PLY_TYPES
+                and properties is not None
+                and name not in properties
+            ):
+                properties[name] = _Property(number(kind), number(length), np.dtype(_PLY_TYPES[kind]))
+            case ["property", kind, name] if (
+                kind in _PLY_TYPES and properties is not None and name not in properties
+            ):
+                properties[name] = _Property(number(kind), None, np.dtype(_PLY_TYPES[kind]))
+            case _:
+                raise InputError(
+                    f"the header contains the invalid line {excerpt(line)}: export the mesh again."
+                )
+    return encoding, elements
+
+
+def _ply_table(
+    body: bytes, offset: int, count: int, properties: dict[str, _Property]
+) -> tuple[dict[str, _Column], int]:
+    """Return the columns of the table that begins at `offset`, and the offset of the table's end.
+
+    **Raises:** `EOFError` if the body ends within the table.
+    """
+    shortest = sum((p.length or p.type).itemsize for p in properties.values())
+    if count * shortest > len(body) - offset:
+        raise EOFError
+    if not count or not properties:
+        return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
+
+    # In most files, all lists of a property have the same length. NumPy then reads all rows together, as one
+    # array of records.
+    spans, _ = _ply_row(body, offset, properties)
+    sizes = {name: size for name, (_, size) in zip(properties, spans, strict=True)}
+    lengths = {name: f"length of {name}" for name, (_, length, _) in properties.items() if length}
+    fields: list[tuple] = []
+    for name, (kind, length, _) in properties.items():
+        fields += [(lengths[name], length)] if length else []
+        fields += [(name, kind, (sizes[name],))]
+    record = np.dtype(fields)
+    end = offset + count * record.itemsize
+    if end <= len(body):
+        table = np.frombuffer(body, record, count, offset)
+        if all((table[key] == sizes[name]).all() for name, key in lengths.items()):
+            return {
+                name: _Column(table[name].ravel(), np.full(count, sizes[name])) for name in properties
+            }, end
+
+    rows = []
+    for _ in range(count):
+        spans, offset = _ply_row(body, offset, properties)
+        rows.append(spans)
+    columns = {}
+    for (name, (kind, _, _)), column in zip(properties.items(), zip(*rows, strict=True), strict=True):
+        values = b"".join([body[start : start + size * kind.itemsize] for start, size in column])
+        columns[name] = _Column(np.frombuffer(values, kind), np.array([size for _, size in column]))
+    return columns, offset
+
+
+def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
+    """Return the span of each property in a row, and the offset of the row's end.
+
+    A span consists of the offset of the property's first value and the number of the property's values.
+
+    **Raises:** `EOFError` if the body ends within the row.
+    """
+    spans = []
+    for kind, length, _ in properties.values():
+        size = 1
+        if length:
+            start, offset = offset, offset + length.itemsize
+            if offset > len(body):
+                raise EOFError
+            written = np.frombuffer(body, length, 1, start)[0]
+            if not 0 <= written <= len(body) or written % 1:
+                raise InputError(
+                    f"a list declares {written:.15g} numbers, so the file is damaged: export the mesh again."
+                )
+            size = int(written)
+        spans.append((offset, size))
+        offset += size * kind.itemsize
+    if offset > len(body):
+        raise EOFError
+    return spans, offset
+
+
+_TYPE_NAMES = {
+    **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
+    **{"f4": "float", "f8": "double"},
+}
+
+
+def format_ply(data: MeshData) -> Written:
+    """Format positions, triangles, texture coordinates and all data as a little-endian binary file.
+
+    The columns of an array a become the properties a_0, a_1, …, except for colours and normals.
+    """
+    vertex_columns = dict(zip("xyz", data.mesh.vertices.T, strict=True))
+    extra, lost_of_vertices = _columns(
+        data.vertex_data, {*vertex_columns, *(n for pair in _TEXTURES for n in pair)}
+    )
+    if is_texture_of_vertices(data) and data.texture is not None:
+        extra = dict(zip(("s", "t"), data.texture[0].T, strict=True)) | extra
+    face_extra, lost_of_faces = _columns(
+        data.face_data, {"vertex_indices", "vertex_index", TEXTURE_OF_CORNERS}
+    )
+    vertices, vertex_lines = _table(vertex_columns | extra, len(data.mesh.vertices))
+    lists: dict[str, np.ndarray] = {"vertex_indices": data.faces.astype("<i4")}
+    if data.texture is not None and not is_texture_of_vertices(data):
+        lists[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
+    faces, face_lines = _table(face_extra, len(data.faces), lists)
+    header = [
+        *("ply", "format binary_little_endian 1.0"),
+        *(f"element vertex {len(vertices)}", *vertex_lines, f"element face {len(faces)}", *face_lines),
+        *("end_header", ""),
+    ]
+    notes = omissions(
+        data,
+        "PLY",
+        vertex_data=lambda name, _: name not in lost_of_vertices,
+        face_data=lambda name, _: name not in lost_of_faces,
+        texture=always,
+    )
+    return Written("\n".join(header).encode() + vertices.tobytes() + faces.tobytes(), notes)
+
+
+def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[str, np.ndarray], set[str]]:
+    """Return a dictionary from property names to columns, and the names of arrays that do not fit.
+
+    An array does not fit if its name is not a plain word or belongs to another property, or if an integer
+    needs more than 53 bits.
+    """
+    columns: dict[str, np.ndarray] = {}
+    lost = set()
+    for name, values in data.items():
+        known: tuple[str, ...] = _COLUMNS_OF.get(name, ())
+        count = 1 if values.ndim == 1 else values.shape[1]
+        names = [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(count)]
+        if values.ndim == 2 and 3 <= count <= len(known) and (name != COLORS or is_color(name, values)):
+            names = list(known[:count])
+        stored = _storable(values)
+        if stored is None or not re.fullmatch(r"[!-~]+", name) or {*names} & (reserved | {*columns}):
+            lost.add(name)
+        else:
+            columns |= dict(zip(names, np.atleast_2d(stored.T), strict=True))
+    return columns, lost
+
+
+def _storable(values: np.ndarray) -> np.ndarray | None:
+    """Return values in a type that PLY files know. Long integers become int32 or float64 if they fit."""
+    if values.dtype.str[1:] in _TYPE_NAMES:
+        return values
+    for kind in (np.int32, np.float64):
+        limits = np.iinfo(np.int32) if kind is np.int32 else None
+        low, high = (limits.min, limits.max) if limits else (-(2**53), 2**53)
+        if values.min() >= low and values.max() <= high:
+            return values.astype(kind)
+    return None
+
+
+def _table(
+    columns: Mapping[str, np.ndarray], count: int, lists: Mapping[str, np.ndarray] | None = None
+) -> tuple[np.ndarray, list[str]]:
+    """Return the records of an element, and the lines of the header that declare its properties."""
+    fields: list[tuple] = []
+    lines = []
+    for name, values in (lists or {}).items():
+        kind = values.dtype.newbyteorder("<")
+        fields += [(f"length of {name}", "u1"), (name, kind, values.shape[1])]
+        lines.append(f"property list uchar {_TYPE_NAMES[kind.str[1:]]} {name}")
+    for name, values in columns.items():
+        fields.append((name, values.dtype.newbyteorder("<")))
+        lines.append(f"property {_TYPE_NAMES[values.dtype.str[1:]]} {name}")
+    records = np.empty(count, fields)
+    for name, values in (lists or {}).items():
+        records[f"length of {name}"], records[name] = values.shape[1], values
+    for name, values in columns.items():
+        records[name] = values
+    return records, lines

@@ -1,0 +1,64 @@
+"""STL files, which are lists of separate triangles (https://www.fabbers.com/tech/STL_Format)."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of, first_equal_rows
+from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions
+from jaxsmw.io.formats.lines import numbers, text
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def parse_stl(data: bytes) -> Polygons:
+    """Parse a text or binary file. Corners at the same position become one vertex."""
+    header = 84
+    count = int.from_bytes(data[80:header], "little")
+    # Both text files and some binary files begin with "solid". Therefore a file is treated as binary if its
+    # length fits its header.
+    if len(data) >= header and len(data) == header + count * _FACET.itemsize:
+        corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3)
+        with np.errstate(invalid="ignore"):  # some bit patterns of NaN cause a warning
+            corners = corners.astype(np.float64)
+    elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
+        content = text(data).lower()
+        corners = numbers(
+            [" ".join(words) for words in re.findall(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", content)], 3
+        )
+        facets = len(re.findall(r"\bendfacet\b", content))
+        if len(corners) != 3 * facets or "endsolid" not in content:
+            raise InputError(
+                f"has {count_of(facets, 'complete facet')} and {count_of(len(corners), 'corner')}, but must "
+                "have three corners per facet and end with endsolid, so the file is truncated or damaged: "
+                "export the mesh again."
+            )
+    elif len(data) >= header:
+        raise InputError(
+            f"the header declares {count} triangles, which does not fit the file's {len(data)} bytes, so the "
+            "file is truncated or not in the STL format: export the mesh again."
+        )
+    else:
+        raise InputError("is neither a text nor a binary STL file: export the mesh again.")
+    appearance, faces = np.unique(first_equal_rows(corners), return_inverse=True)
+    note = (
+        "STL files have no shared vertices: corners at the same position were merged into "
+        f"{count_of(len(appearance), 'vertex')}, numbered by first appearance."
+    )
+    return Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), (note,))
+
+
+def format_stl(data: MeshData) -> Written:
+    """Format all triangles as a binary file with float32 positions."""
+    corners = data.mesh.vertices[data.faces].astype(np.float32)
+    facets = np.zeros(len(corners), _FACET)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    facets["corners"] = corners
+    note = "STL files contain only the positions of corners, so the order of the vertices is lost."
+    content = b"triangles".ljust(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
+    return Written(content, (note, *omissions(data, "STL")))

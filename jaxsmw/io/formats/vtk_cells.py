@@ -1,0 +1,165 @@
+"""What VTK's two formats have in common: cells of several types, and arrays on points and cells."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.formats.data import (
+    TEXTURE_OF_CORNERS,
+    MeshData,
+    Polygons,
+    is_texture_of_vertices,
+    texture_at_corners,
+    texture_of_corners,
+    unique_name,
+)
+from jaxsmw.io.formats.lines import excerpt
+from jaxsmw.io.text import is_number
+
+# Types of cells (https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html).
+VERTEX, LINE, STRIP, POLYGON = 1, 3, 6, 7
+_IGNORED = 0, VERTEX, 2, LINE, 4
+_SURFACE = 5, STRIP, POLYGON, 9
+DAMAGED = "so the file is damaged: export the mesh again."
+
+LARGEST_COLUMNS = 2**16
+
+
+class Cells(NamedTuple):
+    """Cells in the order of the file: the type and the number of corners of each cell, and all corners."""
+
+    kinds: Int64[np.ndarray, " c"]
+    sizes: Int64[np.ndarray, " c"]
+    corners: np.ndarray
+
+
+def cells_of(kind: int, offsets: np.ndarray, corners: np.ndarray) -> Cells:
+    """Make cells of one type from offsets (c + 1,), which begin at 0 and end at the number of corners."""
+    offsets = offsets.astype(np.int64)
+    sizes = np.diff(offsets)
+    if len(offsets) and (offsets[0] != 0 or offsets[-1] != len(corners) or (sizes < 0).any()):
+        raise InputError(f"the offsets of the cells do not fit {count_of(len(corners), 'corner')}, {DAMAGED}")
+    if not len(offsets) and len(corners):
+        raise InputError(f"the cells have {count_of(len(corners), 'corner')}, but no offsets, {DAMAGED}")
+    return Cells(np.full(len(sizes), kind), sizes, corners)
+
+
+def joined(groups: list[Cells]) -> Cells:
+    """Join groups of cells, in their order."""
+    if not groups:
+        return Cells(*(np.empty(0, np.int64) for _ in range(3)))
+    return Cells(*(np.concatenate(parts) for parts in zip(*groups, strict=True)))
+
+
+def numbers_of(words: list[str], kind: str) -> np.ndarray:
+    """Return the numbers in words as an array of a type such as `f4`."""
+    text = " ".join(words)
+    try:
+        if re.search(r"[^\x20-\x7e]|_", text):  # NumPy would read 1_0 as 10
+            raise ValueError
+        if kind in ("i8", "u8"):
+            return np.array([int(word) for word in words], kind)
+        values = np.array(words, np.float64) if words else np.empty(0)
+        if kind[0] in "iu" and words:
+            limits = np.iinfo(kind)
+            if not ((values >= limits.min) & (values <= limits.max) & (values == np.floor(values))).all():
+                raise ValueError
+        with np.errstate(over="ignore"):
+            return values.astype(kind)
+    except (ValueError, OverflowError):
+        wrong = next((word for word in words if not is_number(word, finite=False)), words[0])
+        raise InputError(
+            f"{excerpt(wrong)} is written among numbers of the type {np.dtype(kind).name}, {DAMAGED}"
+        ) from None
+
+
+def polygons_of(
+    points: Float64[np.ndarray, "n 3"],
+    cells: Cells,
+    point_data: Mapping[str, np.ndarray],
+    cell_data: Mapping[str, np.ndarray],
+    coordinates: np.ndarray | None = None,
+) -> Polygons:
+    """Return the polygons among the cells. Strips become triangles, and points and lines are ignored.
+
+    **Arguments:**
+
+    - `point_data`, `cell_data`: arrays with one row per point or per cell.
+    - `coordinates`: the texture coordinates of the points (n, 2 or more), or None.
+    """
+    for data, count, what in ((point_data, len(points), "point"), (cell_data, len(cells.sizes), "cell")):
+        for name, values in data.items():
+            if len(values) != count:
+                raise InputError(
+                    f"the array {name[:40]!a} has {count_of(len(values), 'row')}, but the file has "
+                    f"{count_of(count, what)}: export the mesh again."
+                )
+    known = np.isin(cells.kinds, _IGNORED + _SURFACE)
+    if not known.all():
+        raise InputError(
+            f"contains cells of type {cells.kinds[int(known.argmin())]}, which are not triangles or "
+            "polygons: extract the surface first."
+        )
+    used = np.isin(cells.kinds, _SURFACE)
+    ignored = int((~used).sum())
+    notes = (f"{count_of(ignored, 'cell')} ignored: points and lines are not part of a surface.",)
+    sizes, corners, cell = _without_strips(cells, used)
+    texture = None
+    if coordinates is not None and _within(corners, len(points)):
+        texture = coordinates[:, :2].astype(np.float64), corners
+    of_corners = cell_data.get(TEXTURE_OF_CORNERS)
+    face_data = {name: values[cell] for name, values in cell_data.items()}
+    if of_corners is not None and of_corners.shape[1:] == (6,) and (sizes == 3).all():
+        del face_data[TEXTURE_OF_CORNERS]
+        texture = texture_of_corners(corners, of_corners[cell].reshape(-1, 2).astype(np.float64))
+    return Polygons(points, corners, sizes, notes if ignored else (), point_data, face_data, texture=texture)
+
+
+def _within(corners: np.ndarray, n: int) -> bool:
+    return not len(corners) or bool(corners.min() >= 0 and corners.max() < n)
+
+
+def _without_strips(cells: Cells, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sizes and corners of the polygons and strip triangles, and the cell of each of them."""
+    start = np.cumsum(cells.sizes) - cells.sizes
+    strip = cells.kinds == STRIP
+    if (cells.sizes[strip] < 3).any():
+        raise InputError(f"a triangle strip has fewer than three corners, {DAMAGED}")
+    cell = np.repeat(np.arange(len(used)), np.where(used, np.where(strip, cells.sizes - 2, 1), 0))
+    first = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])) if len(cell) else cell
+    per_cell = np.diff(np.append(first, len(cell)))
+    step = np.where(strip[cell], np.arange(len(cell)) - np.repeat(first, per_cell), 0)
+    sizes = np.where(strip[cell], 3, cells.sizes[cell])
+    polygon = np.repeat(np.arange(len(cell)), sizes)
+    corner = np.arange(len(polygon)) - (np.cumsum(sizes) - sizes)[polygon]
+    # Every second triangle of a strip has the opposite orientation.
+    corner = np.where((step[polygon] % 2 == 1) & (corner < 2), 1 - corner, corner)
+    return sizes, cells.corners[start[cell[polygon]] + step[polygon] + corner], cell
+
+
+def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> str:
+    """Add an array with one row per point or cell, and return its name, which may get a number."""
+    chosen = unique_name(name or "unnamed", data)
+    data[chosen] = values[:, 0] if values.shape[1] == 1 else values
+    return chosen
+
+
+def arrays_of(data: MeshData) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]:
+    """Return the arrays to write on the points and on the cells, and the texture coordinates of the points.
+
+    Texture coordinates with seams become an array on the cells.
+    """
+    cell_data = dict(data.face_data)
+    if data.texture is None:
+        return dict(data.vertex_data), cell_data, None
+    if is_texture_of_vertices(data):
+        return dict(data.vertex_data), cell_data, data.texture[0]
+    cell_data[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
+    return dict(data.vertex_data), cell_data, None

@@ -1,0 +1,326 @@
+"""VTK XML files of polygons (https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import lzma
+import re
+import zlib
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
+from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions, unique_name
+from jaxsmw.io.formats.lines import excerpt
+from jaxsmw.io.formats.vtk_cells import (
+    DAMAGED,
+    LARGEST_COLUMNS,
+    LINE,
+    POLYGON,
+    STRIP,
+    VERTEX,
+    Cells,
+    add_array,
+    arrays_of,
+    cells_of,
+    joined,
+    numbers_of,
+    polygons_of,
+)
+from jaxsmw.runtime.files import largest_contents
+
+_TYPES = {
+    **{"Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4"},
+    **{"Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8"},
+}
+_NAMES = {kind: name for name, kind in _TYPES.items()}
+# The groups of cells in the order in which the data of cells lists them.
+_KINDS = {"Verts": VERTEX, "Lines": LINE, "Polys": POLYGON, "Strips": STRIP}
+_COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCompressor"}
+
+
+def parse_vtp(data: bytes) -> Polygons:
+    """Parse a file with PolyData. Several pieces become one mesh."""
+    file = _File(data)
+    pieces = file.root.findall("PolyData/Piece")
+    if not pieces:
+        raise InputError("contains no piece of PolyData: export the mesh again.")
+    points: list[np.ndarray] = []
+    groups: dict[str, list] = {kind: [] for kind in _KINDS}
+    rows: dict[str, list[dict[str, np.ndarray]]] = {"PointData": [], "CellData": []}
+    coordinates: list[np.ndarray | None] = []
+    cell_rows: dict[str, list[tuple[int, int]]] = {kind: [] for kind in _KINDS}
+    offset = cells_before = 0
+    for piece in pieces:
+        n = _integer(piece, "NumberOfPoints", 0)
+        position = piece.find("Points/DataArray")
+        if position is None:
+            raise InputError(f"a piece has no points, {DAMAGED}")
+        points.append(file.array(position, n, 3).astype(np.float64))
+        total = 0
+        for kind in _KINDS:
+            cells = file.cells(piece, kind)
+            groups[kind].append(cells._replace(corners=cells.corners + offset))
+            cell_rows[kind].append((cells_before + total, cells_before + total + len(cells.sizes)))
+            total += len(cells.sizes)
+        data_of_points, texture = file.data(piece, "PointData", n)
+        coordinates.append(texture)
+        rows["PointData"].append(data_of_points)
+        rows["CellData"].append(file.data(piece, "CellData", total)[0])
+        offset, cells_before = offset + n, cells_before + total
+    order = np.concatenate([np.arange(*span) for kind in _KINDS for span in cell_rows[kind]])
+    known = [one for one in coordinates if one is not None]
+    return polygons_of(
+        np.concatenate(points),
+        joined([cells for kind in _KINDS for cells in groups[kind]]),
+        _common(rows["PointData"]),
+        {name: values[order] for name, values in _common(rows["CellData"]).items()},
+        np.concatenate(known) if len(known) == len(pieces) else None,
+    )
+
+
+def _common(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Join the arrays that all pieces have with the same number of columns."""
+    return {
+        name: np.concatenate([piece[name] for piece in pieces])
+        for name in pieces[0]
+        if len({piece[name].shape[1:] if name in piece else None for piece in pieces}) == 1
+    }
+
+
+class _File:
+    """The XML tree of a file, and a decoder of its arrays."""
+
+    def __init__(self, data: bytes) -> None:
+        appended = re.search(rb"<AppendedData\b([^>]*)>\s*_", data)
+        xml = data if appended is None else data[: appended.start()] + b"</VTKFile>"
+        self.appended = b"" if appended is None else data[appended.end() :].rpartition(b"</AppendedData>")[0]
+        self.is_raw = appended is not None and b"raw" in appended[1]
+        self.budget = largest_contents(len(data))
+        try:
+            if b"<!" in re.sub(rb"<!--.*?-->|<!\[CDATA\[", b"", xml, flags=re.DOTALL):
+                raise ValueError  # a document type can declare entities that expand without limit
+            self.root = ElementTree.fromstring(xml)
+        except (ElementTree.ParseError, LookupError, ValueError):
+            raise InputError("is not a complete XML file: export the mesh again.") from None
+        if self.root.tag != "VTKFile" or self.root.get("type") != "PolyData":
+            raise InputError("is not a VTK file of the type PolyData: extract the surface and save it again.")
+        version = self.root.get("version", "0.1")
+        if not re.fullmatch(r"[0-2]\.\d{1,3}", version, re.ASCII):
+            raise InputError(f"has the unknown version {excerpt(version)}: save the mesh in version 1.0.")
+        orders = {"LittleEndian": "<", "BigEndian": ">"}
+        headers = {"UInt32": "u4", "UInt64": "u8"}
+        order, header = self.root.get("byte_order", "LittleEndian"), self.root.get("header_type", "UInt32")
+        self.compressor = self.root.get("compressor", "")
+        if order not in orders or header not in headers:
+            raise InputError(f"has the unknown byte order {order!a} or header type {header!a}, {DAMAGED}")
+        if self.compressor and self.compressor not in _COMPRESSORS:
+            raise InputError(
+                f"is compressed with {excerpt(self.compressor)}, which is not supported: save it with "
+                "ZLib or without compression."
+            )
+        self.order, self.header = orders[order], np.dtype(orders[order] + headers[header])
+
+    def data(
+        self, piece: ElementTree.Element, tag: str, count: int
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Return the arrays on the points or cells of a piece, and the texture coordinates of the points."""
+        found: dict[str, np.ndarray] = {}
+        section, coordinates = piece.find(tag), None
+        for element in () if section is None else section.findall("DataArray"):
+            values = self.array(element, count, _integer(element, "NumberOfComponents", 1))
+            name = element.get("Name", "")
+            is_texture = tag == "PointData" and section is not None and name == section.get("TCoords", "\0")
+            if is_texture and values.shape[1] >= 2 and coordinates is None:
+                coordinates = values
+            else:
+                add_array(found, name, values)
+        return found, coordinates
+
+    def cells(self, piece: ElementTree.Element, tag: str) -> Cells:
+        """Return the cells of a piece of one type."""
+        count = _integer(piece, f"NumberOf{tag}", 0)
+        arrays = {one.get("Name"): one for one in piece.findall(f"{tag}/DataArray")}
+        if not count:
+            return cells_of(_KINDS[tag], np.zeros(1), np.empty(0, np.int64))
+        if not {"offsets", "connectivity"} <= set(arrays):
+            raise InputError(f"the {tag} have no offsets or no connectivity, {DAMAGED}")
+        ends = self.array(arrays["offsets"], count, 1)[:, 0]
+        if not 0 <= ends[-1] < 2**53:
+            raise InputError(f"the offsets of the {tag} are not valid, {DAMAGED}")
+        corners = self.array(arrays["connectivity"], int(ends[-1]), 1)[:, 0]
+        return cells_of(_KINDS[tag], np.concatenate([[0], ends.astype(np.int64)]), corners.astype(np.int64))
+
+    def array(self, element: ElementTree.Element, rows: int, columns: int) -> np.ndarray:
+        """Return the numbers of a DataArray (rows, columns)."""
+        kind = _TYPES.get(element.get("type", ""))
+        if kind is None:
+            raise InputError(
+                f"contains numbers of the unknown type {excerpt(element.get('type', ''))}: save the mesh "
+                "with floats and integers."
+            )
+        if not 1 <= columns <= LARGEST_COLUMNS:
+            raise InputError(f"declares an array with {count_of(columns, 'column')}, {DAMAGED}")
+        count, form, text = rows * columns, element.get("format", "ascii"), element.text or ""
+        if form == "ascii":
+            values = numbers_of(text.split(), kind)
+        elif form == "binary":
+            values = self.decode(text.strip().encode("ascii", "replace"), False, count, kind)
+        elif form == "appended":
+            content = self.appended[_integer(element, "offset", 0) :]
+            values = self.decode(content, self.is_raw, count, kind)
+        else:
+            raise InputError(f"has an array in the unknown format {excerpt(form)}, {DAMAGED}")
+        if len(values) != count:
+            raise InputError(
+                f"the array {element.get('Name', '')[:40]!a} has {count_of(len(values), 'number')} instead "
+                f"of {count}, {DAMAGED}"
+            )
+        return values.reshape(rows, columns)
+
+    def decode(self, content: bytes, is_raw: bool, count: int, kind: str) -> np.ndarray:
+        """Return numbers from raw bytes or base64, which begin with their size and may be compressed."""
+        expected = count * np.dtype(kind).itemsize
+        if expected > self.budget:
+            raise InputError(f"declares {count_of(count, 'number')}, more than the file contains, {DAMAGED}")
+        self.budget -= expected
+        stream = _Stream(content, is_raw)
+        size = self.header.itemsize
+        if not self.compressor:
+            written = stream.take(size + expected)
+            if np.frombuffer(written, self.header, 1)[0] != expected:
+                raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
+            unpacked = written[size:]
+        else:
+            blocks, block, last = np.frombuffer(stream.peek(3 * size), self.header).tolist()
+            total = (blocks - 1) * block + (last or block) if blocks else 0
+            if total != expected:
+                raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
+            sizes = np.frombuffer(stream.take((3 + blocks) * size), self.header)[3:].tolist()
+            packed = stream.take(sum(sizes))
+            parts, start = [], 0
+            for number, length in enumerate(sizes):
+                wanted = last or block if number == blocks - 1 else block
+                parts.append(self.unpack(packed[start : start + length], wanted))
+                start += length
+            unpacked = b"".join(parts)
+        return np.frombuffer(unpacked, self.order + kind).astype(kind)
+
+    def unpack(self, packed: bytes, size: int) -> bytes:
+        """Unpack a compressed block, which must have the given size."""
+        try:
+            if self.compressor == "vtkZLibDataCompressor":
+                unpacked = zlib.decompressobj().decompress(packed, size or 1)
+            elif self.compressor == "vtkLZMADataCompressor":
+                unpacked = lzma.LZMADecompressor(memlimit=2**28).decompress(packed, size or 1)
+            else:
+                unpacked = _unpack_lz4(packed, size)
+        except (zlib.error, lzma.LZMAError, EOFError):
+            unpacked = b""
+        if len(unpacked) != size:
+            raise InputError(f"a compressed array cannot be unpacked, {DAMAGED}")
+        return unpacked
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes:
+    """Unpack a block that is compressed with LZ4; return nothing if the block is damaged."""
+    try:
+        import lz4.block
+    except ImportError:
+        raise InputError(
+            "is compressed with LZ4, which needs the package lz4: run pip install "
+            "'jaxsmw[vtk]', or save the file with ZLib."
+        ) from None
+    try:
+        return lz4.block.decompress(packed, uncompressed_size=min(size, 255 * len(packed)))
+    except (lz4.block.LZ4BlockError, ValueError):
+        return b""
+
+
+class _Stream:
+    """Bytes that are stored as they are, or as several base64 texts, one after another."""
+
+    def __init__(self, content: bytes, is_raw: bool) -> None:
+        self.content, self.is_raw, self.position = content, is_raw, 0
+
+    def peek(self, size: int) -> bytes:
+        start = self.position
+        found = self.take(size)
+        self.position = start
+        return found
+
+    def take(self, size: int) -> bytes:
+        """Return the next bytes. The next call begins at the end of their base64 text."""
+        length = size if self.is_raw else (size + 2) // 3 * 4
+        part = self.content[self.position : self.position + length]
+        self.position += length
+        if not self.is_raw:
+            try:
+                part = base64.b64decode(part, validate=True)
+            except binascii.Error:
+                part = b""
+        if len(part) < size:
+            raise InputError(
+                "an array ends early, so the file is truncated or damaged: export the mesh again."
+            )
+        return part[:size]
+
+
+def _integer(element: ElementTree.Element, name: str, default: int) -> int:
+    word = element.get(name, str(default)).strip()
+    if not re.fullmatch(r"\d{1,18}", word, re.ASCII):
+        raise InputError(f"{excerpt(word)} is written where the number {name} should be, {DAMAGED}")
+    return int(word)
+
+
+def format_vtp(data: MeshData) -> Written:
+    """Format PolyData in version 1.0, with arrays in base64 and compressed with zlib."""
+    point_data, cell_data, coordinates = arrays_of(data)
+    n, f = len(data.mesh.vertices), len(data.faces)
+    point_data, cell_data = ({k: v for k, v in d.items() if k.isprintable()} for d in (point_data, cell_data))
+    texture = unique_name("texture", point_data)
+    if coordinates is not None:
+        point_data[texture] = coordinates
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64" '
+        'compressor="vtkZLibDataCompressor">',
+        f'<PolyData><Piece NumberOfPoints="{n}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
+        f'NumberOfPolys="{f}">',
+        "<PointData>" if coordinates is None else f'<PointData TCoords="{texture}">',
+        *(_array(name, values) for name, values in point_data.items()),
+        "</PointData><CellData>",
+        *(_array(name, values) for name, values in cell_data.items()),
+        "</CellData><Points>",
+        _array("Points", data.mesh.vertices),
+        "</Points><Polys>",
+        _array("connectivity", data.faces.ravel()),
+        _array("offsets", 3 * np.arange(1, f + 1)),
+        "</Polys></Piece></PolyData></VTKFile>",
+        "",
+    ]
+    notes = omissions(data, "VTP", vertex_data=_fits, face_data=_fits, texture=always)
+    return Written("\n".join(lines).encode(), notes)
+
+
+def _fits(name: str, _: np.ndarray) -> bool:
+    """Return whether XML can contain a name."""
+    return name.isprintable()
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    """Return a DataArray with one compressed block."""
+    kind = values.dtype.str[1:]
+    content = values.astype("<" + kind).tobytes()
+    packed = zlib.compress(content)
+    header = np.array([1, len(content), 0, len(packed)] if content else [0, 0, 0], "<u8").tobytes()
+    text = base64.b64encode(header) + base64.b64encode(packed if content else b"")
+    columns = values.shape[1] if values.ndim == 2 else 1
+    return (
+        f'<DataArray type="{_NAMES[kind]}" Name={quoteattr(name)} NumberOfComponents="{columns}" '
+        f'format="binary">{text.decode()}</DataArray>'
+    )

@@ -1,0 +1,202 @@
+"""Readers and writers of meshes together with their data, and the table of all formats of mesh files.
+
+Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
+has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
+and aborts the process on some invalid headers. The reader of VTK 9.7 ends the process with a segmentation
+fault if a polygon declares too many corners. It also accepts files whose counts are wrong. The reader of
+trimesh splits and drops vertices of OBJ files, and it cannot read binary PLY files whose polygons have
+different numbers of corners. pygltflib only parses the JSON part of glTF files, without checks.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of, make_mesh
+from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Texture, Written
+from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
+from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
+from jaxsmw.io.formats.mat import format_mat, parse_mat
+from jaxsmw.io.formats.npz import format_npz, parse_npz
+from jaxsmw.io.formats.obj import format_obj, parse_obj
+from jaxsmw.io.formats.off import format_off, parse_off
+from jaxsmw.io.formats.ply import format_ply, parse_ply
+from jaxsmw.io.formats.stl import format_stl, parse_stl
+from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
+from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
+from jaxsmw.runtime.files import atomic_write, read_bytes
+
+__all__ = ["MESH_SUFFIXES", "MeshData", "Skin", "Texture", "read_mesh_data", "write_mesh_data"]
+
+_PARSERS: dict[str, Callable[[bytes], Polygons]] = {
+    ".off": parse_off,
+    ".obj": parse_obj,
+    ".ply": parse_ply,
+    ".stl": parse_stl,
+    ".mat": parse_mat,
+    ".vtk": parse_vtk,
+    ".vtp": parse_vtp,
+    ".glb": parse_glb,
+    ".npz": parse_npz,
+}
+_FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
+    ".off": format_off,
+    ".obj": format_obj,
+    ".ply": format_ply,
+    ".stl": format_stl,
+    ".mat": format_mat,
+    ".vtk": format_vtk,
+    ".vtp": format_vtp,
+    ".gltf": format_gltf,
+    ".glb": format_glb,
+    ".npz": format_npz,
+}
+MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
+"""The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
+
+
+def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
+    """Read a mesh together with all data on its vertices and faces.
+
+    The data of each format:
+
+    - `.off`: colours of vertices and faces, normals, and texture coordinates (COFF, NOFF, STOFF).
+    - `.obj`: the `vt` lines as texture. The `g`, `o` and `usemtl` lines as the face data `group`, `object`
+      and `material`. Colours after the positions.
+    - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
+      array `a`. The lists `texcoord` of faces, or the properties `s` and `t` of vertices, become the texture.
+    - `.stl`: none.
+    - `.mat`: the further fields of the struct that `write_mesh_data` writes.
+    - `.vtk`: VTK legacy files up to version 5.1, text or binary, with a POLYDATA or an UNSTRUCTURED_GRID of
+      triangles, polygons and triangle strips: all arrays on points and cells.
+    - `.vtp`: VTK XML files in all encodings, also compressed: all arrays on points and cells. Compression
+      with LZ4 needs the extra `vtk`.
+    - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
+      Further attributes, morph targets and skins are read as well.
+    - `.npz`: arrays with the names of the attributes of a `MeshData`.
+
+    A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
+    vertices at exactly the same position are welded, as if `weld` were True. All meshes of the scene are
+    joined, in the order of the nodes, after the transforms of the nodes. Skinned meshes stay in their bind
+    pose. A glTF file reads only buffers that are files in its own folder or below. Normals, tangents,
+    animations and pictures are not read.
+
+    **Arguments:**
+
+    - `path`: the file. The suffix, in upper or lower case, determines the format.
+    - `weld`: if True, vertices at exactly the same position are merged in `MeshData.mesh`, as `read_mesh`
+        explains. `MeshData.faces` are not welded.
+
+    **Returns:**
+
+    A `MeshData` with n vertices and f triangles. Polygons with more than three corners and triangle strips
+    are split into triangles, which all have the data of their polygon.
+
+    **Raises:**
+
+    `InputError` if `read_mesh` refuses the file, or its data is damaged: for example because an array has a
+    wrong length, or a face uses a texture vertex that the file does not have.
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATTERS:
+        raise InputError(
+            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
+            f"mesh to one of {', '.join(_FORMATTERS)}."
+        )
+    try:
+        polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
+        at, polygon = _fans(polygons.sizes)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    faces = polygons.corners[at]
+    notes = list(polygons.notes)
+    large = int((polygons.sizes > 3).sum())
+    if large:
+        notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
+    mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+    return MeshData(
+        mesh,
+        faces.astype(np.int64),
+        vertex_data=polygons.vertex_data,
+        face_data={name: _repeated(values, polygon) for name, values in polygons.face_data.items()},
+        texture=None if polygons.texture is None else (polygons.texture[0], polygons.texture[1][at]),
+        blend_shapes=polygons.blend_shapes,
+        skin=polygons.skin,
+        label_names=polygons.label_names,
+    )
+
+
+def _fans(
+    sizes: Int64[np.ndarray, " f"],
+) -> tuple[Int64[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
+    """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1).
+
+    Return the positions of the corners of all triangles (t, 3) in the list of all corners, and the polygon of
+    each triangle (t,).
+    """
+    if (sizes < 3).any():
+        at = int((sizes < 3).argmax())
+        raise InputError(
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
+        )
+    per_face = sizes - 2
+    polygon = np.repeat(np.arange(len(sizes)), per_face)
+    apex = (np.cumsum(sizes) - sizes)[polygon]
+    step = np.arange(len(apex)) - (np.cumsum(per_face) - per_face)[polygon]
+    return np.stack([apex, apex + step + 1, apex + step + 2], axis=1), polygon
+
+
+def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
+    """Return the data of each triangle's polygon. `MeshData` refuses arrays of a wrong length."""
+    if values.ndim == 0 or len(values) <= polygon.max(initial=-1):
+        return values
+    return values[polygon]
+
+
+def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
+    """Write a mesh together with all data on its vertices and faces.
+
+    `read_mesh_data` lists the formats. It reads the same data from the file, in the precision of the format:
+    float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
+
+    Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
+    vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
+    them again.
+
+    The write is atomic: an incomplete file never appears under this name.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
+    - `data`: a `MeshData`. The file contains all of its `faces`, including faces that cleaning dropped from
+        its `mesh`.
+
+    **Returns:** Sentences about the data that the format cannot hold; an empty tuple if the file contains
+    everything. Only `.npz` files hold everything.
+
+    **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
+    be written.
+    """
+    path = Path(path)
+    form = _FORMATTERS.get(path.suffix.lower())
+    if form is None:
+        raise InputError(
+            f"{path}: meshes cannot be written as {path.suffix!r}: choose a name that ends in "
+            f"{', '.join(_FORMATTERS)}."
+        )
+    try:
+        written = form(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(written.content)
+    return written.notes
