@@ -1,0 +1,481 @@
+// The landmark mode: points that correspond, which a user places on both bodies, drags, names, loads and saves.
+
+import { readLandmarkFile, writeMarkups, writeTable } from "./landmark_files.js";
+import { LandmarkList, other } from "./landmark_list.js";
+import { copyCommand, download, enableControls, fillList, quoted, say, titles } from "./landmark_panel.js";
+import { Markers } from "./markers.js";
+import { Placement, sendPoint, Suggestions } from "./proposals.js";
+
+const REACH = { mouse: 13, touch: 24 }; // a press at most so many pixels from a marker holds this marker
+const DRAG_TOLERANCE = 4; // pixels; shorter movements are clicks
+const CURSOR_STEP = 8; // pixels
+const FAR = 0.02; // landmarks that are further from the surface, as a share of the diagonal, get a note
+const OFF = 0.05; // files whose landmarks are further away on average are not loaded without a question
+
+const byId = (id) => document.getElementById(id);
+const sides = ["x", "y"];
+const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+
+export function startLandmarks(viewer) {
+  return new LandmarkMode(viewer);
+}
+
+class LandmarkMode {
+  active = false;
+  list = new LandmarkList();
+  #suggestion = null; // a point of the source, with the vertex and its expected error
+  #drag = null; // { id, side, start, before, moved }
+  #waiting = null; // a file that lies off the surface: { side, file, landmarks }
+  #cursors = { x: null, y: null }; // the crosshairs of the keyboard, in pixels of the canvas
+  #format = ".mrk.json"; // of the files that the command names
+
+  constructor(viewer) {
+    Object.assign(this, viewer);
+    this.placements = { x: new Placement(this.data.x.placement), y: new Placement(this.data.y.placement) };
+    this.markers = { x: new Markers(this.bodies.x), y: new Markers(this.bodies.y) };
+    this.suggestions = new Suggestions(this.bodies.x.shape);
+    for (const side of sides) this.#listenToBody(side);
+    this.#listenToPanel();
+    this.#listenToPage();
+    this.update();
+  }
+
+  // ---- What is shown
+
+  color({ id }) {
+    return `hsl(${Math.round(210 + id * 137.5) % 360} 75% 38%)`;
+  }
+
+  /** The other point of the open landmark as the map gives it: { side, point }. Null without an open landmark. */
+  get ghost() {
+    const { open } = this.list;
+    if (!open) return null;
+    const side = open.x ? "x" : "y";
+    const { x, y } = this.bodies;
+    const point = sendPoint(side, open[side], x.shape, y.shape, this.currentMap().pointwise);
+    return point && { side: other[side], point };
+  }
+
+  /** The hollow marker that can be accepted. */
+  get proposal() {
+    return this.ghost ?? (this.#suggestion && !this.list.open ? { side: "x", point: this.#suggestion.point } : null);
+  }
+
+  /** Shows the current landmarks in the bodies and in the panel. */
+  update(message) {
+    const proposal = this.active ? this.proposal : null;
+    for (const side of sides) {
+      const { shape } = this.bodies[side];
+      const shown = this.list.entries.flatMap((entry, i) => {
+        const selected = entry.id === this.list.selected;
+        const look = { text: String(i + 1), color: this.color(entry), selected, item: entry };
+        if (entry[side]) return { ...look, position: shape.position(entry[side]) };
+        if (!selected || proposal?.side !== side) return [];
+        return { ...look, position: shape.position(proposal.point), hollow: true, item: "proposal" };
+      });
+      if (proposal?.side === side && !this.list.open) {
+        const look = { text: "?", color: "#1b2230", hollow: true, selected: true, item: "proposal" };
+        shown.push({ ...look, position: shape.position(proposal.point) });
+      }
+      this.markers[side].show(this.active ? shown : []);
+      this.#showCursor(side);
+    }
+    fillList(this.list, (entry) => this.color(entry));
+    enableControls(this.list, { proposal, canSuggest: Boolean(this.#expected()) });
+    say("landmark-status", message ?? this.#advice());
+    say("landmark-command", this.#command());
+    this.draw();
+  }
+
+  #advice() {
+    const { open, selection } = this.list;
+    if (open) {
+      return `${open.name}: click the matching point on the ${titles[open.x ? "y" : "x"]}, or accept the hollow marker, which shows where the map sends the point.`;
+    }
+    if (this.#suggestion) {
+      const { vertex, error } = this.#suggestion;
+      return `A landmark helps most near source vertex ${vertex}, where the expected error is ${error.toFixed(3)}. Accept the hollow marker or click near it.`;
+    }
+    if (selection) return `${selection.name} is complete. Drag its markers to correct it, or click the next point.`;
+    return "Click a point on one body, then the matching point on the other body.";
+  }
+
+  problem(text = "") {
+    say("landmark-problem", text);
+  }
+
+  toggle(on = !this.active) {
+    this.active = on;
+    document.body.dataset.landmarks = on ? "on" : "off";
+    byId("landmark-mode").setAttribute("aria-pressed", on);
+    byId("landmarks").hidden = !on;
+    if (on) this.unpin();
+    this.update();
+  }
+
+  // ---- Changes
+
+  place(side, point) {
+    this.#suggestion = null;
+    this.problem();
+    this.list.place(side, point);
+    this.update();
+  }
+
+  accept() {
+    const { proposal } = this;
+    if (proposal) this.place(proposal.side, proposal.point);
+  }
+
+  cancel() {
+    const { open } = this.list;
+    this.#suggestion = null;
+    this.problem();
+    if (this.#drag) this.#endDrag(false);
+    else {
+      // A pair that clicks have begun is dropped. A landmark from a file stays.
+      if (open && !open.loaded) this.list.remove(open.id);
+      this.list.selected = null;
+    }
+    this.update();
+  }
+
+  remove() {
+    this.list.remove(this.list.selected);
+    this.update();
+  }
+
+  step(by) {
+    if (this.#drag) this.#endDrag(false);
+    this.list.step(by);
+    this.update();
+  }
+
+  select(id) {
+    this.list.selected = id;
+    for (const side of sides) if (this.#cursors[side]) this.#moveCursorTo(side, this.list.selection);
+    this.update();
+  }
+
+  suggest() {
+    const found = this.suggestions.next(this.#expected(), this.list.entries.map(({ x }) => x).filter(Boolean));
+    if (this.list.open) this.list.selected = null;
+    this.#suggestion = found;
+    if (!found) return this.update("There are no further suggestions, because every part of the source is near a landmark or an earlier suggestion.");
+    const { x, y } = this.bodies;
+    const match = sendPoint("x", found.point, x.shape, y.shape, this.currentMap().pointwise);
+    this.turnTowards({ x: found.point, y: match });
+    this.update();
+  }
+
+  /** The expected errors of the current map, or else of another map, or undefined. */
+  #expected() {
+    const { expected } = this.data;
+    return [this.currentMap(), ...this.maps].map(({ errors }) => errors[expected]).find(Boolean);
+  }
+
+  // ---- Mouse and touch
+
+  onClick(side, point) {
+    if (this.#pressed?.item === "proposal") this.accept();
+    else if (point && !this.#pressed) this.place(side, point);
+  }
+
+  #pressed = null; // the marker on which the latest press began
+
+  #listenToBody(side) {
+    const { canvas, controls } = this.bodies[side];
+    const figure = canvas.parentElement;
+    // This listener of the figure runs before those of the canvas, so that a drag of a marker does not turn the body.
+    figure.addEventListener("pointerdown", (event) => {
+      this.#pressed = null;
+      if (!this.active || event.target !== canvas || event.button || this.#drag) return;
+      const marker = this.markers[side].at(event, event.pointerType === "touch" ? REACH.touch : REACH.mouse);
+      if (!marker) return;
+      this.#pressed = marker;
+      controls.enabled = false;
+      if (marker.item === "proposal") return;
+      const { id } = marker.item;
+      this.#drag = { id, side, start: event, before: marker.item[side], moved: false };
+      canvas.setPointerCapture(event.pointerId);
+      this.select(id);
+    }, { capture: true });
+    canvas.addEventListener("pointermove", (event) => this.#onDrag(event));
+    canvas.addEventListener("pointerup", () => {
+      if (this.#drag) this.#endDrag(true);
+      controls.enabled = true;
+    });
+    canvas.addEventListener("pointercancel", () => {
+      if (this.#drag) this.#endDrag(false);
+      controls.enabled = true;
+    });
+    canvas.addEventListener("blur", () => this.#setCursor(side, null));
+    figure.addEventListener("dragover", () => (figure.dataset.drop = "on"));
+    for (const type of ["dragleave", "drop"]) figure.addEventListener(type, () => delete figure.dataset.drop);
+    figure.addEventListener("drop", (event) => this.load(side, event.dataTransfer.files));
+  }
+
+  #onDrag(event) {
+    const drag = this.#drag;
+    if (!drag || drag.start.pointerId !== event.pointerId) return;
+    drag.moved ||= Math.hypot(event.clientX - drag.start.clientX, event.clientY - drag.start.clientY) > DRAG_TOLERANCE;
+    const point = drag.moved && this.bodies[drag.side].pointAt(event);
+    if (!point) return;
+    this.list.preview(drag.id, drag.side, point);
+    this.update();
+  }
+
+  /** Ends a drag; the marker stays at its new place or returns to its old place. */
+  #endDrag(stays) {
+    const { id, side, before, moved } = this.#drag;
+    this.#drag = null;
+    this.bodies[side].controls.enabled = true;
+    const point = this.list.entries.find((entry) => entry.id === id)[side];
+    this.list.preview(id, side, before);
+    if (stays && moved) this.list.move(id, side, point);
+    this.update();
+  }
+
+  // ---- Keys
+
+  #setCursor(side, place) {
+    this.#cursors[side] = place;
+    this.#showCursor(side);
+  }
+
+  #showCursor(side) {
+    const mark = byId(`cursor-${side}`), place = this.#cursors[side], { canvas } = this.bodies[side];
+    mark.hidden = !place || !this.active;
+    if (!place) return;
+    mark.style.left = `${canvas.offsetLeft + place.x}px`;
+    mark.style.top = `${canvas.offsetTop + place.y}px`;
+  }
+
+  /** Moves the crosshair to a landmark, or to the middle of the canvas. */
+  #moveCursorTo(side, entry) {
+    const { canvas, shape } = this.bodies[side];
+    const box = canvas.getBoundingClientRect();
+    const at = entry?.[side] && this.bodies[side].projectPoint(shape.position(entry[side]));
+    const middle = { x: box.width / 2, y: box.height / 2 };
+    this.#setCursor(side, at ? { x: at.x - box.left, y: at.y - box.top } : middle);
+  }
+
+  /** Handles a key that is pressed on a body; returns whether it was handled. */
+  onKey(body, event) {
+    if (!this.active) return false;
+    const side = body === this.bodies.x ? "x" : "y";
+    const { canvas } = body;
+    const arrow = event.shiftKey && arrows[event.key];
+    if (arrow) {
+      if (!this.#cursors[side]) this.#moveCursorTo(side, this.list.selection);
+      const within = (value, size) => Math.max(0, Math.min(size - 1, value));
+      const { x, y } = this.#cursors[side];
+      this.#setCursor(side, {
+        x: within(x + CURSOR_STEP * arrow[0], canvas.clientWidth),
+        y: within(y + CURSOR_STEP * arrow[1], canvas.clientHeight),
+      });
+    } else if (event.key === "Enter" || event.key.toLowerCase() === "m") {
+      if (!this.#cursors[side]) this.#moveCursorTo(side, null);
+      const box = canvas.getBoundingClientRect(), { x, y } = this.#cursors[side];
+      const point = body.pointAt({ clientX: box.left + x, clientY: box.top + y });
+      if (!point) this.problem("The crosshair is beside the body; move it with Shift and the arrow keys.");
+      else if (event.key === "Enter") this.place(side, point);
+      else if (this.list.selection) {
+        this.list.move(this.list.selected, side, point);
+        this.update();
+      }
+    } else return event.key === "Escape"; // the page handles Escape
+    event.preventDefault();
+    return true;
+  }
+
+  #listenToPage() {
+    document.addEventListener("keydown", (event) => {
+      if (!this.active || document.querySelector("dialog[open]")) return;
+      if (event.target.matches("input[type=text], input[type=number], select")) return;
+      const key = event.key.toLowerCase(), command = event.ctrlKey || event.metaKey;
+      if (command && (key === "y" || (key === "z" && event.shiftKey))) this.step(1);
+      else if (command && key === "z") this.step(-1);
+      else if (command || event.altKey) return;
+      else if (key === "delete" || key === "backspace") this.remove();
+      else if (key === "escape") this.cancel();
+      else if (key === "a" && this.proposal) this.accept();
+      else return;
+      event.preventDefault();
+    });
+    // A file that is dropped beside the bodies must not replace the page.
+    for (const type of ["dragover", "drop"]) document.addEventListener(type, (event) => event.preventDefault());
+  }
+
+  #listenToPanel() {
+    const actions = {
+      "landmark-mode": () => this.toggle(),
+      "landmark-accept": () => this.accept(),
+      "landmark-undo": () => this.step(-1),
+      "landmark-redo": () => this.step(1),
+      "landmark-delete": () => this.remove(),
+      "landmark-suggest": () => this.suggest(),
+      "landmark-copy": copyCommand,
+      "landmark-flip": () => this.#answer(true),
+      "landmark-as-written": () => this.#answer(false),
+    };
+    for (const [id, action] of Object.entries(actions)) byId(id).addEventListener("click", action);
+    const list = byId("landmark-list"), field = byId("landmark-name");
+    list.addEventListener("click", (event) => {
+      const option = event.target.closest("[data-id]");
+      if (option) this.select(Number(option.dataset.id));
+    });
+    list.addEventListener("dblclick", () => field.select());
+    list.addEventListener("keydown", (event) => {
+      const steps = { ArrowDown: 1, ArrowUp: -1, Home: -Infinity, End: Infinity };
+      if (event.altKey || event.ctrlKey || event.metaKey) return;
+      if (event.key in steps) {
+        this.list.select(steps[event.key]);
+        this.select(this.list.selected);
+      } else if (event.key === "Enter" || event.key === "F2") field.select();
+      else return;
+      event.preventDefault();
+    });
+    field.addEventListener("change", () => {
+      this.problem(this.list.rename(field.value));
+      field.value = this.list.selection?.name ?? "";
+      this.update();
+    });
+    field.addEventListener("keydown", ({ key }) => {
+      if (key === "Escape") field.value = this.list.selection?.name ?? "";
+      if (key === "Escape" || key === "Enter") list.focus();
+    });
+    for (const button of document.querySelectorAll("[data-save]")) {
+      button.addEventListener("click", () => this.save(button.dataset.side, button.dataset.save));
+    }
+    for (const side of sides) {
+      byId(`landmark-file-${side}`).addEventListener("change", ({ target }) => {
+        this.load(side, target.files).then(() => (target.value = ""));
+      });
+    }
+  }
+
+  // ---- Files
+
+  async load(side, files) {
+    if (!files.length) return;
+    this.toggle(true);
+    this.#ask(null);
+    if (files.length > 1) return this.problem(`${files.length} files were dropped on the ${titles[side]}; drop one file on each body.`);
+    try {
+      this.#consider(side, files[0].name, await readLandmarkFile(files[0]));
+    } catch (error) {
+      this.problem(error.message);
+    }
+  }
+
+  /** Merges the landmarks of a file, or asks first if they lie off the surface. */
+  #consider(side, file, landmarks) {
+    const snapped = this.#snap(side, landmarks.positions);
+    const { diagonal } = this.bodies[side].shape;
+    if (mean(snapped) <= OFF * diagonal) return this.#merge(side, file, landmarks, snapped);
+    const flipped = this.#snap(side, landmarks.positions.map(flip));
+    const distance = (points) => this.#length(side, mean(points));
+    const system = landmarks.system ? `, in ${landmarks.system}, ` : " ";
+    const cure =
+      mean(flipped) < mean(snapped)
+        ? `with the signs of x and y changed, as between LPS and RAS, they lie ${distance(flipped)} off`
+        : "a change between LPS and RAS does not help, so check that file and mesh belong together and have the same unit";
+    this.#ask({ side, file, landmarks }, `${file}: as written${system}the landmarks lie ${distance(snapped)} off the ${titles[side]} on average; ${cure}.`);
+  }
+
+  #ask(waiting, question = "") {
+    this.#waiting = waiting;
+    this.problem(question);
+    byId("landmark-question").hidden = !waiting;
+  }
+
+  #answer(flips) {
+    const { side, file, landmarks } = this.#waiting;
+    this.#ask(null);
+    const positions = flips ? landmarks.positions.map(flip) : landmarks.positions;
+    const system = flips && landmarks.system ? { LPS: "RAS", RAS: "LPS" }[landmarks.system] : landmarks.system;
+    this.#merge(side, file, { ...landmarks, system }, this.#snap(side, positions));
+  }
+
+  #merge(side, file, { names, system, omitted }, snapped) {
+    const { diagonal } = this.bodies[side].shape;
+    this.list.merge(side, names.map((name, i) => {
+      const { face, weights, distance } = snapped[i];
+      const note = distance > FAR * diagonal ? `moved ${this.#length(side, distance)} to the ${titles[side]}` : undefined;
+      return { name, point: { face, weights }, note };
+    }));
+    if (system) byId(`landmark-system-${side}`).value = system;
+    const both = names.filter((name) => this.list.complete.some((entry) => entry.name === name)).length;
+    const far = snapped.filter(({ distance }) => distance > FAR * diagonal).length;
+    const notes = [`${file}: ${names.length} landmarks on the ${titles[side]}, ${both} of them on both bodies`];
+    if (system) notes.push(`coordinates ${system}, used as they are`);
+    if (far) notes.push(`${far} lay off the surface and were moved to it`);
+    if (omitted) notes.push(`${omitted} without a defined position left out`);
+    this.problem();
+    this.update(`${notes.join("; ")}.`);
+  }
+
+  #snap(side, positions) {
+    const { shape } = this.bodies[side];
+    return positions.map((position) => shape.nearest(this.placements[side].toPage(position)));
+  }
+
+  /** A length on the page, in the unit of the mesh file and as a share of the diagonal. */
+  #length(side, length) {
+    const share = (100 * length) / this.bodies[side].shape.diagonal;
+    return `${Number((length * this.placements[side].scale).toPrecision(3))} (${Number(share.toPrecision(2))} % of the diagonal)`;
+  }
+
+  /** The position of a landmark in the coordinates of the mesh file. */
+  position(side, entry) {
+    return this.placements[side].toFile(this.bodies[side].shape.position(entry[side]));
+  }
+
+  save(side, format) {
+    const { complete } = this.list;
+    const names = complete.map(({ name }) => name);
+    const positions = complete.map((entry) => this.position(side, entry));
+    const system = byId(`landmark-system-${side}`).value;
+    this.#format = format;
+    if (format === ".csv") download(this.#fileName(side), writeTable(names, positions), "text/csv");
+    else download(this.#fileName(side), writeMarkups(names, positions, system), "application/json");
+    this.update(`${this.#fileName(side)} is saved.`);
+  }
+
+  #fileName(side) {
+    // A comma separates the two files in the command.
+    const stem = (of) => this.data[of].name.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N}._-]+/gu, "_");
+    const distinct = stem("x") === stem("y") ? `-${titles[side]}` : "";
+    return `${stem(side)}${distinct}-landmarks${this.#format}`;
+  }
+
+  #command() {
+    const init = `landmarks:${this.#fileName("x")},${this.#fileName("y")}`;
+    const meshes = sides.map((side) => quoted(this.data[side].name.replace(/^-/, "./-")));
+    return `jaxsmw match ${meshes.join(" ")} --init ${quoted(init)} --output map.txt`;
+  }
+
+  /** What scripts and tests can read. */
+  report() {
+    const { list, proposal } = this;
+    const describe = (entry) => ({
+      ...entry,
+      color: this.color(entry),
+      positions: { x: entry.x && this.position("x", entry), y: entry.y && this.position("y", entry) },
+    });
+    const at = proposal && { ...proposal, position: this.bodies[proposal.side].shape.position(proposal.point) };
+    const screen = at && this.bodies[at.side].projectPoint(at.position);
+    return {
+      active: this.active,
+      entries: list.entries.map(describe),
+      selected: list.selection?.name ?? null,
+      proposal: at && { ...at, screen },
+      suggestion: this.#suggestion,
+      cursors: this.#cursors,
+    };
+  }
+}
+
+const mean = (points) => points.reduce((sum, { distance }) => sum + distance, 0) / points.length;
+const flip = ([x, y, z]) => [-x, -y, z];
