@@ -1,16 +1,14 @@
 // The landmark mode: points that correspond, which a user places on both bodies, drags, names, loads and saves.
 
-import { readLandmarkFile, writeMarkups, writeTable } from "./landmark_files.js";
+import { Crosshair } from "./crosshair.js";
+import { LandmarkExchange } from "./landmark_exchange.js";
 import { LandmarkList, other } from "./landmark_list.js";
-import { copyCommand, download, enableControls, fillList, quoted, say, titles } from "./landmark_panel.js";
+import { copyCommand, enableControls, fillList, say, titles } from "./landmark_panel.js";
 import { Markers } from "./markers.js";
 import { Placement, sendPoint, Suggestions } from "./proposals.js";
 
 const REACH = { mouse: 13, touch: 24 }; // a press at most so many pixels from a marker holds this marker
 const DRAG_TOLERANCE = 4; // pixels; shorter movements are clicks
-const CURSOR_STEP = 8; // pixels
-const FAR = 0.02; // landmarks that are further from the surface, as a share of the diagonal, get a note
-const OFF = 0.05; // files whose landmarks are further away on average are not loaded without a question
 
 const byId = (id) => document.getElementById(id);
 const sides = ["x", "y"];
@@ -25,15 +23,14 @@ class LandmarkMode {
   list = new LandmarkList();
   #suggestion = null; // a point of the source, with the vertex and its expected error
   #drag = null; // { id, side, start, before, moved }
-  #waiting = null; // a file that lies off the surface: { side, file, landmarks }
-  #cursors = { x: null, y: null }; // the crosshairs of the keyboard, in pixels of the canvas
-  #format = ".mrk.json"; // of the files that the command names
 
   constructor(viewer) {
     Object.assign(this, viewer);
     this.placements = { x: new Placement(this.data.x.placement), y: new Placement(this.data.y.placement) };
     this.markers = { x: new Markers(this.bodies.x), y: new Markers(this.bodies.y) };
     this.suggestions = new Suggestions(this.bodies.x.shape);
+    this.crosshairs = { x: new Crosshair(this.bodies.x, "x"), y: new Crosshair(this.bodies.y, "y") };
+    this.exchange = new LandmarkExchange(this);
     for (const side of sides) this.#listenToBody(side);
     this.#listenToPanel();
     this.#listenToPage();
@@ -78,12 +75,12 @@ class LandmarkMode {
         shown.push({ ...look, position: shape.position(proposal.point) });
       }
       this.markers[side].show(this.active ? shown : []);
-      this.#showCursor(side);
+      if (!this.active) this.crosshairs[side].hide();
     }
     fillList(this.list, (entry) => this.color(entry));
     enableControls(this.list, { proposal, canSuggest: Boolean(this.#expected()) });
     say("landmark-status", message ?? this.#advice());
-    say("landmark-command", this.#command());
+    say("landmark-command", this.exchange.command);
     this.draw();
   }
 
@@ -117,7 +114,7 @@ class LandmarkMode {
 
   place(side, point) {
     this.#suggestion = null;
-    this.problem();
+    if (!this.exchange.asks) this.problem();
     this.list.place(side, point);
     this.update();
   }
@@ -130,7 +127,7 @@ class LandmarkMode {
   cancel() {
     const { open } = this.list;
     this.#suggestion = null;
-    this.problem();
+    this.exchange.ask(null);
     if (this.#drag) this.#endDrag(false);
     else {
       // A pair that clicks have begun is dropped. A landmark from a file stays.
@@ -153,7 +150,6 @@ class LandmarkMode {
 
   select(id) {
     this.list.selected = id;
-    for (const side of sides) if (this.#cursors[side]) this.#moveCursorTo(side, this.list.selection);
     this.update();
   }
 
@@ -209,10 +205,9 @@ class LandmarkMode {
       if (this.#drag) this.#endDrag(false);
       controls.enabled = true;
     });
-    canvas.addEventListener("blur", () => this.#setCursor(side, null));
     figure.addEventListener("dragover", () => (figure.dataset.drop = "on"));
     for (const type of ["dragleave", "drop"]) figure.addEventListener(type, () => delete figure.dataset.drop);
-    figure.addEventListener("drop", (event) => this.load(side, event.dataTransfer.files));
+    figure.addEventListener("drop", (event) => this.exchange.load(side, event.dataTransfer.files));
   }
 
   #onDrag(event) {
@@ -238,46 +233,14 @@ class LandmarkMode {
 
   // ---- Keys
 
-  #setCursor(side, place) {
-    this.#cursors[side] = place;
-    this.#showCursor(side);
-  }
-
-  #showCursor(side) {
-    const mark = byId(`cursor-${side}`), place = this.#cursors[side], { canvas } = this.bodies[side];
-    mark.hidden = !place || !this.active;
-    if (!place) return;
-    mark.style.left = `${canvas.offsetLeft + place.x}px`;
-    mark.style.top = `${canvas.offsetTop + place.y}px`;
-  }
-
-  /** Moves the crosshair to a landmark, or to the middle of the canvas. */
-  #moveCursorTo(side, entry) {
-    const { canvas, shape } = this.bodies[side];
-    const box = canvas.getBoundingClientRect();
-    const at = entry?.[side] && this.bodies[side].projectPoint(shape.position(entry[side]));
-    const middle = { x: box.width / 2, y: box.height / 2 };
-    this.#setCursor(side, at ? { x: at.x - box.left, y: at.y - box.top } : middle);
-  }
-
   /** Handles a key that is pressed on a body; returns whether it was handled. */
   onKey(body, event) {
     if (!this.active) return false;
-    const side = body === this.bodies.x ? "x" : "y";
-    const { canvas } = body;
+    const side = body === this.bodies.x ? "x" : "y", crosshair = this.crosshairs[side];
     const arrow = event.shiftKey && arrows[event.key];
-    if (arrow) {
-      if (!this.#cursors[side]) this.#moveCursorTo(side, this.list.selection);
-      const within = (value, size) => Math.max(0, Math.min(size - 1, value));
-      const { x, y } = this.#cursors[side];
-      this.#setCursor(side, {
-        x: within(x + CURSOR_STEP * arrow[0], canvas.clientWidth),
-        y: within(y + CURSOR_STEP * arrow[1], canvas.clientHeight),
-      });
-    } else if (event.key === "Enter" || event.key.toLowerCase() === "m") {
-      if (!this.#cursors[side]) this.#moveCursorTo(side, null);
-      const box = canvas.getBoundingClientRect(), { x, y } = this.#cursors[side];
-      const point = body.pointAt({ clientX: box.left + x, clientY: box.top + y });
+    if (arrow) crosshair.step(arrow, this.list.selection?.[side]);
+    else if (event.key === "Enter" || event.key.toLowerCase() === "m") {
+      const point = crosshair.point;
       if (!point) this.problem("The crosshair is beside the body; move it with Shift and the arrow keys.");
       else if (event.key === "Enter") this.place(side, point);
       else if (this.list.selection) {
@@ -316,8 +279,8 @@ class LandmarkMode {
       "landmark-delete": () => this.remove(),
       "landmark-suggest": () => this.suggest(),
       "landmark-copy": copyCommand,
-      "landmark-flip": () => this.#answer(true),
-      "landmark-as-written": () => this.#answer(false),
+      "landmark-flip": () => this.exchange.answer(true),
+      "landmark-as-written": () => this.exchange.answer(false),
     };
     for (const [id, action] of Object.entries(actions)) byId(id).addEventListener("click", action);
     const list = byId("landmark-list"), field = byId("landmark-name");
@@ -346,114 +309,19 @@ class LandmarkMode {
       if (key === "Escape" || key === "Enter") list.focus();
     });
     for (const button of document.querySelectorAll("[data-save]")) {
-      button.addEventListener("click", () => this.save(button.dataset.side, button.dataset.save));
+      button.addEventListener("click", () => this.exchange.save(button.dataset.save));
     }
     for (const side of sides) {
       byId(`landmark-file-${side}`).addEventListener("change", ({ target }) => {
-        this.load(side, target.files).then(() => (target.value = ""));
+        this.exchange.load(side, target.files).then(() => (target.value = ""));
       });
+      byId(`landmark-format-${side}`).addEventListener("change", () => this.update());
     }
-  }
-
-  // ---- Files
-
-  async load(side, files) {
-    if (!files.length) return;
-    this.toggle(true);
-    this.#ask(null);
-    if (files.length > 1) return this.problem(`${files.length} files were dropped on the ${titles[side]}; drop one file on each body.`);
-    try {
-      this.#consider(side, files[0].name, await readLandmarkFile(files[0]));
-    } catch (error) {
-      this.problem(error.message);
-    }
-  }
-
-  /** Merges the landmarks of a file, or asks first if they lie off the surface. */
-  #consider(side, file, landmarks) {
-    const snapped = this.#snap(side, landmarks.positions);
-    const { diagonal } = this.bodies[side].shape;
-    if (mean(snapped) <= OFF * diagonal) return this.#merge(side, file, landmarks, snapped);
-    const flipped = this.#snap(side, landmarks.positions.map(flip));
-    const distance = (points) => this.#length(side, mean(points));
-    const system = landmarks.system ? `, in ${landmarks.system}, ` : " ";
-    const cure =
-      mean(flipped) < mean(snapped)
-        ? `with the signs of x and y changed, as between LPS and RAS, they lie ${distance(flipped)} off`
-        : "a change between LPS and RAS does not help, so check that file and mesh belong together and have the same unit";
-    this.#ask({ side, file, landmarks }, `${file}: as written${system}the landmarks lie ${distance(snapped)} off the ${titles[side]} on average; ${cure}.`);
-  }
-
-  #ask(waiting, question = "") {
-    this.#waiting = waiting;
-    this.problem(question);
-    byId("landmark-question").hidden = !waiting;
-  }
-
-  #answer(flips) {
-    const { side, file, landmarks } = this.#waiting;
-    this.#ask(null);
-    const positions = flips ? landmarks.positions.map(flip) : landmarks.positions;
-    const system = flips && landmarks.system ? { LPS: "RAS", RAS: "LPS" }[landmarks.system] : landmarks.system;
-    this.#merge(side, file, { ...landmarks, system }, this.#snap(side, positions));
-  }
-
-  #merge(side, file, { names, system, omitted }, snapped) {
-    const { diagonal } = this.bodies[side].shape;
-    this.list.merge(side, names.map((name, i) => {
-      const { face, weights, distance } = snapped[i];
-      const note = distance > FAR * diagonal ? `moved ${this.#length(side, distance)} to the ${titles[side]}` : undefined;
-      return { name, point: { face, weights }, note };
-    }));
-    if (system) byId(`landmark-system-${side}`).value = system;
-    const both = names.filter((name) => this.list.complete.some((entry) => entry.name === name)).length;
-    const far = snapped.filter(({ distance }) => distance > FAR * diagonal).length;
-    const notes = [`${file}: ${names.length} landmarks on the ${titles[side]}, ${both} of them on both bodies`];
-    if (system) notes.push(`coordinates ${system}, used as they are`);
-    if (far) notes.push(`${far} lay off the surface and were moved to it`);
-    if (omitted) notes.push(`${omitted} without a defined position left out`);
-    this.problem();
-    this.update(`${notes.join("; ")}.`);
-  }
-
-  #snap(side, positions) {
-    const { shape } = this.bodies[side];
-    return positions.map((position) => shape.nearest(this.placements[side].toPage(position)));
-  }
-
-  /** A length on the page, in the unit of the mesh file and as a share of the diagonal. */
-  #length(side, length) {
-    const share = (100 * length) / this.bodies[side].shape.diagonal;
-    return `${Number((length * this.placements[side].scale).toPrecision(3))} (${Number(share.toPrecision(2))} % of the diagonal)`;
   }
 
   /** The position of a landmark in the coordinates of the mesh file. */
   position(side, entry) {
     return this.placements[side].toFile(this.bodies[side].shape.position(entry[side]));
-  }
-
-  save(side, format) {
-    const { complete } = this.list;
-    const names = complete.map(({ name }) => name);
-    const positions = complete.map((entry) => this.position(side, entry));
-    const system = byId(`landmark-system-${side}`).value;
-    this.#format = format;
-    if (format === ".csv") download(this.#fileName(side), writeTable(names, positions), "text/csv");
-    else download(this.#fileName(side), writeMarkups(names, positions, system), "application/json");
-    this.update(`${this.#fileName(side)} is saved.`);
-  }
-
-  #fileName(side) {
-    // A comma separates the two files in the command.
-    const stem = (of) => this.data[of].name.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N}._-]+/gu, "_");
-    const distinct = stem("x") === stem("y") ? `-${titles[side]}` : "";
-    return `${stem(side)}${distinct}-landmarks${this.#format}`;
-  }
-
-  #command() {
-    const init = `landmarks:${this.#fileName("x")},${this.#fileName("y")}`;
-    const meshes = sides.map((side) => quoted(this.data[side].name.replace(/^-/, "./-")));
-    return `jaxsmw match ${meshes.join(" ")} --init ${quoted(init)} --output map.txt`;
   }
 
   /** What scripts and tests can read. */
@@ -472,10 +340,7 @@ class LandmarkMode {
       selected: list.selection?.name ?? null,
       proposal: at && { ...at, screen },
       suggestion: this.#suggestion,
-      cursors: this.#cursors,
+      crosshairs: { x: this.crosshairs.x.place, y: this.crosshairs.y.place },
     };
   }
 }
-
-const mean = (points) => points.reduce((sum, { distance }) => sum + distance, 0) / points.length;
-const flip = ([x, y, z]) => [-x, -y, z];

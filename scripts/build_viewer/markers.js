@@ -1,9 +1,8 @@
 // Numbered markers on one body: discs that keep their size on the screen, and are faint where the body hides them.
 
-import { CanvasTexture, Sprite, SpriteMaterial, SRGBColorSpace, Vector3 } from "three";
+import { CanvasTexture, LinearFilter, Sprite, SpriteMaterial, SRGBColorSpace, Vector3 } from "three";
 
 const PIXELS = { marker: 11, selected: 14 }; // radius on the screen, in CSS pixels
-const TEXTURE = 96; // the width of a picture of a marker
 const FAINT = 0.35;
 
 const pictures = new Map();
@@ -17,30 +16,33 @@ function picture({ text, color, hollow, selected }) {
 
 function drawPicture(text, color, hollow, selected) {
   const canvas = document.createElement("canvas");
-  canvas.width = canvas.height = TEXTURE;
-  const pen = canvas.getContext("2d"), center = TEXTURE / 2;
+  // As many pixels as on the screen, so that numbers are sharp.
+  const width = Math.round(2 * (selected ? PIXELS.selected : PIXELS.marker) * Math.min(window.devicePixelRatio, 2));
+  canvas.width = canvas.height = width;
+  const pen = canvas.getContext("2d"), center = width / 2;
   const disc = (radius, style) => {
     pen.fillStyle = style;
     pen.beginPath();
     pen.arc(center, center, radius, 0, 2 * Math.PI);
     pen.fill();
   };
-  disc(0.5 * TEXTURE, selected ? "#000000" : "#00000066");
-  disc(0.46 * TEXTURE, "#ffffff");
+  disc(0.5 * width, selected ? "#000000" : "#00000066");
+  disc(0.46 * width, "#ffffff");
   if (hollow) {
     pen.strokeStyle = color;
-    pen.lineWidth = 0.09 * TEXTURE;
-    pen.setLineDash([0.16 * TEXTURE, 0.1 * TEXTURE]);
+    pen.lineWidth = 0.09 * width;
+    pen.setLineDash([0.16 * width, 0.1 * width]);
     pen.beginPath();
-    pen.arc(center, center, 0.38 * TEXTURE, 0, 2 * Math.PI);
+    pen.arc(center, center, 0.38 * width, 0, 2 * Math.PI);
     pen.stroke();
-  } else disc((selected ? 0.36 : 0.4) * TEXTURE, color);
+  } else disc(0.4 * width, color);
   pen.fillStyle = hollow ? color : "#ffffff";
-  pen.font = `bold ${(text.length > 2 ? 0.34 : 0.46) * TEXTURE}px system-ui, sans-serif`;
+  pen.font = `bold ${(text.length > 2 ? 0.34 : 0.46) * width}px system-ui, sans-serif`;
   pen.textAlign = "center";
   pen.textBaseline = "middle";
   pen.fillText(text, center, 1.04 * center);
   const texture = new CanvasTexture(canvas);
+  Object.assign(texture, { minFilter: LinearFilter, generateMipmaps: false });
   texture.colorSpace = SRGBColorSpace;
   return texture;
 }

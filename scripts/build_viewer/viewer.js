@@ -260,6 +260,8 @@ class Body {
   }
 }
 
+startHelp();
+
 let bodies;
 try {
   bodies = { x: new Body(byId("canvas-x"), data.x), y: new Body(byId("canvas-y"), data.y) };
@@ -673,7 +675,7 @@ for (const [side, body] of Object.entries(bodies)) {
 
   let hovered = null; // the latest position of the pointer that has not been handled yet
   canvas.addEventListener("pointermove", (event) => {
-    if (state.pinned || event.buttons || event.pointerType === "touch") return;
+    if (state.pinned || landmarks.active || event.buttons || event.pointerType === "touch") return;
     if (!hovered) {
       requestAnimationFrame(() => {
         if (hovered && !state.pinned) pick(side, body.vertexAt(hovered));
@@ -748,7 +750,6 @@ for (const body of everyBody) observer.observe(body.canvas);
 
 const landmarks = startLandmarks({ bodies, data, draw, turnTowards, unpin: () => pin("x", null), currentMap: () => maps[state.map], maps });
 startRegistered({ bodies, data, draw });
-startHelp();
 
 byId("filter").disabled = filters < 2;
 chooseFilter();
