@@ -78,8 +78,12 @@ def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     assert '<p data-for="error-0">How far &amp; wide. ' in page
     assert '<p data-for="error-1">Expected &lt;error&gt; of every match. ' in page
     assert "{{" not in page.split("<script>")[0]
-    # The only address in the page is the name of an XML namespace, which browsers do not fetch.
-    assert set(re.findall(r"https?://[^\s\"'`<]+", page)) == {"http://www.w3.org/1999/xhtml"}
+    # Browsers fetch neither the name of an XML namespace nor the name of a schema of landmark files.
+    addresses = set(re.findall(r"https?://[^\s\"'`<]+", page))
+    assert {address.partition("#")[0].rpartition("/")[2] for address in addresses} == {
+        "xhtml",
+        "markups-schema-v1.0.3.json",
+    }
     assert not re.search(r"<(link|iframe|object)|@import|\burl\(", page.split("<script>")[0])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
 

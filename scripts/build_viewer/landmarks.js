@@ -327,18 +327,18 @@ class LandmarkMode {
   /** What scripts and tests can read. */
   report() {
     const { list, proposal } = this;
+    const screen = (side, point) => this.bodies[side].projectPoint(this.bodies[side].shape.position(point));
     const describe = (entry) => ({
       ...entry,
       color: this.color(entry),
       positions: { x: entry.x && this.position("x", entry), y: entry.y && this.position("y", entry) },
+      screen: { x: entry.x && screen("x", entry.x), y: entry.y && screen("y", entry.y) },
     });
-    const at = proposal && { ...proposal, position: this.bodies[proposal.side].shape.position(proposal.point) };
-    const screen = at && this.bodies[at.side].projectPoint(at.position);
     return {
       active: this.active,
       entries: list.entries.map(describe),
       selected: list.selection?.name ?? null,
-      proposal: at && { ...at, screen },
+      proposal: proposal && { ...proposal, screen: screen(proposal.side, proposal.point) },
       suggestion: this.#suggestion,
       crosshairs: { x: this.crosshairs.x.place, y: this.crosshairs.y.place },
     };
