@@ -5,6 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,35 @@ def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     }
     assert not re.search(r"<(link|iframe|object)|@import|\burl\(", page.split("<script>")[0])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
+
+
+def test_page_holds_the_placements_and_the_registered_source(tmp_path: Path) -> None:
+    other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
+    other = replace(other, vertices=70 * other.vertices + [4000, 0, -3])
+    path = tmp_path / "page.html"
+    shown = {"map": ShownMap(number)}
+    write_page(path, TALL, other, shown, title="", registered=other.vertices[number])
+    data = embedded(path.read_text("utf-8"))
+    for side, mesh in (("x", TALL), ("y", other)):
+        placement = data[side]["placement"]
+        displayed = decode(data[side]["vertices"], "<f4").reshape(-1, 3).astype(float)
+        found = displayed @ np.array(placement["matrix"]) + placement["offset"]
+        # The docstring of `encode_shape` states this error.
+        diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+        assert np.linalg.norm(found - mesh.vertices, axis=1).max() < 1e-7 * diagonal
+        assert data[side]["name"] == Path(mesh.name).name
+    registered = decode(data["registered"], "<f4").reshape(-1, 3)
+    assert np.allclose(registered, decode(data["y"]["vertices"], "<f4").reshape(-1, 3)[number], atol=1e-6)
+    assert data["expected"] == "Expected error"
+    write_page(path, TALL, other, shown, title="")
+    assert "registered" not in embedded(path.read_text("utf-8"))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("registered", [TALL.vertices[1:], TALL.vertices * np.nan, TALL.vertices[:, :2]])
+def test_registered_positions_that_do_not_fit_are_refused(registered: np.ndarray) -> None:
+    with pytest.raises(InputError, match="three finite numbers for each of the 642 vertices of ellipsoid"):
+        _page(TALL, TALL, np.arange(len(TALL.vertices)), registered=registered)
 
 
 @pytest.mark.parametrize("errors", [(0.7, 0.02), (0.001,), ()])

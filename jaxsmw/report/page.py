@@ -145,9 +145,9 @@ def write_page(
     - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
-    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file. If the positions
-      are given, the page can draw X over Y, and a slider moves X from its own shape to these positions. They
-      take 16 bytes per vertex.
+    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file; None (the
+      default) for a page without them. The page can draw X over Y at these positions, and a slider moves X
+      there from its own shape. The positions take 16 bytes per vertex.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not

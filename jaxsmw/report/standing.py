@@ -111,9 +111,7 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
     return standing_x, standing_y
 
 
-def placement(
-    mesh: Mesh, standing: Mesh
-) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
+def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
     """The similarity that takes a standing mesh back to its file: `file = standing @ matrix + offset`.
 
     **Arguments:**

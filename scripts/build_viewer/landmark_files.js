@@ -124,7 +124,8 @@ function cells(line, separator) {
 }
 
 function readPickedPoints(text) {
-  if (/<!DOCTYPE/i.test(text)) throw new Error("the file declares a document type; remove the declaration.");
+  // MeshLab writes <!DOCTYPE PickedPoints>. Declarations inside a document type could define entities.
+  if (/<!DOCTYPE[^>]*\[|<!ENTITY/i.test(text)) throw new Error("the file declares entities; remove the declarations.");
   const content = new DOMParser().parseFromString(text, "application/xml");
   if (content.querySelector("parsererror")) throw new Error("the file is not valid XML; save the points again.");
   const points = [...content.querySelectorAll("point")];

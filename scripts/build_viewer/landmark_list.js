@@ -34,11 +34,13 @@ export class LandmarkList {
     this.#history.splice(++this.#now, Infinity, entries);
   }
 
-  /** Undoes (-1) or redoes (1) one change. */
+  /** Undoes (-1) or redoes (1) one change, and selects the landmark that changed. */
   step(by) {
     if (by < 0 ? !this.canUndo : !this.canRedo) return;
+    const before = this.entries;
     this.#now += by;
-    if (!this.selection) this.selected = null;
+    const changed = this.entries.find((entry) => !before.includes(entry));
+    this.selected = (changed ?? this.selection)?.id ?? null;
   }
 
   #replace(id, changes) {

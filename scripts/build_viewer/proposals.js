@@ -67,8 +67,10 @@ export class Suggestions {
     if (errors !== this.#errors) {
       this.#made = [];
       this.#errors = errors;
-      // An infinite error, of a match on a separate component, counts as 1.
-      this.#smoothed = shape.smooth(errors.map((error) => Math.min(error, 1)), NEIGHBOURHOOD * shape.diagonal);
+      // An infinite error, of a match on a separate component, counts as the largest finite error.
+      const largest = errors.reduce((most, error) => (error < Infinity && error > most ? error : most), 0) || 1;
+      const finite = errors.map((error) => Math.min(error, largest));
+      this.#smoothed = shape.smooth(finite, NEIGHBOURHOOD * shape.diagonal);
     }
     const taken = [...landmarks.map((point) => shape.nearestCorner(point)), ...this.#made];
     const near = shape.within(taken, APART * shape.diagonal);
