@@ -87,7 +87,7 @@ class LandmarkMode {
   #advice() {
     const { open, selection } = this.list;
     if (open) {
-      return `${open.name}: click the matching point on the ${titles[open.x ? "y" : "x"]}, or accept the hollow marker, which shows where the map sends the point.`;
+      return `${open.name}: click the matching point on the ${titles[open.x ? "y" : "x"]}, or accept the hollow marker, the match by the map.`;
     }
     if (this.#suggestion) {
       const { vertex, error } = this.#suggestion;

@@ -21,6 +21,8 @@ const share = (part, whole, weights) => weights(whole > 0 ? part / whole : 0);
 
 export const distanceBetween = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 
+const MOST_AVERAGES = 50; // keeps smoothing fast on fine meshes
+
 // Evenly spread directions (a Fibonacci sphere).
 const DIRECTIONS = Array.from({ length: 120 }, (_, i) => {
   const z = 1 - (2 * i + 1) / 120, r = Math.sqrt(1 - z * z), angle = i * Math.PI * (3 - Math.sqrt(5));
@@ -127,10 +129,16 @@ export class Surface {
   get balls() {
     if (this.#balls) return this.#balls;
     this.#balls = new Float64Array((4 * this.faces.length) / 3);
-    for (let face = 0; face < this.faces.length / 3; face++) {
-      const center = this.position({ face, weights: [1 / 3, 1 / 3, 1 / 3] });
-      const radii = this.corners({ face }).map((corner) => distanceBetween(center, this.vertex(corner)));
-      this.#balls.set([...center, Math.max(...radii)], 4 * face);
+    const { faces, positions } = this, balls = this.#balls;
+    for (let first = 0, at = 0; first < faces.length; first += 3, at += 4) {
+      for (let corner = first; corner < first + 3; corner++) {
+        for (let axis = 0; axis < 3; axis++) balls[at + axis] += positions[3 * faces[corner] + axis] / 3;
+      }
+      for (let corner = first; corner < first + 3; corner++) {
+        const v = 3 * faces[corner];
+        const x = positions[v] - balls[at], y = positions[v + 1] - balls[at + 1], z = positions[v + 2] - balls[at + 2];
+        balls[at + 3] = Math.max(balls[at + 3], Math.sqrt(x * x + y * y + z * z));
+      }
     }
     return this.#balls;
   }
@@ -171,7 +179,7 @@ export class Surface {
     return Uint8Array.from(distances, (distance) => distance < Infinity);
   }
 
-  /** The values, averaged over a neighbourhood of about this radius. Unknown values (NaN) have no weight. */
+  /** The values, averaged over a neighbourhood of about this radius, or less on very fine meshes. Unknown values (NaN) have no weight. */
   smooth(values, radius) {
     const { starts, list } = this.neighbours;
     let length = 0;
@@ -179,15 +187,18 @@ export class Surface {
       length += distanceBetween(this.vertex(this.faces[at]), this.vertex(this.faces[at + 1]));
     }
     // The reach of repeated averages grows with the square root of their number.
-    const repetitions = Math.min(200, Math.max(1, Math.round((radius / (length / (this.faces.length / 3))) ** 2)));
+    const repetitions = Math.min(MOST_AVERAGES, Math.max(1, Math.round((radius / (length / (this.faces.length / 3))) ** 2)));
     let weights = Float64Array.from(values, (value) => Number(Number.isFinite(value)));
     let sums = Float64Array.from(values, (value) => (Number.isFinite(value) ? value : 0));
-    const average = (of) =>
-      of.map((own, i) => {
-        let sum = own;
+    const average = (of) => {
+      const result = new Float64Array(of.length);
+      for (let i = 0; i < of.length; i++) {
+        let sum = of[i];
         for (let at = starts[i]; at < starts[i + 1]; at++) sum += of[list[at]];
-        return sum / (1 + starts[i + 1] - starts[i]);
-      });
+        result[i] = sum / (1 + starts[i + 1] - starts[i]);
+      }
+      return result;
+    };
     for (let i = 0; i < repetitions; i++) [weights, sums] = [average(weights), average(sums)];
     return sums.map((sum, i) => (weights[i] > 0 && starts[i + 1] > starts[i] ? sum / weights[i] : NaN));
   }
