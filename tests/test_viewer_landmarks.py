@@ -432,6 +432,28 @@ def test_names_must_be_unique_and_are_shown_as_text(page: LandmarkPage, tmp_path
         assert page.names == ["L1", HOSTILE] and page.text("landmark-problem") == ""
 
 
+def test_a_typed_name_stays_with_its_landmark(page: LandmarkPage) -> None:
+    page.add(0)
+    page.add(40)
+    page.find("#landmark-name").click()
+    page.mouse().send_keys("tail").perform()
+    # A press on another marker selects that landmark before the field loses the focus.
+    other = page.entries[0]["screen"]["x"]
+    page.point_at(round(other["x"]), round(other["y"]), click=True)
+    assert page.names == ["L1", "L2tail"] and page.report["selected"] == "L1"
+    assert page.find("#landmark-name").get_property("value") == "L1"
+
+
+def test_the_command_is_copied(page: LandmarkPage) -> None:
+    page.add(0)
+    page.find("#landmark-copy").click()
+    page.settle()
+    told = page.text("landmark-status")
+    if told != "The command is copied.":  # the browser may refuse access to the clipboard
+        assert told.startswith("The command is selected")
+        assert page.run("return getSelection().toString().trim()") == page.text("landmark-command")
+
+
 def test_touch_places_and_drags_on_a_phone_of_360_pixels(browser: Any, page_file: Path) -> None:
     browser.get_log("browser")
     page = LandmarkPage(browser, page_file, width=360, height=740)

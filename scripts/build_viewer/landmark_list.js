@@ -74,13 +74,14 @@ export class LandmarkList {
     this.#history[this.#now] = this.#replace(id, { [side]: point });
   }
 
-  /** Renames the selected landmark; returns a sentence if the name cannot be used. */
-  rename(text) {
+  /** Renames a landmark; returns a sentence if the name cannot be used. */
+  rename(id, text) {
     const name = text.replace(/\p{Cc}/gu, " ").trim();
-    if (!this.selection || name === this.selection.name) return "";
+    const entry = this.entries.find((entry) => entry.id === id);
+    if (!entry || name === entry.name) return "";
     if (!name) return "The name is empty; type a name.";
     if (this.entries.some((entry) => entry.name === name)) return `Another landmark is named ${name}; type another name.`;
-    this.#commit(this.#replace(this.selected, { name }));
+    this.#commit(this.#replace(id, { name }));
     return "";
   }
 

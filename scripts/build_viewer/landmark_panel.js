@@ -53,12 +53,19 @@ export function enableControls(list, { proposal, canSuggest }) {
   byId("landmark-suggest").hidden = !canSuggest;
   const field = byId("landmark-name");
   field.disabled = !list.selection;
-  if (document.activeElement !== field || !list.selection) field.value = list.selection?.name ?? "";
+  // A name that is being typed belongs to the landmark that was selected when the typing began.
+  if (document.activeElement !== field || !list.selection) fillName(list);
   for (const button of document.querySelectorAll("[data-save]")) button.disabled = !list.complete.length;
   byId("landmark-result").hidden = !list.complete.length;
   const left = list.entries.length - list.complete.length;
   const of = `${list.complete.length} ${list.complete.length === 1 ? "landmark" : "landmarks"}`;
   say("landmark-count", left ? `The files contain ${of} with points on both bodies, and leave out ${left}.` : `The files contain ${of}.`);
+}
+
+/** Shows the name of the selected landmark in the field of the name. */
+export function fillName({ selection }) {
+  byId("landmark-name").value = selection?.name ?? "";
+  byId("landmark-name").dataset.id = selection?.id ?? "";
 }
 
 /** Saves a text as a file. */

@@ -3,7 +3,7 @@
 import { Crosshair } from "./crosshair.js";
 import { LandmarkExchange } from "./landmark_exchange.js";
 import { LandmarkList, other } from "./landmark_list.js";
-import { copyCommand, enableControls, fillList, say, titles } from "./landmark_panel.js";
+import { copyCommand, enableControls, fillList, fillName, say, titles } from "./landmark_panel.js";
 import { Markers } from "./markers.js";
 import { Placement, sendPoint, Suggestions } from "./proposals.js";
 
@@ -300,12 +300,12 @@ class LandmarkMode {
       event.preventDefault();
     });
     field.addEventListener("change", () => {
-      this.problem(this.list.rename(field.value));
-      field.value = this.list.selection?.name ?? "";
+      this.problem(this.list.rename(Number(field.dataset.id), field.value));
+      fillName(this.list);
       this.update();
     });
     field.addEventListener("keydown", ({ key }) => {
-      if (key === "Escape") field.value = this.list.selection?.name ?? "";
+      if (key === "Escape") fillName(this.list);
       if (key === "Escape" || key === "Enter") list.focus();
     });
     for (const button of document.querySelectorAll("[data-save]")) {
