@@ -5,6 +5,7 @@ import json
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +79,43 @@ def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     assert '<p data-for="error-0">How far &amp; wide. ' in page
     assert '<p data-for="error-1">Expected &lt;error&gt; of every match. ' in page
     assert "{{" not in page.split("<script>")[0]
-    # The only address in the page is the name of an XML namespace, which browsers do not fetch.
-    assert set(re.findall(r"https?://[^\s\"'`<]+", page)) == {"http://www.w3.org/1999/xhtml"}
+    # Browsers fetch neither the name of an XML namespace nor the name of a schema of landmark files.
+    addresses = set(re.findall(r"https?://[^\s\"'`<]+", page))
+    assert {address.partition("#")[0].rpartition("/")[2] for address in addresses} == {
+        "xhtml",
+        "markups-schema-v1.0.3.json",
+    }
     assert not re.search(r"<(link|iframe|object)|@import|\burl\(", page.split("<script>")[0])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
+
+
+def test_page_holds_the_placements_and_the_registered_source(tmp_path: Path) -> None:
+    other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
+    other = replace(other, vertices=70 * other.vertices + [4000, 0, -3])
+    path = tmp_path / "page.html"
+    shown = {"map": ShownMap(number)}
+    write_page(path, TALL, other, shown, title="", registered=other.vertices[number])
+    data = embedded(path.read_text("utf-8"))
+    for side, mesh in (("x", TALL), ("y", other)):
+        placement = data[side]["placement"]
+        displayed = decode(data[side]["vertices"], "<f4").reshape(-1, 3).astype(float)
+        found = displayed @ np.array(placement["matrix"]) + placement["offset"]
+        # The docstring of `encode_shape` states this error.
+        diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+        assert np.linalg.norm(found - mesh.vertices, axis=1).max() < 1e-7 * diagonal
+        assert data[side]["name"] == Path(mesh.name).name
+    registered = decode(data["registered"], "<f4").reshape(-1, 3)
+    assert np.allclose(registered, decode(data["y"]["vertices"], "<f4").reshape(-1, 3)[number], atol=1e-6)
+    assert data["expected"] == "Expected error"
+    write_page(path, TALL, other, shown, title="")
+    assert "registered" not in embedded(path.read_text("utf-8"))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("registered", [TALL.vertices[1:], TALL.vertices * np.nan, TALL.vertices[:, :2]])
+def test_registered_positions_that_do_not_fit_are_refused(registered: np.ndarray) -> None:
+    with pytest.raises(InputError, match="three finite numbers for each of the 642 vertices of ellipsoid"):
+        _page(TALL, TALL, np.arange(len(TALL.vertices)), registered=registered)
 
 
 @pytest.mark.parametrize("errors", [(0.7, 0.02), (0.001,), ()])
@@ -146,8 +180,9 @@ def test_viewer_bundle_is_current_licensed_and_safe_to_embed() -> None:
     assert license.strip() in viewer and "MIT" in license
     # The script must not end the script element early, and must not open a comment that hides the end tag.
     assert "</script" not in viewer.lower() and "<!--" not in viewer
-    # The bundle was built from the current viewer.js.
-    source = (ROOT / "scripts" / "build_viewer" / "viewer.js").read_bytes()
-    assert f"Built from viewer.js with SHA-256 {hashlib.sha256(source).hexdigest()}." in viewer
+    # The bundle was built from the current sources.
+    sources = sorted((ROOT / "scripts" / "build_viewer").glob("*.js"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    assert f"Built from the viewer's sources with SHA-256 {digest}." in viewer
     lock = json.loads((ROOT / "scripts" / "build_viewer" / "package-lock.json").read_text("utf-8"))
     assert all("resolved" not in package for package in lock["packages"].values())

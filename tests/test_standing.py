@@ -13,7 +13,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.report.standing import guess_up, stand, stand_pair
+from jaxsmw.report.standing import guess_up, placement, stand, stand_pair
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
@@ -27,6 +27,23 @@ def test_stand_turns_the_named_axis_up(up: Any) -> None:
     assert standing.area == pytest.approx(1)
     used = standing.vertices[: len(TALL.vertices)]
     assert np.allclose(used.min(axis=0), -used.max(axis=0))
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_placement_takes_a_standing_mesh_back_to_its_file(up: Any) -> None:
+    # Vertex 0 has no face, and the body is far from the origin.
+    stray = np.concatenate([[[900.0, 1, 2]], TALL.vertices * [1, 1.3, 0.7]])
+    body = replace(TALL, vertices=40 * stray + [1e4, -300, 5], faces=TALL.faces + 1)
+    for standing in (stand(body, up), stand_pair(body, replace(body, vertices=0.5 * body.vertices), up)[0]):
+        matrix, offset = placement(body, standing)
+        assert np.allclose(standing.vertices @ matrix + offset, body.vertices, rtol=0, atol=1e-9)
+        assert np.linalg.det(matrix) > 0
+    # A flat mesh determines the rotation as well.
+    vertices, faces = grid_mesh(5, 4)
+    flat = Mesh(np.asarray(vertices, dtype=float), faces.astype(np.int64))
+    standing = stand(flat, up)
+    matrix, offset = placement(flat, standing)
+    assert np.allclose(standing.vertices @ matrix + offset, flat.vertices, rtol=0, atol=1e-12)
 
 
 # The rotations convert y-up coordinates (x across the body, y up, z forward) to each convention.

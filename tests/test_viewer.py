@@ -1,9 +1,7 @@
 """The page works in a browser with mouse, keyboard and touch."""
 
 import io
-import os
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -13,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.image import imread
+from browser_pages import OpenPage, differ
 from report_helpers import TALL, decode, embedded, renumbered
 
 from jaxsmw.core.banks import Meyer
@@ -31,112 +29,6 @@ from jaxsmw.report.standing import stand_pair
 pytestmark = pytest.mark.browser
 
 HOSTILE = '</script></title><img src=x onerror="window.hacked=1"><b>\'&{{script}}'
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A headless Chromium with software rendering."""
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    driver = shutil.which("chromedriver")
-    if not chromium or not driver:
-        message = "the page is tested in Chromium: install chromium and chromedriver"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for argument in (
-        "--headless=new",
-        "--no-sandbox",
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-dev-shm-usage",
-        "--disable-sync",
-        "--no-first-run",
-        f"--user-data-dir={tmp_path_factory.mktemp('chromium')}",
-    ):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    chrome = webdriver.Chrome(options=options, service=Service(driver))
-    yield chrome
-    chrome.quit()
-
-
-class OpenPage:
-    """A page in the browser, with a method for each action of a user."""
-
-    def __init__(self, browser: Any, path: Path, *, width: int = 840, height: int = 600) -> None:
-        self.browser, self.path = browser, path
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        browser.get(path.as_uri())
-        self.settle()
-
-    def settle(self) -> None:
-        """Waits until the page is drawn."""
-        self.browser.execute_async_script(
-            "const [done] = arguments, next = requestAnimationFrame; next(() => next(() => setTimeout(done, 30)))"
-        )
-
-    def find(self, selector: str) -> Any:
-        return self.browser.find_element("css selector", selector)
-
-    def run(self, script: str, *arguments: Any) -> Any:
-        return self.browser.execute_script(script, *arguments)
-
-    @property
-    def state(self) -> dict[str, Any]:
-        return self.run("return jaxsmw.state")
-
-    @property
-    def readout(self) -> str:
-        return self.find("#readout").text
-
-    def view(self, side: str) -> np.ndarray:
-        """The pixels of one canvas."""
-        self.settle()
-        png = self.find(f"#canvas-{side}").screenshot_as_png
-        return np.round(255 * imread(io.BytesIO(png))[..., :3]).astype(int)
-
-    def place(self, side: str, vertex: int) -> tuple[int, int]:
-        point = self.run("return jaxsmw.project(arguments[0], arguments[1])", side, vertex)
-        return round(point["x"]), round(point["y"])
-
-    def mouse(self) -> Any:
-        from selenium.webdriver.common.action_chains import ActionChains
-
-        return ActionChains(self.browser, duration=30)
-
-    def look_away(self) -> None:
-        """Moves the pointer off the bodies."""
-        self.point_at(3, 3, click=False)
-
-    def point_at(self, x: int, y: int, *, click: bool) -> None:
-        actions = self.mouse()
-        actions.w3c_actions.pointer_action.move_to_location(x, y)
-        if click:
-            actions.w3c_actions.pointer_action.click()
-        actions.perform()
-        self.settle()
-
-    def drag(self, side: str, across: int) -> None:
-        canvas = self.find(f"#canvas-{side}")
-        self.mouse().move_to_element(canvas).click_and_hold().move_by_offset(across, 0).release().perform()
-        self.settle()
-
-    def choose(self, mode: str) -> None:
-        self.find(f"input[value={mode}]").click()
-        self.settle()
-
-
-def differ(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the share of pixels that differ visibly."""
-    return float(np.mean(np.abs(a - b).max(axis=2) > 8)) if a.shape == b.shape else 1.0
 
 
 # This shape is irregular, so its views and vertices differ clearly.
@@ -329,6 +221,7 @@ def test_page_fits_small_screens_in_both_color_schemes(browser: Any, page_file: 
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     page = OpenPage(browser, page_file, width=375, height=667)
     assert page.run("return document.documentElement.scrollWidth") <= 375
+    page.run("document.querySelector('.bodies').scrollIntoView()")
     for side in "xy":
         box = page.find(f"#canvas-{side}").rect
         assert box["x"] >= 0 and box["x"] + box["width"] <= 375 and box["width"] > 120
@@ -701,7 +594,7 @@ def test_every_control_works_with_the_keyboard(comparison: OpenPage) -> None:
     comparison.find("h1").click()
     comparison.run("getSelection().setPosition(document.body, 0)")
     reached: list[str] = []
-    for _ in range(12):
+    for _ in range(14):
         comparison.mouse().send_keys(Keys.TAB).perform()
         name, outline = comparison.run(
             "const e = document.activeElement, shown = e.type === 'radio' ? e.parentElement : e;"
@@ -712,7 +605,8 @@ def test_every_control_works_with_the_keyboard(comparison: OpenPage) -> None:
         assert outline not in ("none", ""), f"{name} does not show that it has the focus"
         reached.append(name)
     assert reached == [
-        "map", "mode", "filter", "linked", "reset", "vertex", "canvas-x", "canvas-y", "matrix", "table",
+        "help-open", "map", "mode", "filter", "linked", "reset", "landmark-mode", "vertex", "canvas-x", "canvas-y",
+        "matrix", "table",
     ]  # fmt: skip
     for selector, keys, key, value in (
         ("input[name=map]", Keys.ARROW_RIGHT, "map", "bad"),

@@ -31,7 +31,8 @@ from jaxsmw.report.page_data import (
     encode_bytes,
     encode_colors,
     encode_functional_map,
-    encode_mesh,
+    encode_registered,
+    encode_shape,
     spectra_on_page,
 )
 from jaxsmw.report.rendering import ELEVATION, choose_azimuth
@@ -40,6 +41,9 @@ from jaxsmw.runtime.files import atomic_write
 
 # If the bodies are wider than this multiple of their height, narrow screens show one body above the other.
 _WIDE = 0.65
+
+EXPECTED_ERROR = "Expected error"
+"""The name of the errors in `ShownMap.errors` from which the page suggests places for landmarks."""
 
 _EXPLANATIONS = {
     "transfer": (
@@ -103,8 +107,12 @@ def write_page(
     error_limit: float = ERROR_LIMIT,
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
+    registered: Float[np.ndarray, "m 3"] | None = None,
 ) -> None:
     """Writes a web page that shows both bodies in 3D and colours them by one map at a time.
+
+    On the page, a user can place landmarks, and load and save landmark files in the coordinates of the mesh
+    files. If a map has errors named `EXPECTED_ERROR`, the page suggests places for landmarks.
 
     The page also shows the match of the point under the pointer. If spectra are given, the page can show the
     wavelets of a refiner's filter bank. The wavelet of scale l around a vertex y is the function
@@ -137,23 +145,32 @@ def write_page(
     - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
+    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file; None (the
+      default) for a page without them. The page can draw X over Y at these positions, and a slider moves X
+      there from its own shape. The positions take 16 bytes per vertex.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
-    positive, `up` is not an axis, or the file cannot be written.
+    positive, `up` is not an axis, the registered positions do not fit X, or the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one map.")
     check_error_limit(error_limit)
     encoded = [_encode_map(name, shown, mesh_x, mesh_y) for name, shown in maps.items()]
     error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
-    data = _encode_shapes(*stand_pair(mesh_x, mesh_y, up)) | {
+    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
+    data = _encode_view(shown_x, shown_y) | {
+        "x": encode_shape(mesh_x, shown_x),
+        "y": encode_shape(mesh_y, shown_y),
         "maps": encoded,
         "plain": np.round(255 * PLAIN).astype(int).tolist(),
         "scales": {name: encode_colors(colors) for name, colors in COLOR_SCALES.items()},
         "limit": error_limit,
         "error_names": error_names,
+        "expected": EXPECTED_ERROR,
     }
+    if registered is not None:
+        data["registered"] = encode_registered(registered, mesh_x, mesh_y, shown_y)
     filters = _add_wavelets(data, mesh_x, mesh_y, spectra, refiner)
     modes = _modes(maps, error_names, has_spectra=filters > 0)
     fragments = {
@@ -175,14 +192,12 @@ def write_page(
         temporary.write_bytes(page.encode("utf-8", "replace"))
 
 
-def _encode_shapes(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """The data from which the viewer draws two upright meshes: the meshes, their colours and the camera."""
+def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
+    """The data from which the viewer looks at two upright meshes: the colours and the camera."""
     reach = np.max(
         [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
     )
     return {
-        "x": encode_mesh(shown_x),
-        "y": encode_mesh(shown_y),
         "colors": encode_colors(position_colors(shown_y)),
         "azimuth": choose_azimuth([shown_x, shown_y]),
         "elevation": ELEVATION,

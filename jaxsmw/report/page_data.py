@@ -14,7 +14,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.pair import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
-from jaxsmw.report.inputs import check_functional_map
+from jaxsmw.report.inputs import check_functional_map, describe
+from jaxsmw.report.standing import placement
 
 # A page contains between `_FEWEST` and `_EIGENVECTORS` eigenvectors per shape, or no eigenvectors. The
 # eigenvectors of both shapes together have at most `_VALUES` entries, which take one byte each before
@@ -85,6 +86,52 @@ def encode(array: Shaped[np.ndarray, " *shape"], dtype: str) -> str:
 def encode_mesh(mesh: Mesh) -> dict[str, Any]:
     """Encodes the vertices of a mesh as float32 and the faces as uint32, both in base64."""
     return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
+
+
+def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
+    """Encodes a shape: its upright mesh, its name, and the similarity that takes the page back to the file.
+
+    The page shows positions in float32. The page computes a point on a triangle from the shown corners in
+    float64, and takes this point to the coordinates of the file by the similarity in float64
+    (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times the diagonal of the
+    bounding box, plus the float64 rounding of the file's own coordinates.
+
+    **Arguments:**
+
+    - `mesh`: the mesh in the coordinates of its file.
+    - `standing`: the same mesh as shown, from `jaxsmw.report.standing.stand_pair`.
+    """
+    matrix, offset = placement(mesh, standing)
+    return encode_mesh(standing) | {
+        "name": describe(mesh)[0],
+        "placement": {"matrix": matrix.tolist(), "offset": offset.tolist()},
+    }
+
+
+def encode_registered(
+    registered: Float[np.ndarray, "m 3"], mesh_x: Mesh, mesh_y: Mesh, standing_y: Mesh
+) -> str:
+    """Encodes the positions of X's vertices on Y, in the coordinates of Y's file, for the upright target.
+
+    **Arguments:**
+
+    - `registered`: the positions (m, 3), in the unit of Y's file.
+    - `mesh_x`, `mesh_y`: X (m vertices) and Y, in the coordinates of their files.
+    - `standing_y`: Y as shown.
+
+    **Returns:** The positions on the page as float32 in base64.
+
+    **Raises:** `InputError` if the positions are not three finite numbers for every vertex of X.
+    """
+    positions = np.asarray(registered, dtype=float)
+    if positions.shape != mesh_x.vertices.shape or not np.isfinite(positions).all():
+        raise InputError(
+            f"the registered positions have shape {positions.shape}, and {np.sum(~np.isfinite(positions))} "
+            f"entries are not finite; give three finite numbers for each of the {len(mesh_x.vertices)} "
+            f"vertices of {mesh_x.name}."
+        )
+    matrix, offset = placement(mesh_y, standing_y)
+    return encode((positions - offset) @ np.linalg.inv(matrix), "<f4")
 
 
 def encode_colors(colors: Float64[np.ndarray, "n 3"]) -> str:

@@ -111,6 +111,25 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
     return standing_x, standing_y
 
 
+def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
+    """The similarity that takes a standing mesh back to its file: `file = standing @ matrix + offset`.
+
+    **Arguments:**
+
+    - `mesh`: the mesh as read from its file.
+    - `standing`: the result of `stand` or `stand_pair` for this mesh.
+
+    **Returns:** The matrix (3, 3), a rotation times the scale, and the offset (3,), in the unit of the file.
+    """
+    used = mesh.referenced_vertices
+    scale = np.sqrt(mesh.area / standing.area)
+    # `stand` turns every mesh by one of these rotations. Only the right one leaves a constant offset.
+    matrices = [scale * np.array(rows, dtype=float) for rows in _STAND.values()]
+    offsets = [mesh.vertices[used] - standing.vertices[used] @ matrix for matrix in matrices]
+    best = min(range(len(matrices)), key=lambda i: float(np.ptp(offsets[i], axis=0).max()))
+    return matrices[best], offsets[best].mean(axis=0)
+
+
 def guess_up(mesh: Mesh) -> Axis:
     """Guesses which axis of the file points up, from the limbs on which the body stands.
 

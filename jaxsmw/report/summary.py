@@ -34,7 +34,7 @@ from jaxsmw.report.figures import (
     save_figure,
 )
 from jaxsmw.report.inputs import check_map
-from jaxsmw.report.page import ShownMap, write_page
+from jaxsmw.report.page import EXPECTED_ERROR, ShownMap, write_page
 from jaxsmw.report.page_data import eigenvectors_on_page
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import atomic_write, make_directory
@@ -64,7 +64,7 @@ _FILTERS_CAPTION = (
 )
 _ERROR_MEANINGS = {
     "Error": "The distance along the surface between each match and the true point on the target.",
-    "Expected error": (
+    EXPECTED_ERROR: (
         "An estimate of the distance between each match and the true point on the target. The estimate does "
         "not use the true points."
     ),
@@ -130,6 +130,7 @@ def write_report(
         error_meanings=_ERROR_MEANINGS,
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
+        registered=_registered(correspondence),
     )
     summary = {
         "settings": dict(settings or {}),
@@ -157,7 +158,7 @@ def _shown_maps(
     final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
     refined = ShownMap(
         correspondence.pointwise_map,
-        _named_errors(final, m) | {"Expected error": expected_error},
+        _named_errors(final, m) | {EXPECTED_ERROR: expected_error},
         correspondence.functional_map,
         convention,
         _error_statistics(final),
@@ -170,6 +171,13 @@ def _shown_maps(
         _error_statistics(initial),
     )
     return {"refined": refined, "initial": before}
+
+
+def _registered(correspondence: Correspondence) -> Float64[np.ndarray, "m 3"]:
+    """The positions of X's vertices on Y: their matches as points on triangles."""
+    points, mesh_y = correspondence.surface_points(), correspondence.mesh_y
+    corners = mesh_y.vertices[mesh_y.faces[points.faces]]
+    return np.einsum("mc,mcd->md", points.weights, corners)
 
 
 def _save_figures(

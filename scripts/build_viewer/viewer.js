@@ -1,6 +1,6 @@
 // The interactive page: two bodies in 3D, the match of the vertex under the pointer, wavelets around both, and the
-// functional map. build.mjs bundles this file with three.js into jaxsmw/report/assets/viewer.js, which page.html
-// embeds.
+// functional map. Other modules add landmarks and the registered source. build.mjs bundles all of them with three.js
+// into jaxsmw/report/assets/viewer.js, which page.html embeds.
 
 import {
   AmbientLight,
@@ -27,12 +27,17 @@ import {
   WebGLRenderer,
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { startHelp } from "./help.js";
+import { startLandmarks } from "./landmarks.js";
+import { startRegistered } from "./registered.js";
+import { Surface } from "./surface.js";
 
 const FIELD_OF_VIEW = 25;
 // The caption covers the top of the canvas. The body may use this share of the upper half.
 const BELOW_CAPTION = 0.85;
 const KEY_TURN = Math.PI / 18;
 const KEY_ZOOM = 1.15;
+const HIDDEN = 0.01; // a point is hidden if the surface is in front of it by this share of the diagonal
 const CLICK_TOLERANCE = 5; // the most pixels that the pointer moves between press and release of a click
 const NAMED_VERTICES = 12; // the most source vertices that are listed for one target vertex
 const WITHIN_SCALE = 0.98; // the share of values inside the colour scale of a function; the rest is clipped
@@ -105,6 +110,8 @@ class Body {
     this.controls.enableDamping = false;
     this.marked = [];
     this.marks = [];
+    this.overlays = []; // further objects in the scene, which are placed before each picture
+    this.shape = new Surface(this.positions, geometry.index.array);
   }
 
   /** Adds lamps that move with the viewer, so that the visible side is always well lit. */
@@ -158,14 +165,19 @@ class Body {
     if (indices.length) this.scene.add(...this.marks);
   }
 
+  /** The length at a point of the scene that covers one pixel of the screen. */
+  pixelAt(point) {
+    const height = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / this.canvas.clientHeight;
+    return height * this.camera.position.distanceTo(point);
+  }
+
   /** Places the marks so that they keep their size on the screen at every distance. */
   #placeMarks() {
-    const pixel = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / this.canvas.clientHeight;
     const pixels = this.marked.length > 1 ? 4.5 : 6;
     this.marked.forEach((index, i) => {
       const center = this.vertex(index);
       const towards = this.camera.position.clone().sub(center);
-      const radius = pixels * pixel * towards.length();
+      const radius = pixels * this.pixelAt(center);
       // Move the mark towards the viewer, so that the surface does not cut into it.
       center.addScaledVector(towards.normalize(), 2 * radius);
       const matrix = new Matrix4().makeScale(radius, radius, radius).setPosition(center);
@@ -192,25 +204,44 @@ class Body {
     return 1.08 * distance;
   }
 
+  /** The point of the surface under the pointer, as { face, weights }, or null. */
+  pointAt(event) {
+    const hit = this.#hit(event);
+    return hit && this.shape.onFace(hit.faceIndex, hit.point.toArray());
+  }
+
   /** The vertex under the pointer, or null. */
   vertexAt(event) {
+    const point = this.pointAt(event);
+    return point && this.shape.nearestCorner(point);
+  }
+
+  /** Whether the surface hides a point on it from the camera. */
+  hides(position) {
+    const { x, y } = this.projectPoint(position);
+    const hit = this.#hit({ clientX: x, clientY: y });
+    const distance = this.camera.position.distanceTo(new Vector3(...position));
+    return Boolean(hit) && hit.distance < distance - HIDDEN * this.shape.diagonal;
+  }
+
+  #hit(event) {
     const box = this.canvas.getBoundingClientRect();
     const x = (2 * (event.clientX - box.left)) / box.width - 1;
     const y = 1 - (2 * (event.clientY - box.top)) / box.height;
     const raycaster = new Raycaster();
     raycaster.setFromCamera(new Vector2(x, y), this.camera);
-    const [hit] = raycaster.intersectObject(this.surface);
-    if (!hit) return null;
-    const corners = [hit.face.a, hit.face.b, hit.face.c];
-    const distances = corners.map((corner) => this.vertex(corner).distanceTo(hit.point));
-    return corners[distances.indexOf(Math.min(...distances))];
+    return raycaster.intersectObject(this.surface)[0] ?? null;
   }
 
   /** The position of a vertex in the window, in CSS pixels. */
   project(index) {
+    return this.projectPoint(this.vertex(index).toArray());
+  }
+
+  projectPoint(position) {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
-    const { x, y } = this.vertex(index).project(this.camera);
+    const { x, y } = new Vector3(...position).project(this.camera);
     return { x: box.left + ((x + 1) / 2) * box.width, y: box.top + ((1 - y) / 2) * box.height };
   }
 
@@ -224,9 +255,12 @@ class Body {
 
   render() {
     this.#placeMarks();
+    for (const overlay of this.overlays) overlay.place();
     this.renderer.render(this.scene, this.camera);
   }
 }
+
+startHelp();
 
 let bodies;
 try {
@@ -572,6 +606,17 @@ function resetView() {
   untouched = true;
 }
 
+/** Turns the bodies so that these surface points, { x, y }, face the viewer. */
+function turnTowards(points) {
+  for (const [side, point] of Object.entries(points)) {
+    if (!point || (side === "y" && byId("linked").checked)) continue;
+    const body = bodies[side];
+    const distance = body.camera.position.distanceTo(body.controls.target);
+    turnTo(body, new Vector3(...body.shape.viewOf(point)).setLength(distance));
+  }
+  untouched = false;
+}
+
 let leader = null; // the body that the other body follows at the moment
 function follow(body) {
   draw();
@@ -591,6 +636,7 @@ const zooms = { "+": 1 / KEY_ZOOM, "=": 1 / KEY_ZOOM, "-": KEY_ZOOM };
 
 function onKey(body, event) {
   if (event.altKey || event.ctrlKey || event.metaKey) return;
+  if (landmarks.onKey(body, event)) return;
   if (turns[event.key] || zooms[event.key]) {
     const [around, over] = turns[event.key] ?? [0, 0];
     const { controls, camera } = body;
@@ -623,12 +669,13 @@ for (const [side, body] of Object.entries(bodies)) {
   canvas.addEventListener("pointerdown", (event) => (pressed = { x: event.clientX, y: event.clientY }));
   canvas.addEventListener("click", (event) => {
     if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) > CLICK_TOLERANCE) return;
-    pin(side, body.vertexAt(event));
+    if (landmarks.active) landmarks.onClick(side, body.pointAt(event));
+    else pin(side, body.vertexAt(event));
   });
 
   let hovered = null; // the latest position of the pointer that has not been handled yet
   canvas.addEventListener("pointermove", (event) => {
-    if (state.pinned || event.buttons || event.pointerType === "touch") return;
+    if (state.pinned || landmarks.active || event.buttons || event.pointerType === "touch") return;
     if (!hovered) {
       requestAnimationFrame(() => {
         if (hovered && !state.pinned) pick(side, body.vertexAt(hovered));
@@ -701,16 +748,22 @@ const observer = new ResizeObserver(() => {
 });
 for (const body of everyBody) observer.observe(body.canvas);
 
+const landmarks = startLandmarks({ bodies, data, draw, turnTowards, unpin: () => pin("x", null), currentMap: () => maps[state.map], maps });
+startRegistered({ bodies, data, draw });
+
 byId("filter").disabled = filters < 2;
 chooseFilter();
 chooseMap(0);
 
-// For scripts and tests: pick a source vertex, and read the state, the colours and the position of a vertex in the
-// window.
+// For scripts and tests: pick a source vertex, and read the state, the colours, the landmarks and the position of a
+// vertex in the window.
 window.jaxsmw = {
   pick: (vertex) => pin("x", vertex),
   project: (side, vertex) => bodies[side].project(vertex),
   colors: (side) => Array.from(bodies[side].colors),
+  get landmarks() {
+    return landmarks.report();
+  },
   get functions() {
     return { x: functions.x && Array.from(functions.x), y: functions.y && Array.from(functions.y) };
   },
