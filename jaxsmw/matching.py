@@ -20,7 +20,7 @@ from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.core.triangles import nearest_point_on_triangles
+from jaxsmw.core.triangles import nearest_point_on_candidates, nearest_point_on_triangles
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
@@ -35,9 +35,14 @@ from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import padded_size
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
+from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
+
+# The geometric mean of the numbers of vertices above which surface points are searched around matches only.
+_ALL_TRIANGLES_UP_TO = 15_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,16 +119,49 @@ class Correspondence:
         `pointwise_map` contains the nearest vertex of Y. An unreferenced vertex of X receives the point of
         the nearest referenced vertex.
 
+        If the geometric mean of the numbers of vertices is above 15 000, only the triangles around the match
+        in `pointwise_map` are searched, because a search of all triangles takes minutes.
+
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
+        queries, database = self._embeddings()
+        faces_y = jax.device_put(self.mesh_y.faces)
         with self._precision():
-            faces, traced_weights = compiled(nearest_point_on_triangles)(
-                *self._embeddings(), jax.device_put(self.mesh_y.faces)
-            )
+            if len(queries) * len(database) < _ALL_TRIANGLES_UP_TO**2:
+                found = compiled(nearest_point_on_triangles)(queries, database, faces_y)
+            else:
+                rows, candidates = self.mesh_y.faces_around(self.pointwise_map)
+                padding = padded_size(len(rows)) - len(rows)
+                rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
+                found = compiled(nearest_point_on_candidates)(
+                    queries, database, faces_y, *jax.device_put((rows, candidates))
+                )
+        faces, traced_weights = found
         # Rounding errors can make weights negative.
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
+
+    def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
+        """Deform X onto Y, so that its vertices follow `surface_points`; see `jaxsmw.transfer.register_mesh`.
+
+        **Arguments:**
+
+        - `stiffness`: a positive length in units of the square root of Y's area, below which noise of the map
+          is smoothed. The default is 0.003.
+
+        **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the unit
+        of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
+
+        **Raises:** `InputError` if the stiffness is not positive and finite.
+        """
+        return register_mesh(
+            self.mesh_x,
+            self.mesh_y,
+            self.surface_points(),
+            stiffness=stiffness,
+            same_unit=self.pair.partial,
+        )
 
     def one_to_one(self) -> Int64[np.ndarray, " m"]:
         """Compute a map in which no two referenced vertices of X share a match.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.products import product
@@ -11,6 +13,8 @@ from jaxsmw.core.search import in_blocks
 # The number of queries per block. Memory contains the distances from all queries of one block to all
 # triangles.
 _BLOCK = 32
+# The number of pairs of a query and a triangle per block, if the triangles are given.
+_PAIRS = 4096
 
 
 def nearest_point_on_triangles(
@@ -63,6 +67,43 @@ def nearest_point_on_triangles(
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
     _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
     return found, jnp.stack([1 - s - t, s, t], axis=1)
+
+
+def nearest_point_on_candidates(
+    queries: Float[Array, "m d"],
+    points: Float[Array, "n d"],
+    faces: Int[Array, "f 3"],
+    rows: Int[Array, " p"],
+    candidates: Int[Array, " p"],
+) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
+    """Finds, for each query, the nearest point on some triangles of a set, in a space of any dimension.
+
+    The time grows with the number of candidates, not with the number of all triangles.
+
+    **Arguments:**
+
+    - `queries`, `points`, `faces`: (m, d), (n, d) and (f, 3), as in `nearest_point_on_triangles`.
+    - `rows`: (p,), for each candidate the index of its query. Every query needs at least one candidate.
+    - `candidates`: (p,), the triangles to compare the query with, as indices of `faces`.
+
+    **Returns:** For the nearest point of each query, the triangle (m,), int32, and the barycentric weights
+    (m, 3).
+    """
+
+    def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:
+        row, face = pair
+        corners = points[faces[face]]
+        edges, away = corners[1:] - corners[0], queries[row] - corners[0]
+        along, gram = edges @ away, edges @ edges.T
+        squared, s, t = _closest(away @ away, along[0], along[1], gram[0, 0], gram[0, 1], gram[1, 1])
+        return squared, jnp.stack([s, t])
+
+    squared, inside = lax.map(compare, (rows, candidates), batch_size=_PAIRS)
+    m, p = queries.shape[0], rows.shape[0]
+    least = jax.ops.segment_min(squared, rows, m)
+    best = jax.ops.segment_min(jnp.where(squared == least[rows], jnp.arange(p), p), rows, m)
+    weights = jnp.stack([1 - inside[best, 0] - inside[best, 1], inside[best, 0], inside[best, 1]], axis=1)
+    return candidates[best].astype(jnp.int32), weights
 
 
 def _closest(

@@ -171,6 +171,21 @@ class Mesh:
         balance = np.bincount(edge_of_side, weights=np.sign(head - tail))
         return _EdgeTable(np.stack(np.divmod(key, n), axis=1), faces, balance)
 
+    def faces_around(
+        self, vertices: Int64[np.ndarray, " q"]
+    ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
+        """Return all pairs of a given vertex and a face around it.
+
+        **Returns:** For each of p pairs, the index of the vertex in `vertices` (p,) and the face (p,).
+        """
+        faces = np.argsort(self.faces.ravel(), kind="stable") // 3
+        counts = np.bincount(self.faces.ravel(), minlength=len(self.vertices))
+        number = counts[vertices]
+        rows = np.repeat(np.arange(len(vertices)), number)
+        first = np.cumsum(counts) - counts
+        position = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
+        return rows, faces[first[vertices][rows] + position]
+
     def _sum_at_vertices(self, per_face: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " n"]:
         return np.bincount(self.faces.ravel(), weights=np.repeat(per_face, 3), minlength=len(self.vertices))
 
