@@ -31,6 +31,13 @@ GeodesicMethod = Literal["strips", "exact"]
 IndexBase = Literal[0, 1]
 """The possible indices of the first vertex in a file."""
 
+CoordinateSystem = Literal["LPS", "RAS"]
+"""The names of the coordinate systems of medical images; the letters say where x, y and z increase.
+
+LPS means left, posterior (back), superior (up); RAS means right, anterior (front), superior. A change between
+them reverses the signs of x and y.
+"""
+
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
 

@@ -150,8 +150,8 @@ class Correspondence:
         - `stiffness`: a positive length in units of the square root of Y's area, below which noise of the map
           is smoothed. The default is 0.003.
 
-        **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the unit
-        of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
+        **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
+        unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
 
         **Raises:** `InputError` if the stiffness is not positive and finite.
         """

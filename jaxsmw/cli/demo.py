@@ -7,7 +7,7 @@ import argparse
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import initial_map_file
+from jaxsmw.cli.inputs import initial_map_files
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 
@@ -85,4 +85,4 @@ def _check_output(options: argparse.Namespace) -> None:
     check_drawable()
     from jaxsmw.report.summary import REPORT_FILES
 
-    check_outputs([initial_map_file(options.init)], directories=[(options.output, (*_FILES, *REPORT_FILES))])
+    check_outputs(initial_map_files(options.init), directories=[(options.output, (*_FILES, *REPORT_FILES))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -73,25 +74,31 @@ def read_maps(
 def initial_map(text: str) -> str:
     """Return `text` if the option `--init` accepts this value.
 
-    The option accepts the names of initial maps, `landmarks:FILE` and `map:FILE`.
+    The option accepts the names of initial maps, `landmarks:FILE`, `landmarks:SOURCE_FILE,TARGET_FILE` and
+    `map:FILE`.
 
     **Raises:** `argparse.ArgumentTypeError` for any other text.
     """
     kind, _, file = text.partition(":")
-    if file and kind in _INITIAL_MAP_FILES:
-        path(file)
+    if file and kind in ("landmarks", "map"):
+        for name in initial_map_files(text):
+            path(name)
     elif text not in get_args(InitialMap):
-        choices = (*get_args(InitialMap), *(f"{kind}:FILE" for kind in _INITIAL_MAP_FILES))
+        choices = (*get_args(InitialMap), "landmarks:FILE", "landmarks:SOURCE_FILE,TARGET_FILE", "map:FILE")
         raise argparse.ArgumentTypeError(f"{text!r} is not an initial map: choose from {', '.join(choices)}")
     return text
 
 
-_INITIAL_MAP_FILES = ("landmarks", "map")
+def initial_map_files(init: str) -> list[str]:
+    """Return the names of the files in a value of `--init`.
 
-
-def initial_map_file(init: str) -> str | None:
-    """Return the file name in a value of `--init`, or None if the value contains no file name."""
-    return init.partition(":")[2] or None
+    The list has two names for `landmarks:SOURCE_FILE,TARGET_FILE`, unless a file has a name with a comma.
+    """
+    kind, _, file = init.partition(":")
+    source, _, target = file.partition(",")
+    if kind == "landmarks" and source and target and not os.path.lexists(file):
+        return [source, target]
+    return [file] if file else []
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
@@ -103,12 +110,34 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
     """
     from jaxsmw.io.map_files import read_landmarks, read_pointwise_map
 
-    kind, _, file = init.partition(":")
-    if not file:
-        return init
-    _note_index_base(file, index_base)
-    read = read_landmarks if kind == "landmarks" else read_pointwise_map
-    return read(file, mesh_x, mesh_y, index_base=index_base)
+    match initial_map_files(init):
+        case []:
+            return init
+        case [file]:
+            _note_index_base(file, index_base)
+            read = read_landmarks if init.startswith("landmarks:") else read_pointwise_map
+            return read(file, mesh_x, mesh_y, index_base=index_base)
+        case files:
+            return _read_landmark_files(files, (mesh_x, mesh_y))
+
+
+def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
+    """Read landmarks on the source and on the target, and match them by name.
+
+    **Returns:** For each name in both files, the nearest vertex of X and of Y, an array (l, 2).
+    """
+    from jaxsmw.io.landmark_files import read_landmark_file
+    from jaxsmw.io.landmarks import match_landmarks
+    from jaxsmw.transfer.landmarks import nearest_vertices
+
+    both = [read_landmark_file(file) for file in files]
+    matched = match_landmarks(*both)
+    for landmarks, alone in zip(both, (matched.only_first, matched.only_second), strict=True):
+        for note in landmarks.notes:
+            report_progress(f"{landmarks.name}: {note}")
+        if alone:
+            say(f"note: {landmarks.name}: {len(alone)} landmarks without a partner, such as {alone[0]!a}.")
+    return nearest_vertices(both[0].select(matched.names), both[1].select(matched.names), *meshes)
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:

@@ -17,7 +17,7 @@ from jaxsmw.cli.arguments import (
 )
 from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress
-from jaxsmw.cli.inputs import initial_map_file, read_mesh_file, read_truth
+from jaxsmw.cli.inputs import initial_map_files, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
@@ -118,11 +118,11 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    init_file = initial_map_file(options.init)
+    init_files = initial_map_files(options.init)
     check_preset(options)
     check_evaluation(options)
     refuse_without(options, "--report", bool(options.report), "up")
-    reads_indices = bool(options.ground_truth or init_file)
+    reads_indices = bool(options.ground_truth or init_files)
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
     points, expected = options.surface_points, options.expected_error
     if points and Path(points).suffix != ".baryc_gt":
@@ -138,7 +138,7 @@ def _check(options: argparse.Namespace) -> None:
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
     check_outputs(
-        [options.source, options.target, init_file, *(options.ground_truth or ())],
+        [options.source, options.target, *init_files, *(options.ground_truth or ())],
         files=[options.output, points, options.one_to_one, expected],
         directories=_directories(options),
     )

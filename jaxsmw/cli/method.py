@@ -60,11 +60,13 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         metavar="INITIAL_MAP",
         type=initial_map,
         default=DEFAULT_INITIAL_MAP,
-        help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE or map:FILE (default: "
+        help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE, "
+        "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
         "%(default)s). With shot, wks, hks and wavelet, each source vertex is matched to the target vertex "
         "with the most similar descriptor. functional computes a functional map that preserves SHOT "
-        "descriptors. A landmarks file has a source and a target vertex per line. Of these initial maps, "
-        "only shot, functional and landmarks distinguish left from right",
+        "descriptors. A landmarks file has a source and a target vertex per line. Two landmark "
+        "files contain named points on the source and on the target, in the formats of "
+        "transfer --landmarks. Of these initial maps, only shot, functional and landmarks distinguish left from right",
     )
     group.add_argument(
         "--preset",
@@ -148,6 +150,13 @@ def preset_name(options: argparse.Namespace) -> PresetName:
     Otherwise, the default preset is used.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
+
+
+def given_method(options: argparse.Namespace) -> list[str]:
+    """Return the names of the given options that have no effect without a match, such as `--preset`."""
+    given = _changes(options)
+    given += ["--preset"] if options.preset else []
+    return given + (["--init"] if options.init != DEFAULT_INITIAL_MAP else [])
 
 
 def _changes(options: argparse.Namespace) -> list[str]:

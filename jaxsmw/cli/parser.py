@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum
+from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum, transfer
 from jaxsmw.cli.arguments import add_quiet
 from jaxsmw.cli.console import say, show
 
@@ -15,6 +15,7 @@ from jaxsmw.cli.console import say, show
 _COMMANDS = {
     "demo": demo,
     "match": match,
+    "transfer": transfer,
     "evaluate": evaluate,
     "benchmark": benchmark,
     "spectrum": spectrum,

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.landmarks import CoordinateSystem, Landmarks, first_faulty_name, usable
+from jaxsmw.io.landmarks import Landmarks, first_faulty_name, usable
 from jaxsmw.io.text import is_number
 
 MOST_LANDMARKS = 2**20

@@ -92,7 +92,7 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
     `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the coordinate system of
     the landmarks is None.
     """
-    suffix = _suffix(path, list(_WRITERS))
+    suffix = check_landmark_suffix(path)
     if landmarks.coordinates is None and suffix in _WITH_SYSTEM:
         raise InputError(
             f"{path}: {suffix} files state a coordinate system, but the one of {landmarks.name} is not "
@@ -106,6 +106,14 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
     _check_size(path, len(data), suffix)
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
+
+
+def check_landmark_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a landmark file to be written, in lower case.
+
+    **Raises:** `InputError` if landmarks cannot be written in the format of the suffix.
+    """
+    return _suffix(path, list(_WRITERS))
 
 
 def _suffix(path: str | os.PathLike[str], known: list[str]) -> str:

@@ -12,10 +12,11 @@ import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
-from jaxsmw.io.landmarks import CoordinateSystem, Landmarks
+from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
 
 _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")

@@ -5,21 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
+from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import LARGEST_EXTENT, Mesh
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to_surface
-
-CoordinateSystem = Literal["LPS", "RAS"]
-"""The names of the coordinate systems of medical images; the letters say where x, y and z increase.
-
-LPS means left, posterior (back), superior (up); RAS means right, anterior (front), superior. A change between
-them reverses the signs of x and y.
-"""
 
 # Mean distances to the surface, as fractions of the diagonal of the mesh. Landmarks in the wrong coordinate
 # system are above `FAR`. Landmarks in the right one are below `NEAR`, like all landmarks of the data sets.
@@ -96,6 +90,19 @@ class Landmarks:
                 f"converted to {coordinates}: use them as they are, or state their coordinate system."
             )
         return self if self.coordinates == coordinates else self.flipped()
+
+    def stated(self, coordinates: CoordinateSystem) -> Landmarks:
+        """Return the same positions, with a coordinate system that their file does not state.
+
+        **Raises:** `InputError` if the file states the other coordinate system.
+        """
+        check_choice(coordinates, CoordinateSystem, "a coordinate system")
+        if self.coordinates not in (None, coordinates):
+            raise InputError(
+                f"{self.name}: states {self.coordinates} coordinates, not {coordinates}: convert the "
+                "landmarks."
+            )
+        return replace(self, coordinates=coordinates)
 
     def select(self, names: Sequence[str]) -> Landmarks:
         """Return the landmarks with the given names, in the order of the names.

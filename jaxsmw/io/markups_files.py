@@ -11,10 +11,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmark_entries import Entries, left_out
-from jaxsmw.io.landmarks import CoordinateSystem, Landmarks
+from jaxsmw.io.landmarks import Landmarks
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"

@@ -161,6 +161,18 @@ def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarra
     return values[polygon]
 
 
+def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
+    """Check that a mesh can be written in the format of a file's suffix.
+
+    **Raises:** `InputError` if the suffix belongs to no format.
+    """
+    if Path(path).suffix.lower() not in _FORMATTERS:
+        raise InputError(
+            f"{path}: meshes cannot be written as {Path(path).suffix!r}: choose a name that ends in "
+            f"{', '.join(_FORMATTERS)}."
+        )
+
+
 def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
     """Write a mesh together with all data on its vertices and faces.
 
@@ -187,14 +199,9 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     be written.
     """
     path = Path(path)
-    form = _FORMATTERS.get(path.suffix.lower())
-    if form is None:
-        raise InputError(
-            f"{path}: meshes cannot be written as {path.suffix!r}: choose a name that ends in "
-            f"{', '.join(_FORMATTERS)}."
-        )
+    check_mesh_suffix(path)
     try:
-        written = form(data)
+        written = _FORMATTERS[path.suffix.lower()](data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     with atomic_write(path) as temporary:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.io.landmarks import Landmarks, check_frame
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
@@ -73,3 +74,26 @@ def transfer_landmarks(
         landmarks, positions=images.positions(mesh_y), name=f"landmarks on {mesh_y.name}", notes=()
     )
     return TransferredLandmarks(moved, distances, errors, notes)
+
+
+def nearest_vertices(
+    landmarks_x: Landmarks, landmarks_y: Landmarks, mesh_x: Mesh, mesh_y: Mesh
+) -> Int64[np.ndarray, "l 2"]:
+    """Return landmarks with equal names as pairs of vertices, as `match` accepts them as the initial map.
+
+    **Arguments:**
+
+    - `landmarks_x`, `landmarks_y`: l `Landmarks` on X and on Y with the same names in the same order.
+    - `mesh_x`, `mesh_y`: the source X and the target Y.
+
+    **Returns:** For each landmark the corner of the nearest face that is nearest to it, as a 0-based
+    vertex of X and of Y (l, 2).
+
+    **Raises:** `InputError` if landmarks lie off their surface, but on it in the other coordinate system.
+    """
+    pairs = []
+    for landmarks, mesh in ((landmarks_x, mesh_x), (landmarks_y, mesh_y)):
+        check_frame(landmarks, mesh)
+        points, _ = nearest_surface_points(landmarks.positions, mesh)
+        pairs.append(points.nearest_corners(mesh))
+    return np.stack(pairs, axis=1)

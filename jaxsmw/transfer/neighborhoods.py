@@ -15,7 +15,7 @@ from jaxsmw.geometry.mesh import Mesh
 
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
 # to the range from 1/_WEIGHT_RANGE to _WEIGHT_RANGE times the median weight.
-_WEIGHT_RANGE = 100.0
+_WEIGHT_RANGE = 10.0
 # The scale of a neighbourhood is limited to the range from 1/_SCALE_RANGE to _SCALE_RANGE. Where a map
 # collapses a region to a point, the scale would otherwise be zero.
 _SCALE_RANGE = 5.0

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints, check_points
+from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import Mesh, count_of
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
@@ -19,6 +20,8 @@ from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 DEFAULT_STIFFNESS = 0.003
 """The default stiffness of a registered mesh, a length in units of the square root of the target's area."""
 
+# The stiffness with which `points_of_map` smooths a map to vertices. (Entry R21)
+_STIFFNESS_OF_MAPS = 0.01
 # The neighbourhoods whose similarity transformations the mesh follows are averaged this number of times. With
 # fewer averagings, the transformations follow the noise of the map. (Entry R21 of docs/research_log.md)
 _AVERAGINGS = 8
@@ -28,7 +31,7 @@ _FITS = 2
 # _REDUCTIONS times. (Entry R21)
 _REDUCED, _REDUCTIONS = 0.2, 4
 # The relative residual at which the linear solver stops.
-_TOLERANCE = 1e-7
+_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +112,7 @@ class RegisteredMesh:
 
         **Raises:** `InputError` if a point is not on X.
         """
-        return check_points(points, self.mesh_x, "points").positions(self.mesh)
+        return check_surface_points(points, self.mesh_x, "points").positions(self.mesh)
 
     @cached_property
     def points_of_target(self) -> SurfacePoints:
@@ -173,7 +176,7 @@ def register_mesh(
         raise InputError(
             f"the stiffness is {stiffness}: give a positive number, such as {DEFAULT_STIFFNESS}."
         )
-    points = check_points(points, mesh_y, "points")
+    points = check_surface_points(points, mesh_y, "points")
     if len(points) != len(mesh_x.vertices):
         raise InputError(
             f"{mesh_x.name}: there are {len(points)} points for {len(mesh_x.vertices)} vertices: give one "
@@ -186,7 +189,7 @@ def register_mesh(
     around = Neighborhoods(mesh_x, 1.0 if same_unit else root / np.sqrt(mesh_x.area))
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
-    areas = np.maximum(areas, 1e-3 * np.median(areas[areas > 0]))
+    areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
     positions, similarities = targets, around.similarities(targets, _AVERAGINGS)
     weights = areas.copy()
     for _ in range(_FITS):
@@ -201,6 +204,30 @@ def register_mesh(
             corners[mesh_x.faces[flipped]] = 1
             weights = np.where(around.averaging @ corners > 0, _REDUCED * weights, weights)
     return RegisteredMesh(mesh_x, mesh_y, positions + middle, similarities)
+
+
+def points_of_map(
+    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: ArrayLike, *, same_unit: bool = False
+) -> SurfacePoints:
+    """Convert a map to vertices into a map to points between the vertices.
+
+    X is first registered with a stiffness of several edge lengths, which removes the steps between vertices.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
+    - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y.
+    - `same_unit`: whether X and Y have the same unit of length.
+
+    **Returns:** m `SurfacePoints` on Y, for `register_mesh`.
+
+    **Raises:** `InputError` if the map does not fit the meshes.
+    """
+    vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
+    # An unreferenced vertex of Y has no face, so its nearest point represents it.
+    points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
+    smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, same_unit=same_unit)
+    return smooth.surface_points
 
 
 def _follow(

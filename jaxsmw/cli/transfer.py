@@ -1,0 +1,258 @@
+"""`jaxsmw transfer`: register the source on the target, and transfer landmarks and attributes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING, Any, get_args
+
+from jaxsmw.choices import CoordinateSystem
+from jaxsmw.cli.arguments import (
+    MAP_FORMS,
+    add_index_base,
+    add_partial,
+    add_source_and_target,
+    add_weld,
+    path,
+    refuse_without,
+)
+from jaxsmw.cli.console import Stopwatch, report_progress, say, show
+from jaxsmw.cli.inputs import describe_mesh, initial_map_files, read_maps
+from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
+from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxsmw.io.landmarks import Landmarks
+    from jaxsmw.io.mesh_data import MeshData
+    from jaxsmw.matching import Correspondence
+    from jaxsmw.transfer.landmarks import TransferredLandmarks
+    from jaxsmw.transfer.registered_mesh import RegisteredMesh
+
+HELP = "register the source on the target, and transfer landmarks and attributes"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_source_and_target(parser)
+    parser.add_argument(
+        "--map",
+        metavar="FILE",
+        type=path,
+        help=f"map from the source to the target, instead of a match: {MAP_FORMS}",
+    )
+    parser.add_argument(
+        "--registered",
+        metavar="FILE",
+        type=path,
+        help="write the registered mesh to this file: the source with all its faces and attributes, and with "
+        "positions on the target. The suffix determines the format",
+    )
+    parser.add_argument(
+        "--landmarks",
+        metavar="FILE",
+        type=path,
+        help="landmarks on the source: .mrk.json and .fcsv of 3D Slicer, .pp of MeshLab, .mps of MITK, or "
+        ".csv and .txt with a name and a position per line",
+    )
+    parser.add_argument(
+        "--landmarks-output",
+        metavar="FILE",
+        type=path,
+        help="write the landmarks on the target to this file, in one of these formats except .mps",
+    )
+    parser.add_argument(
+        "--coordinates",
+        choices=get_args(CoordinateSystem),
+        help="coordinate system of both meshes, to which landmarks are converted. By default, the coordinate "
+        "system of the landmark file is assumed",
+    )
+    parser.add_argument(
+        "--attributes",
+        metavar="FILE",
+        type=path,
+        help="write the target with the attributes of the source to this file: colours and other data of "
+        "vertices and faces, texture coordinates, blend shapes and skin weights. The suffix determines the "
+        "format",
+    )
+    parser.add_argument(
+        "--stiffness",
+        metavar="LENGTH",
+        type=_positive,
+        help="length below which noise of the map is smoothed, in units of the square root of the target's "
+        "area (default: 0.003)",
+    )
+    add_partial(parser)
+    add_method(parser)
+    add_weld(parser)
+    add_index_base(parser)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text[:60]!r} is not a positive number")
+    return value
+
+
+def run(options: argparse.Namespace) -> None:
+    """Match two meshes or read a map, write the requested files, and print the quality and the times.
+
+    **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
+    """
+    stopwatch = Stopwatch()
+    with stopwatch.step("loading"):
+        _check(options)
+    from jaxsmw.io.mesh_data import read_mesh_data
+
+    with stopwatch.step("reading"):
+        source, target = (
+            read_mesh_data(file, weld=options.weld) for file in (options.source, options.target)
+        )
+        for file, data in ((options.source, source), (options.target, target)):
+            for sentence in describe_mesh(data.mesh):
+                report_progress(f"{file}: {sentence}")
+        landmarks = _read_landmarks(options, source) if options.landmarks else None
+    correspondence, registered = _register(options, source, target, stopwatch)
+    for sentence in registered.sentences():
+        show(sentence)
+    if options.registered:
+        from jaxsmw.transfer.attributes import registered_data
+
+        _write(options.registered, registered_data(source, registered), stopwatch)
+    if options.attributes:
+        from jaxsmw.transfer.attributes import transfer_attributes
+
+        report_progress("attributes ...")
+        with stopwatch.step("attributes"):
+            carried = transfer_attributes(source, registered, target)
+        _write(options.attributes, carried, stopwatch)
+    if landmarks:
+        _transfer_landmarks(options, landmarks, correspondence, registered, stopwatch)
+    show(f"time: {stopwatch.summary()} (compilation included)")
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Check the options and outputs before the long computation, and import the libraries."""
+    if not (options.registered or options.landmarks_output or options.attributes):
+        raise InputError(
+            "nothing to write: give --registered FILE, --attributes FILE, or --landmarks FILE with "
+            "--landmarks-output FILE."
+        )
+    refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
+    refuse_without(options, "--landmarks-output", bool(options.landmarks_output), "landmarks")
+    if options.map and (given := given_method(options)):
+        raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
+    init_files = initial_map_files(options.init)
+    check_preset(options)
+    refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
+    from jaxsmw.io.landmark_files import check_landmark_suffix
+    from jaxsmw.io.mesh_data import check_mesh_suffix
+
+    for file in filter(None, (options.registered, options.attributes)):
+        check_mesh_suffix(file)
+    if options.landmarks_output:
+        check_landmark_suffix(options.landmarks_output)
+    check_outputs(
+        [options.source, options.target, options.map, options.landmarks, *init_files],
+        files=[options.registered, options.attributes, options.landmarks_output],
+    )
+    import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
+
+
+def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
+    """Read the landmarks of the source, convert them to the coordinates of the meshes, and check them."""
+    from jaxsmw.io.landmark_files import read_landmark_file
+    from jaxsmw.io.landmarks import check_frame
+
+    landmarks = read_landmark_file(options.landmarks)
+    for note in landmarks.notes:
+        report_progress(f"{options.landmarks}: {note}")
+    if options.coordinates and landmarks.coordinates is None:
+        landmarks = landmarks.stated(options.coordinates)
+    elif options.coordinates:
+        landmarks = landmarks.in_coordinates(options.coordinates)
+    elif landmarks.coordinates:
+        report_progress(
+            f"{options.landmarks}: the landmarks are in {landmarks.coordinates} coordinates; the meshes are "
+            "assumed to be in the same coordinates."
+        )
+    check_frame(landmarks, source.mesh)  # before the long computation
+    return landmarks
+
+
+def _register(
+    options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
+) -> tuple[Correspondence | None, RegisteredMesh]:
+    """Return the match, or None if a map is given, and the registered mesh."""
+    from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
+
+    correspondence, index_base = None, options.index_base
+    if not options.map:
+        correspondence = match_meshes(
+            options, source.mesh, target.mesh, stopwatch, partial=options.partial, index_base=index_base
+        )
+    report_progress("registered mesh ...")
+    with stopwatch.step("registered mesh"):
+        if correspondence is None:
+            (pointwise_map,) = read_maps(
+                [options.map], source.mesh, target.mesh, index_base=index_base
+            ).values()
+            points = points_of_map(source.mesh, target.mesh, pointwise_map, same_unit=options.partial)
+        else:
+            points = correspondence.surface_points()
+        registered = register_mesh(
+            source.mesh,
+            target.mesh,
+            points,
+            stiffness=options.stiffness or DEFAULT_STIFFNESS,
+            same_unit=options.partial,
+        )
+    return correspondence, registered
+
+
+def _transfer_landmarks(
+    options: argparse.Namespace,
+    landmarks: Landmarks,
+    correspondence: Correspondence | None,
+    registered: RegisteredMesh,
+    stopwatch: Stopwatch,
+) -> None:
+    """Transfer the landmarks, write them, and print their expected errors."""
+    from jaxsmw.io.landmark_files import write_landmark_file
+    from jaxsmw.transfer.landmarks import transfer_landmarks
+
+    expected = None
+    if correspondence is not None:
+        report_progress("expected error ...")
+        with stopwatch.step("expected error"):
+            expected = correspondence.expected_error()
+    with stopwatch.step("landmarks"):
+        found = transfer_landmarks(landmarks, registered, expected_error=expected)
+    for note in found.notes:
+        say(f"note: {note}")
+    _show_landmarks(found)
+    write_landmark_file(options.landmarks_output, found.landmarks)
+    report_written(options.landmarks_output)
+
+
+def _show_landmarks(found: TransferredLandmarks) -> None:
+    """Print the expected error of each landmark, in the unit of the target."""
+    if found.expected_errors is None:
+        return
+    for name, error in zip(found.landmarks.names, found.expected_errors, strict=True):
+        show(f"landmark {name}: expected error {error:.3g}")
+
+
+def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
+    """Write a mesh with its data, and print what the format cannot hold."""
+    from jaxsmw.io.mesh_data import write_mesh_data
+
+    with stopwatch.step("writing"):
+        notes = write_mesh_data(file, data)
+    for note in notes:
+        say(f"note: {file}: {note}")
+    report_written(file)
