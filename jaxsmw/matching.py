@@ -125,9 +125,9 @@ class Correspondence:
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
-        queries, database = self._embeddings()
-        faces_y = jax.device_put(self.mesh_y.faces)
         with self._precision():
+            queries, database = self._embeddings()
+            faces_y = jax.device_put(self.mesh_y.faces)
             if len(queries) * len(database) < _ALL_TRIANGLES_UP_TO**2:
                 found = compiled(nearest_point_on_triangles)(queries, database, faces_y)
             else:

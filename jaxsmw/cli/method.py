@@ -66,7 +66,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "with the most similar descriptor. functional computes a functional map that preserves SHOT "
         "descriptors. A landmarks file has a source and a target vertex per line. Two landmark "
         "files contain named points on the source and on the target, in the formats of "
-        "transfer --landmarks. Of these initial maps, only shot, functional and landmarks distinguish left from right",
+        "transfer --landmarks. Of these initial maps, only shot, "
+        "functional and landmarks distinguish left from right",
     )
     group.add_argument(
         "--preset",

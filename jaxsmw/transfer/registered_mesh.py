@@ -20,15 +20,15 @@ from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 DEFAULT_STIFFNESS = 0.003
 """The default stiffness of a registered mesh, a length in units of the square root of the target's area."""
 
-# The stiffness with which `points_of_map` smooths a map to vertices. (Entry R21)
+# The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
 _STIFFNESS_OF_MAPS = 0.01
 # The neighbourhoods whose similarity transformations the mesh follows are averaged this number of times. With
 # fewer averagings, the transformations follow the noise of the map. (Entry R21 of docs/research_log.md)
 _AVERAGINGS = 8
-# The transformations are fitted to the map, and once again to the result. (Entry R21)
+# The transformations are fitted to the map, and once again to the result. (Entry R22)
 _FITS = 2
 # Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to
-# _REDUCTIONS times. (Entry R21)
+# _REDUCTIONS times. (Entry R22)
 _REDUCED, _REDUCTIONS = 0.2, 4
 # The relative residual at which the linear solver stops.
 _TOLERANCE = 1e-5
