@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_PRESET, Eigensolver, Laplacian
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MIRROR, DEFAULT_PRESET, Eigensolver, Laplacian, Mirror
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
@@ -29,6 +31,7 @@ from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
+from jaxsmw.repair.chirality import Decision, Hands, decide
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
@@ -38,6 +41,8 @@ from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
+
+logger = logging.getLogger("jaxsmw")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +68,15 @@ class Correspondence:
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
-    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. The flag is
-      always False if the preset has no repair.
+    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down, or if both
+      hands look equally good (`mirror_evidence` between 0.3 and 0.5). Without repair in the preset, only the
+      hands are judged.
+    - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
+      hands, such as a left and a right tooth. The map belongs to the vertices of X in both cases.
+    - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm. The map of X itself
+      changes distances by `exp(mirror_evidence)` times as much as the map of its mirror image, measured by
+      coarse maps and, if the hand is not obvious, also by the refined maps (`jaxsmw.repair.chirality.Hands`).
+      Values from 0.4 lead to `mirrored`. None if `match` did not compare the hands.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
       meshes of a given size includes the time of compilation.
     """
@@ -79,12 +91,14 @@ class Correspondence:
     iterations: int
     distortion: float | None = None
     suspicious: bool = False
+    mirrored: bool = False
+    mirror_evidence: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
         judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
-        flag = ", suspicious" if self.suspicious else ""
+        flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
         return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{flag})"
 
     @property
@@ -207,7 +221,10 @@ class Correspondence:
         with self._precision():
             reverse_map = compiled(_reverse_map)(*self._last_stage())
         expected = expected_error(
-            self.pair, self.pointwise_map, np.asarray(reverse_map).astype(np.int64), self.spectrum_x
+            self.pair.mirrored() if self.mirrored else self.pair,
+            self.pointwise_map,
+            np.asarray(reverse_map).astype(np.int64),
+            self.spectrum_x,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 
@@ -222,7 +239,9 @@ class Correspondence:
             return jax.device_put(extend_to_unreferenced(self.mesh_x, np.asarray(queries))), database
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
-        problem = Problem(self.spectrum_x, self.spectrum_y, partial=self.pair.partial)
+        # If the mirror image of X was matched, the state of the refiner belongs to the mirror image.
+        spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
+        problem = Problem(spectrum_x, self.spectrum_y, partial=self.pair.partial)
         return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
@@ -249,12 +268,13 @@ def match(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
+    mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    The function issues a `UserWarning` if the map still looks wrong after repair, or if a mesh is too coarse
-    for the descriptors of the preset.
+    The function issues a `UserWarning` if the map still looks wrong after repair, if X and its mirror image
+    match Y about equally well, or if a mesh is too coarse for the descriptors of the preset.
 
     **Arguments:**
 
@@ -296,6 +316,15 @@ def match(
       `"exact"`.
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`. False, the default, for two full shapes.
+    - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. The mirror image of X
+      is then matched instead of X, and the map belongs to the same vertices of X.
+
+        - `"auto"` (the default): compare both hands; see `jaxsmw.repair.chirality.Hands`. The mirror image is
+          matched only if its map preserves distances clearly better. Whole bodies, which are their own mirror
+          image up to pose, are matched as they are. The hands of a partial pair are not compared.
+        - `"no"`: match X itself.
+        - `"yes"`: match the mirror image of X.
+
     - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
@@ -307,30 +336,75 @@ def match(
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
     computation of the initial map or the refinement fails numerically.
     """
+    check_choice(mirror, Mirror, "a mirror setting")
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
     adapts = isinstance(preset, str | Preset)  # stages of the caller are used unchanged
     chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
-    compiling = _compile_ahead(pair, chosen, history)
-    prepared = prepare(
-        pair,
-        number_of_eigenvectors=chosen.number_of_eigenvectors,
-        number_of_descriptors=chosen.number_of_descriptors,
-        number_of_samples=chosen.number_of_samples,
-        init=init,
-        laplacian=laplacian,
-        eigensolver=eigensolver,
-        descriptors_required=not adapts,
-    )
-    if prepared.spectrum_x.descriptors is None:
-        chosen = chosen.without_descriptors()
-    seconds = dict(prepared.seconds)
-    with timed("refinement", seconds), one_blas_thread():
-        wait(compiling)
-        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
-        jax.block_until_ready(outcome.refinements[-1])
-    return _correspondence(prepared, chosen, outcome, seconds)
+
+    def matched(of_one_hand: Pair) -> _Matched:
+        compiling = _compile_ahead(of_one_hand, chosen, history)
+        prepared = prepare(
+            of_one_hand,
+            number_of_eigenvectors=chosen.number_of_eigenvectors,
+            number_of_descriptors=chosen.number_of_descriptors,
+            number_of_samples=chosen.number_of_samples,
+            init=init,
+            laplacian=laplacian,
+            eigensolver=eigensolver,
+            descriptors_required=not adapts,
+        )
+        usable = chosen if prepared.spectrum_x.descriptors is not None else chosen.without_descriptors()
+        seconds = dict(prepared.seconds)
+        with timed("refinement", seconds), one_blas_thread():
+            wait(compiling)
+            outcome = refine_in_stages(prepared, usable.stages, usable.repair, history=history)
+            jax.block_until_ready(outcome.refinements[-1])
+        return _Matched(prepared, usable, outcome, seconds)
+
+    if mirror == "yes":
+        return _correspondence(pair, matched(pair.mirrored()), Decision(True))
+    found = matched(pair)
+    if mirror == "no" or partial:
+        return _correspondence(pair, found, Decision(False))
+    return _correspondence(pair, *_better_hand(found, matched))
+
+
+class _Matched(NamedTuple):
+    """A pair of one hand with its outcome, and the preset without the parts that cannot be used."""
+
+    prepared: PreparedPair
+    preset: Preset
+    outcome: Outcome
+    seconds: dict[str, float]
+
+    @property
+    def pointwise_map(self) -> Int64[np.ndarray, " m"]:
+        m = len(self.prepared.pair.mesh_x.vertices)
+        return np.asarray(self.outcome.pointwise_map)[:m].astype(np.int64)
+
+
+def _better_hand(own: _Matched, matched: Callable[[Pair], _Matched]) -> tuple[_Matched, Decision]:
+    """Compare the match of X itself with the match of its mirror image, which is computed only if needed."""
+    if not own.outcome.successful:
+        return own, Decision(False)
+    seconds = own.seconds
+    with timed("comparison of hands", seconds):
+        hands = Hands(own.prepared.pair, own.prepared.spectrum_x, own.prepared.spectrum_y)
+        evidence = hands.coarse_evidence()
+    if evidence is None or evidence < hands.settings.refined_from:
+        return own, Decision(False, evidence)
+    logger.info("the mirror image of %s may match better ...", own.prepared.pair.mesh_x.name)
+    mirrored = matched(own.prepared.pair.mirrored())
+    if not mirrored.outcome.successful:
+        return own, Decision(False, evidence)
+    for step, time in mirrored.seconds.items():
+        seconds[step] = seconds.get(step, 0) + time
+    with timed("comparison of hands", seconds):
+        evidence += hands.evidence_of_maps(own.pointwise_map, mirrored.pointwise_map)
+    decision = decide(evidence, hands.settings)
+    return (mirrored if decision.mirrored else own)._replace(seconds=seconds), decision
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -347,20 +421,21 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
 
 
-def _correspondence(
-    prepared: PreparedPair, preset: Preset, outcome: Outcome, seconds: dict[str, float]
-) -> Correspondence:
-    """Make the result of `match`, and issue a warning if the map looks wrong.
+def _correspondence(pair: Pair, found: _Matched, decision: Decision) -> Correspondence:
+    """Make the result of `match`, and issue a warning if the map or the hand looks wrong.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
-    pair, m = prepared.pair, len(prepared.pair.mesh_x.vertices)
+    prepared, preset, outcome, seconds = found
+    m = len(pair.mesh_x.vertices)
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
     if outcome.suspicious:
         assert preset.repair is not None
         warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
+    if decision.doubtful:
+        warnings.warn(_doubt(pair, decision), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -369,13 +444,25 @@ def _correspondence(
         pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         preset=preset,
-        spectrum_x=spectrum_x,
+        spectrum_x=spectrum_x.reflect() if decision.mirrored else spectrum_x,
         spectrum_y=spectrum_y,
         refinement=last,
         iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
         distortion=outcome.distortion,
-        suspicious=outcome.suspicious,
+        suspicious=outcome.suspicious or decision.doubtful,
+        mirrored=decision.mirrored,
+        mirror_evidence=decision.evidence,
         seconds=seconds,
+    )
+
+
+def _doubt(pair: Pair, decision: Decision) -> str:
+    """Return the text of the warning that the hand is doubtful."""
+    took = "the mirror image of the source" if decision.mirrored else "the source itself"
+    return (
+        f"{pair.name}: the source and its mirror image match the target about equally well (evidence "
+        f"{decision.evidence:.2f} for the mirror image). {took.capitalize()} was matched. If both meshes are "
+        'of the same hand, set mirror="no" (--mirror no); if not, set mirror="yes" (--mirror yes).'
     )
 
 

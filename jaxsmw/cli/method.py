@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from jaxsmw.choices import (
     DEFAULT_INITIAL_MAP,
+    DEFAULT_MIRROR,
     DEFAULT_PRESET,
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
     IndexBase,
     InitialMap,
+    Mirror,
     PresetName,
     Search,
 )
@@ -73,6 +75,14 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "samples; accurate has more stages and repairs maps, so refinement takes three to four times as long "
         f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
         "given)",
+    )
+    group.add_argument(
+        "--mirror",
+        choices=get_args(Mirror),
+        default=DEFAULT_MIRROR,
+        help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
+        "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both hands "
+        "(default: %(default)s)",
     )
     group.add_argument(
         "--precision",
@@ -196,6 +206,7 @@ def match_meshes(
             laplacian=options.laplacian,
             eigensolver=options.eigensolver,
             partial=partial,
+            mirror=options.mirror,
         )
     stopwatch.add(correspondence.seconds)
     return correspondence
