@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,14 +69,14 @@ class Correspondence:
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
     - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down, or if both
-      hands look equally good (`mirror_evidence` between 0.3 and 0.5). Without repair in the preset, only the
-      hands are judged.
+      hands are about equally likely (`mirror_evidence` between 0.05 and 0.15). Without repair in the preset,
+      only the hands are judged.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. The map belongs to the vertices of X in both cases.
-    - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm. The map of X itself
-      changes distances by `exp(mirror_evidence)` times as much as the map of its mirror image, measured by
-      coarse maps and, if the hand is not obvious, also by the refined maps (`jaxsmw.repair.chirality.Hands`).
-      Values from 0.4 lead to `mirrored`. None if `match` did not compare the hands.
+    - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm; None if `match` did not
+      compare the hands. A coarse map of X itself changes distances by at least `exp(mirror_evidence)` times
+      as much as a coarse map of its mirror image. Values from 0.1 lead to `mirrored`; most correct decisions
+      for `mirrored` have values above 0.3.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
       meshes of a given size includes the time of compilation.
     """
@@ -319,11 +319,13 @@ def match(
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. The mirror image of X
       is then matched instead of X, and the map belongs to the same vertices of X.
 
-        - `"auto"` (the default): compare both hands; see `jaxsmw.repair.chirality.Hands`. The mirror image is
-          matched only if its map preserves distances clearly better. Whole bodies, which are their own mirror
-          image up to pose, are matched as they are. The hands of a partial pair are not compared.
-        - `"no"`: match X itself.
+        - `"no"` (the default): match X itself.
         - `"yes"`: match the mirror image of X.
+        - `"auto"`: compare both hands (`jaxsmw.repair.chirality.Hands`), and match the mirror image if its
+          coarse maps preserve distances clearly better. Use this setting for shapes that are not their own
+          mirror image, such as teeth. Most bodies are their own mirror image, which gives no evidence, and
+          they are then matched as they are; some pairs of animals in different poses are mirrored wrongly
+          (docs/research_log.md). The hands of a partial pair are not compared.
 
     - `history`: whether to record a `History` of the last stage; see `jaxsmw.refine`.
 
@@ -343,68 +345,35 @@ def match(
     if adapts:
         chosen = chosen.fitted(fewest)
 
-    def matched(of_one_hand: Pair) -> _Matched:
-        compiling = _compile_ahead(of_one_hand, chosen, history)
-        prepared = prepare(
-            of_one_hand,
-            number_of_eigenvectors=chosen.number_of_eigenvectors,
-            number_of_descriptors=chosen.number_of_descriptors,
-            number_of_samples=chosen.number_of_samples,
-            init=init,
-            laplacian=laplacian,
-            eigensolver=eigensolver,
-            descriptors_required=not adapts,
-        )
-        usable = chosen if prepared.spectrum_x.descriptors is not None else chosen.without_descriptors()
-        seconds = dict(prepared.seconds)
-        with timed("refinement", seconds), one_blas_thread():
-            wait(compiling)
-            outcome = refine_in_stages(prepared, usable.stages, usable.repair, history=history)
-            jax.block_until_ready(outcome.refinements[-1])
-        return _Matched(prepared, usable, outcome, seconds)
-
-    if mirror == "yes":
-        return _correspondence(pair, matched(pair.mirrored()), Decision(True))
-    found = matched(pair)
-    if mirror == "no" or partial:
-        return _correspondence(pair, found, Decision(False))
-    return _correspondence(pair, *_better_hand(found, matched))
-
-
-class _Matched(NamedTuple):
-    """A pair of one hand with its outcome, and the preset without the parts that cannot be used."""
-
-    prepared: PreparedPair
-    preset: Preset
-    outcome: Outcome
-    seconds: dict[str, float]
-
-    @property
-    def pointwise_map(self) -> Int64[np.ndarray, " m"]:
-        m = len(self.prepared.pair.mesh_x.vertices)
-        return np.asarray(self.outcome.pointwise_map)[:m].astype(np.int64)
-
-
-def _better_hand(own: _Matched, matched: Callable[[Pair], _Matched]) -> tuple[_Matched, Decision]:
-    """Compare the match of X itself with the match of its mirror image, which is computed only if needed."""
-    if not own.outcome.successful:
-        return own, Decision(False)
-    seconds = own.seconds
-    with timed("comparison of hands", seconds):
-        hands = Hands(own.prepared.pair, own.prepared.spectrum_x, own.prepared.spectrum_y)
-        evidence = hands.coarse_evidence()
-    if evidence is None or evidence < hands.settings.refined_from:
-        return own, Decision(False, evidence)
-    logger.info("the mirror image of %s may match better ...", own.prepared.pair.mesh_x.name)
-    mirrored = matched(own.prepared.pair.mirrored())
-    if not mirrored.outcome.successful:
-        return own, Decision(False, evidence)
-    for step, time in mirrored.seconds.items():
-        seconds[step] = seconds.get(step, 0) + time
-    with timed("comparison of hands", seconds):
-        evidence += hands.evidence_of_maps(own.pointwise_map, mirrored.pointwise_map)
-    decision = decide(evidence, hands.settings)
-    return (mirrored if decision.mirrored else own)._replace(seconds=seconds), decision
+    of_one_hand = pair.mirrored() if mirror == "yes" else pair
+    compiling = _compile_ahead(pair, chosen, history)
+    prepare_hand = functools.partial(
+        prepare,
+        init=init,
+        laplacian=laplacian,
+        eigensolver=eigensolver,
+        number_of_eigenvectors=chosen.number_of_eigenvectors,
+        number_of_descriptors=chosen.number_of_descriptors,
+        number_of_samples=chosen.number_of_samples,
+        descriptors_required=not adapts,
+    )
+    prepared = prepare_hand(of_one_hand)
+    seconds = dict(prepared.seconds)
+    decision = Decision(mirror == "yes")
+    if mirror == "auto" and not partial:
+        with timed("comparison of hands", seconds):
+            decision = decide(Hands(pair, prepared.spectrum_x, prepared.spectrum_y).evidence())
+        if decision.mirrored:
+            logger.info("%s: the mirror image of the source is matched", pair.name)
+            prepared = prepare_hand(pair.mirrored())
+            seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
+    if prepared.spectrum_x.descriptors is None:
+        chosen = chosen.without_descriptors()
+    with timed("refinement", seconds), one_blas_thread():
+        wait(compiling)
+        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
+        jax.block_until_ready(outcome.refinements[-1])
+    return _correspondence(pair, prepared, chosen, outcome, seconds, decision)
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -421,12 +390,18 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
 
 
-def _correspondence(pair: Pair, found: _Matched, decision: Decision) -> Correspondence:
+def _correspondence(
+    pair: Pair,
+    prepared: PreparedPair,
+    preset: Preset,
+    outcome: Outcome,
+    seconds: dict[str, float],
+    decision: Decision,
+) -> Correspondence:
     """Make the result of `match`, and issue a warning if the map or the hand looks wrong.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
-    prepared, preset, outcome, seconds = found
     m = len(pair.mesh_x.vertices)
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:

@@ -19,7 +19,7 @@ from jaxsmw.choices import (
 )
 from jaxsmw.cli.arguments import add_eigenproblem, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
-from jaxsmw.cli.console import Stopwatch, report_progress, say
+from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import initial_map, read_initial_map
 from jaxsmw.errors import InputError
 
@@ -81,8 +81,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         choices=get_args(Mirror),
         default=DEFAULT_MIRROR,
         help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
-        "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both hands "
-        "(default: %(default)s)",
+        "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both "
+        "hands, for shapes that are not their own mirror image (default: %(default)s)",
     )
     group.add_argument(
         "--precision",
@@ -209,7 +209,17 @@ def match_meshes(
             mirror=options.mirror,
         )
     stopwatch.add(correspondence.seconds)
+    if options.mirror != "no":
+        _say_hand(correspondence)
     return correspondence
+
+
+def _say_hand(correspondence: Correspondence) -> None:
+    """Print which hand of the source was matched."""
+    took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
+    evidence = correspondence.mirror_evidence
+    known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
+    show(f"hand:        {took}{known}")
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:

@@ -66,23 +66,34 @@ class Hands:
         )
         self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
-    def coarse_evidence(self) -> float | None:
+    def evidence(self) -> float | None:
         """Compare coarse maps of both hands.
 
         The coarse maps come from nearest neighbours of SHOT with large radii, and are refined by a feature
-        regression with few eigenvectors, at evenly spread samples.
+        regression with few eigenvectors, at evenly spread samples. Several sets of radii give several pairs
+        of maps. The least evidence counts, because by chance one of two wrong maps can be much better than
+        the other. Further sets are not tried once the evidence is too small for the mirror image.
 
         **Returns:** The evidence for the mirror image, without unit; None if a mesh is too coarse.
         """
         if min(len(shape.areas) for shape in (self.x, self.y)) < self.settings.fewest_samples:
             return None
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # coarse meshes only weaken the evidence
-                shot_x, shot_y = side_by_side(self._shot, self.x, self.y)
-        except InputError:
-            return None
-        mirrored = np.hstack([mirrored_descriptors(radius) for radius in shot_x])
+        least = np.inf
+        for radii in self.settings.radii:
+            try:
+                least = min(least, self._evidence_of(radii))
+            except InputError:  # the samples are too sparse for these radii
+                return None
+            if least < self.settings.mirrored_from - self.settings.doubt:
+                break
+        return float(least)
+
+    def _evidence_of(self, radii: tuple[int, ...]) -> float:
+        """Return the evidence of the maps from SHOT with the given radii."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # sparse samples only weaken the evidence
+            shot_x, shot_y = side_by_side(lambda shape: self._shot(shape, radii), self.x, self.y)
+        mirrored = np.hstack([mirrored_descriptors(one) for one in shot_x])
         shot = [np.hstack(shot_x), mirrored, np.hstack(shot_y)]
         areas = [self.x.areas / 2, self.x.areas / 2, self.y.areas]
         components = principal_components(
@@ -98,32 +109,19 @@ class Hands:
             )
         return _log_ratio(*errors)
 
-    def evidence_of_maps(self, own: Int64[np.ndarray, " m"], mirrored: Int64[np.ndarray, " m"]) -> float:
-        """Compare two refined maps, which match X itself and the mirror image of X to Y.
-
-        **Arguments:**
-
-        - `own`, `mirrored`: the maps of X itself (m,) and of its mirror image (m,), 0-based vertices of Y.
-
-        **Returns:** The evidence for the mirror image, without unit.
-        """
-        sampled = (self.y.samples.nearest[found[self.x.samples.vertices]] for found in (own, mirrored))
-        return _log_ratio(*(_distance_error(self.x, self.y, found) for found in sampled))
-
     def _shape(self, argument: tuple[Mesh, Spectrum]) -> _Shape:
         mesh, spectrum = argument
-        samples = poisson_disk_samples(mesh, self.settings.samples)
-        return _Shape(mesh, samples, spectrum)
+        return _Shape(mesh, poisson_disk_samples(mesh, self.settings.samples), spectrum)
 
-    def _shot(self, shape: _Shape) -> list[Float[np.ndarray, "s 352"]]:
+    def _shot(self, shape: _Shape, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:
         return [
             shot_descriptors(shape.mesh, radius=multiple * SHOT_RADIUS, samples=shape.samples)
-            for multiple in self.settings.radii
+            for multiple in radii
         ]
 
     def _refined(
         self, first: _Map, described_x: Float[np.ndarray, "s d"], described_y: Float[np.ndarray, "t d"]
-    ) -> tuple[_Map, _Map]:
+    ) -> tuple[_Map, Int64[np.ndarray, " t"]]:
         """Refine a map from X to Y, and return the refined map and its reverse map."""
         spectra = self.x.described(described_x), self.y.described(described_y)
         size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
@@ -205,8 +203,7 @@ def decide(evidence: float | None, settings: ChiralitySettings = ChiralitySettin
 
     **Arguments:**
 
-    - `evidence`: the sum of the evidence of coarse maps and of refined maps; the evidence of coarse maps
-      alone if it is below `settings.refined_from`. None if there is no evidence.
+    - `evidence`: the evidence for the mirror image, or None if there is none.
     - `settings`: the thresholds.
     """
     if evidence is None:

@@ -174,21 +174,20 @@ class ChiralitySettings:
     - `samples`: the approximate number of evenly spread samples of each shape.
     - `fewest_samples`: the hands of shapes with fewer samples are not compared, because the regression has
       50 features.
-    - `radii` (entry R20): the radii of SHOT, in units of 0.06 times the square root of the area. With the
-      usual radius alone, descriptors hardly distinguish a tooth from its mirror image.
+    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. Each
+      set gives one pair of coarse maps. With the usual radius alone, descriptors hardly distinguish a tooth
+      from its mirror image.
     - `descriptors`, `levels` (entry R14): the number of descriptors and the levels of the feature regression
       that refines coarse maps.
-    - `refined_from` (entry R21): from this evidence of coarse maps on, both hands are refined by all stages
-      and the evidence of the refined maps is added. Below, X itself is matched.
-    - `mirrored_from` (entry R21): from this evidence on, the mirror image of X is matched.
+    - `mirrored_from` (entry R21): if the least evidence of all sets is at least this value, the mirror image
+      of X is matched.
     - `doubt` (entry R21): a decision is doubtful if the evidence is nearer to `mirrored_from` than this.
     """
 
     samples: int = 1000
     fewest_samples: int = 100
-    radii: tuple[int, ...] = (2, 4, 8)
+    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8), (8, 16))
     descriptors: int = 30
     levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
-    refined_from: float = 0.1
-    mirrored_from: float = 0.4
-    doubt: float = 0.1
+    mirrored_from: float = 0.1
+    doubt: float = 0.05
