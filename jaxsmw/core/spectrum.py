@@ -73,7 +73,7 @@ class Spectrum(eqx.Module):
         """Returns the spectrum of the mirror image: the first coordinates of all positions and normals change
         their signs. The descriptors stay the same.
         """
-        flip = jnp.array([-1, 1, 1])
+        flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(
             self,
             positions=None if self.positions is None else self.positions * flip.astype(self.positions.dtype),
