@@ -186,7 +186,7 @@ class ChiralitySettings:
 
     samples: int = 1000
     fewest_samples: int = 100
-    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8), (8, 16))
+    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8))
     descriptors: int = 30
     levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
     mirrored_from: float = 0.1
