@@ -14,6 +14,10 @@ InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional"]
 """The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
 
+Mirror = Literal["auto", "no", "yes"]
+"""Whether the mirror image of the source is matched instead of the source; see `jaxsmw.match`."""
+DEFAULT_MIRROR: Mirror = "no"
+
 Laplacian = Literal["auto", "cotangent", "robust"]
 """The discretizations of the Laplacian; see `jaxsmw.compute_spectrum`."""
 

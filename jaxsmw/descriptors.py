@@ -150,7 +150,7 @@ def describe(
     shot = np.hstack([np.concatenate(both) for both in _shot_at_all_radii(sampled)], dtype=dtype)
     areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sampled.sides]
     weight = np.concatenate([a / a.sum() / 2 for a in areas]).astype(dtype)
-    components = _principal_components(shot, weight, number_of_descriptors)
+    components = principal_components(shot, weight, number_of_descriptors)
     described = []
     both = np.split(components, [len(areas[0])])
     for spectrum, side, found in zip((spectrum_x, spectrum_y), sampled.sides, both, strict=True):
@@ -173,10 +173,19 @@ def _shot_at_all_radii(
     return shot
 
 
-def _principal_components(
+def principal_components(
     values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
 ) -> Float[np.ndarray, "n d"]:
-    """Compute the first principal components of weighted rows, each scaled to a weighted mean square of 1."""
+    """Compute the first principal components of weighted rows, each scaled to a weighted mean square of 1.
+
+    **Arguments:**
+
+    - `values`: the rows (n, c).
+    - `weight`: the weights of the rows (n,), which sum to 1.
+    - `number`: the number d of components.
+
+    **Returns:** The components of the rows (n, d), those of largest variance first.
+    """
     centered = values - weight @ values
     covariance = centered.T @ (weight[:, None] * centered)
     variances, directions = np.linalg.eigh(covariance.astype(np.float64))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future, wait
@@ -14,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_PRESET, Eigensolver, Laplacian
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MIRROR, DEFAULT_PRESET, Eigensolver, Laplacian, Mirror
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_candidates, nearest_point_on_triangles
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
@@ -29,6 +31,7 @@ from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
+from jaxsmw.repair.chirality import Decision, Hands, decide
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
@@ -43,6 +46,8 @@ from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, r
 
 # The geometric mean of the numbers of vertices above which surface points are searched around matches only.
 _ALL_TRIANGLES_UP_TO = 15_000
+
+logger = logging.getLogger("jaxsmw")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,8 +73,15 @@ class Correspondence:
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
-    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. The flag is
-      always False if the preset has no repair.
+    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down, or if both
+      hands are about equally likely (`mirror_evidence` between 0.05 and 0.15). Without repair in the preset,
+      only the hands are judged.
+    - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
+      hands, such as a left and a right tooth. The map belongs to the vertices of X in both cases.
+    - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm; None if `match` did not
+      compare the hands. A coarse map of X itself changes distances by at least `exp(mirror_evidence)` times
+      as much as a coarse map of its mirror image. Values from 0.1 lead to `mirrored`; most correct decisions
+      for `mirrored` have values above 0.3.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
       meshes of a given size includes the time of compilation.
     """
@@ -84,12 +96,14 @@ class Correspondence:
     iterations: int
     distortion: float | None = None
     suspicious: bool = False
+    mirrored: bool = False
+    mirror_evidence: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
         judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
-        flag = ", suspicious" if self.suspicious else ""
+        flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
         return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{flag})"
 
     @property
@@ -245,7 +259,10 @@ class Correspondence:
         with self._precision():
             reverse_map = compiled(_reverse_map)(*self._last_stage())
         expected = expected_error(
-            self.pair, self.pointwise_map, np.asarray(reverse_map).astype(np.int64), self.spectrum_x
+            self.pair.mirrored() if self.mirrored else self.pair,
+            self.pointwise_map,
+            np.asarray(reverse_map).astype(np.int64),
+            self.spectrum_x,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 
@@ -260,7 +277,9 @@ class Correspondence:
             return jax.device_put(extend_to_unreferenced(self.mesh_x, np.asarray(queries))), database
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
-        problem = Problem(self.spectrum_x, self.spectrum_y, partial=self.pair.partial)
+        # If the mirror image of X was matched, the state of the refiner belongs to the mirror image.
+        spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
+        problem = Problem(spectrum_x, self.spectrum_y, partial=self.pair.partial)
         return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
@@ -287,12 +306,13 @@ def match(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
+    mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    The function issues a `UserWarning` if the map still looks wrong after repair, or if a mesh is too coarse
-    for the descriptors of the preset.
+    The function issues a `UserWarning` if the map still looks wrong after repair, if X and its mirror image
+    match Y about equally well, or if a mesh is too coarse for the descriptors of the preset.
 
     **Arguments:**
 
@@ -334,6 +354,17 @@ def match(
       `"exact"`.
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`. False, the default, for two full shapes.
+    - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. The mirror image of X
+      is then matched instead of X, and the map belongs to the same vertices of X.
+
+        - `"no"` (the default): match X itself.
+        - `"yes"`: match the mirror image of X.
+        - `"auto"`: compare both hands (`jaxsmw.repair.chirality.Hands`), and match the mirror image if its
+          coarse maps preserve distances clearly better. Use this setting for shapes that are not their own
+          mirror image, such as teeth. Most bodies are their own mirror image, which gives no evidence, and
+          they are then matched as they are; some pairs of animals in different poses are mirrored wrongly
+          (docs/research_log.md). The hands of a partial pair are not compared.
+
     - `history`: whether to record a `History` of the last stage, as `refinement.history` of the result.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
@@ -345,30 +376,42 @@ def match(
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
     computation of the initial map or the refinement fails numerically.
     """
+    check_choice(mirror, Mirror, "a mirror setting")
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
     adapts = isinstance(preset, str | Preset)  # stages of the caller are used unchanged
     chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
+
+    of_one_hand = pair.mirrored() if mirror == "yes" else pair
     compiling = _compile_ahead(pair, chosen, history)
-    prepared = prepare(
-        pair,
-        number_of_eigenvectors=chosen.number_of_eigenvectors,
-        number_of_descriptors=chosen.number_of_descriptors,
-        number_of_samples=chosen.number_of_samples,
+    prepare_hand = functools.partial(
+        prepare,
         init=init,
         laplacian=laplacian,
         eigensolver=eigensolver,
+        number_of_eigenvectors=chosen.number_of_eigenvectors,
+        number_of_descriptors=chosen.number_of_descriptors,
+        number_of_samples=chosen.number_of_samples,
         descriptors_required=not adapts,
     )
+    prepared = prepare_hand(of_one_hand)
+    seconds = dict(prepared.seconds)
+    decision = Decision(mirror == "yes")
+    if mirror == "auto" and not partial:
+        with timed("comparison of hands", seconds):
+            decision = decide(Hands(pair, prepared.spectrum_x, prepared.spectrum_y).evidence())
+        if decision.mirrored:
+            logger.info("%s: the mirror image of the source is matched", pair.name)
+            prepared = prepare_hand(pair.mirrored())
+            seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
     if prepared.spectrum_x.descriptors is None:
         chosen = chosen.without_descriptors()
-    seconds = dict(prepared.seconds)
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
         outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
         jax.block_until_ready(outcome.refinements[-1])
-    return _correspondence(prepared, chosen, outcome, seconds)
+    return _correspondence(pair, prepared, chosen, outcome, seconds, decision)
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -386,19 +429,26 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
 
 
 def _correspondence(
-    prepared: PreparedPair, preset: Preset, outcome: Outcome, seconds: dict[str, float]
+    pair: Pair,
+    prepared: PreparedPair,
+    preset: Preset,
+    outcome: Outcome,
+    seconds: dict[str, float],
+    decision: Decision,
 ) -> Correspondence:
-    """Make the result of `match`, and issue a warning if the map looks wrong.
+    """Make the result of `match`, and issue a warning if the map or the hand looks wrong.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
-    pair, m = prepared.pair, len(prepared.pair.mesh_x.vertices)
+    m = len(pair.mesh_x.vertices)
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
     if outcome.suspicious:
         assert preset.repair is not None
         warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
+    if decision.doubtful:
+        warnings.warn(_doubt(pair, decision), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -407,13 +457,25 @@ def _correspondence(
         pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         preset=preset,
-        spectrum_x=spectrum_x,
+        spectrum_x=spectrum_x.reflect() if decision.mirrored else spectrum_x,
         spectrum_y=spectrum_y,
         refinement=last,
         iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
         distortion=outcome.distortion,
-        suspicious=outcome.suspicious,
+        suspicious=outcome.suspicious or decision.doubtful,
+        mirrored=decision.mirrored,
+        mirror_evidence=decision.evidence,
         seconds=seconds,
+    )
+
+
+def _doubt(pair: Pair, decision: Decision) -> str:
+    """Return the text of the warning that the hand is doubtful."""
+    took = "the mirror image of the source" if decision.mirrored else "the source itself"
+    return (
+        f"{pair.name}: the source and its mirror image match the target about equally well (evidence "
+        f"{decision.evidence:.2f} for the mirror image). {took.capitalize()} was matched. If both meshes are "
+        'of the same hand, set mirror="no" (--mirror no); if not, set mirror="yes" (--mirror yes).'
     )
 
 

@@ -96,6 +96,10 @@ class Pair:
                 )
         return min(used)
 
+    def mirrored(self) -> Pair:
+        """Return the pair of the mirror image of X and of Y; see `jaxsmw.Mesh.mirrored`."""
+        return Pair(self.mesh_x.mirrored(), self.mesh_y, self.partial)
+
     def reversed(self) -> Pair:
         """Return the pair with X and Y exchanged."""
         return Pair(self.mesh_y, self.mesh_x, self.partial)

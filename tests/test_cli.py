@@ -198,6 +198,8 @@ def calls(monkeypatch):
         ("--solution least-squares-frobenius", lambda: {"solution": LeastSquares(norm="frobenius")}),
         ("--solution regularized", lambda: {"solution": RegularizedLeastSquares()}),
         ("--laplacian robust", lambda: {"laplacian": "robust"}),
+        ("--mirror yes", lambda: {"mirror": "yes"}),
+        ("--mirror auto", lambda: {"mirror": "auto"}),
         ("--precision float64", lambda: {"float type": np.float64}),
         ("--stop-when-unchanged", lambda: {"stop_when_unchanged": True}),
     ],

@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from jaxsmw.choices import (
     DEFAULT_INITIAL_MAP,
+    DEFAULT_MIRROR,
     DEFAULT_PRESET,
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
     IndexBase,
     InitialMap,
+    Mirror,
     PresetName,
     Search,
 )
 from jaxsmw.cli.arguments import add_eigenproblem, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
-from jaxsmw.cli.console import Stopwatch, report_progress, say
+from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import initial_map, read_initial_map
 from jaxsmw.errors import InputError
 
@@ -76,6 +78,14 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "samples; accurate has more stages and repairs maps, so refinement takes three to four times as long "
         f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
         "given)",
+    )
+    group.add_argument(
+        "--mirror",
+        choices=get_args(Mirror),
+        default=DEFAULT_MIRROR,
+        help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
+        "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both "
+        "hands, for shapes that are not their own mirror image (default: %(default)s)",
     )
     group.add_argument(
         "--precision",
@@ -206,9 +216,20 @@ def match_meshes(
             laplacian=options.laplacian,
             eigensolver=options.eigensolver,
             partial=partial,
+            mirror=options.mirror,
         )
     stopwatch.add(correspondence.seconds)
+    if options.mirror != "no":
+        _say_hand(correspondence)
     return correspondence
+
+
+def _say_hand(correspondence: Correspondence) -> None:
+    """Print which hand of the source was matched."""
+    took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
+    evidence = correspondence.mirror_evidence
+    known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
+    show(f"hand:        {took}{known}")
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:

@@ -69,6 +69,17 @@ class Spectrum(eqx.Module):
             positions=None if self.positions is None else self.positions * factor**0.5,
         )
 
+    def reflect(self) -> Spectrum:
+        """Returns the spectrum of the mirror image: the first coordinates of all positions and normals change
+        their signs. The descriptors stay the same.
+        """
+        flip = jnp.array([[-1, 1, 1]])
+        return dataclasses.replace(
+            self,
+            positions=None if self.positions is None else self.positions * flip.astype(self.positions.dtype),
+            normals=None if self.normals is None else self.normals * flip.astype(self.normals.dtype),
+        )
+
     def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
         """Returns the spectrum with the given descriptors (n, d), or without descriptors if they are None.
 

@@ -65,6 +65,18 @@ class Mesh:
     notes: tuple[str, ...] = ()
     dropped_faces: Int64[np.ndarray, " d"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
+    def mirrored(self) -> Mesh:
+        """Return the mirror image: the first coordinates change their signs.
+
+        Vertices and faces keep their numbers. The corners of each face are reversed, so that normals that
+        point outward still point outward.
+        """
+        return replace(
+            self,
+            vertices=self.vertices * np.array([-1.0, 1.0, 1.0]),
+            faces=np.ascontiguousarray(self.faces[:, ::-1]),
+        )
+
     @property
     def face_numbers(self) -> Int64[np.ndarray, " f"]:
         """The 0-based number of each face (f,) among all faces of the file, including dropped faces."""

@@ -105,6 +105,19 @@ def shot_descriptors(
     return result["descriptors"]
 
 
+def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[np.ndarray, "n 352"]:
+    """Return the SHOT descriptors of the mirror image of a surface.
+
+    A reflection reverses the order of the ranges of azimuth and changes nothing else.
+
+    **Arguments:**
+
+    - `descriptors`: the descriptors of the surface (n, 352), as `shot_descriptors` returns them.
+    """
+    sectors = descriptors.reshape(len(descriptors), _AZIMUTH, -1)
+    return np.ascontiguousarray(sectors[:, ::-1]).reshape(descriptors.shape)
+
+
 def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "

@@ -1,4 +1,4 @@
-"""The settings of the repair of wrong maps and of the expected error."""
+"""The settings of the repair of wrong maps, of the expected error and of the search for the hand."""
 
 from __future__ import annotations
 
@@ -160,3 +160,34 @@ class RepairSettings:
     extremity_maps: int = 2
     extremities: ExtremitySettings = ExtremitySettings()
     scores: ScoreSettings = ScoreSettings()
+
+
+@dataclass(frozen=True)
+class ChiralitySettings:
+    """The settings of `jaxsmw.repair.chirality`, which decides whether X or its mirror image matches Y.
+
+    The evidence is the logarithm of a ratio of distance errors; see `jaxsmw.repair.chirality.Hands`.
+    Entries R20 and R21 are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `samples`: the approximate number of evenly spread samples of each shape.
+    - `fewest_samples`: the hands of shapes with fewer samples are not compared, because the regression has
+      50 features.
+    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. Each
+      set gives one pair of coarse maps. With the usual radius alone, descriptors hardly distinguish a tooth
+      from its mirror image.
+    - `descriptors`, `levels` (entry R14): the number of descriptors and the levels of the feature regression
+      that refines coarse maps.
+    - `mirrored_from` (entry R21): if the least evidence of all sets is at least this value, the mirror image
+      of X is matched.
+    - `doubt` (entry R21): a decision is doubtful if the evidence is nearer to `mirrored_from` than this.
+    """
+
+    samples: int = 1000
+    fewest_samples: int = 100
+    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8))
+    descriptors: int = 30
+    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
+    mirrored_from: float = 0.1
+    doubt: float = 0.05

@@ -389,6 +389,11 @@ def summarize(
         "functional map": "{} x {}".format(*correspondence.functional_map.shape),
         "iterations": str(correspondence.iterations),
     }
+    if correspondence.mirrored or correspondence.mirror_evidence is not None:
+        evidence = correspondence.mirror_evidence
+        facts["source mirrored"] = ("yes" if correspondence.mirrored else "no") + (
+            "" if evidence is None else f" (evidence {evidence:+.2f})"
+        )
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"

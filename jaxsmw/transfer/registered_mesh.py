@@ -23,7 +23,7 @@ DEFAULT_STIFFNESS = 0.003
 # The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
 _STIFFNESS_OF_MAPS = 0.01
 # The neighbourhoods whose similarity transformations the mesh follows are averaged this number of times. With
-# fewer averagings, the transformations follow the noise of the map. (Entry R21 of docs/research_log.md)
+# fewer averagings, the transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
 # The transformations are fitted to the map, and once again to the result. (Entry R22)
 _FITS = 2

@@ -1,0 +1,162 @@
+"""The search for the hand of a pair: left and right teeth, and bodies that are their own mirror image."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from synthetic import bumpy_mesh
+
+import jaxsmw
+from jaxsmw import Mesh, Pair, creature_pair, make_mesh, match, paired_spectra
+from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
+from jaxsmw.repair.chirality import Hands, decide
+from jaxsmw.repair.settings import ChiralitySettings
+
+
+@pytest.fixture(scope="module")
+def lump() -> Mesh:
+    """A lump without symmetry."""
+    return bumpy_mesh(4)
+
+
+def turned(mesh: Mesh, *, seed: int = 0) -> Mesh:
+    """The mesh in another place, with other numbers of the vertices: vertex i becomes `order[i]`."""
+    order = np.random.default_rng(seed).permutation(len(mesh.vertices))
+    vertices = np.empty_like(mesh.vertices)
+    vertices[order] = Rotation.random(random_state=seed).apply(mesh.vertices) * 3 + 1
+    return make_mesh(vertices, order[mesh.faces], name="turned")
+
+
+def order_of(mesh: Mesh, *, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(len(mesh.vertices))
+
+
+def share_right(found: np.ndarray, mesh: Mesh) -> float:
+    """The share of vertices whose match is near the vertex of which it is the image."""
+    order = order_of(mesh)
+    back = np.argsort(order)[found]
+    apart = np.linalg.norm(mesh.vertices[back] - mesh.vertices, axis=1)
+    return float((apart < 0.1 * mesh.area**0.5).mean())
+
+
+def test_a_mirror_image_keeps_numbers_and_normals_point_outward(lump):
+    image = lump.mirrored()
+    np.testing.assert_array_equal(image.vertices, lump.vertices * [-1, 1, 1])
+    assert not image.is_inside_out
+    np.testing.assert_allclose(image.vertex_normals, lump.vertex_normals * [-1, 1, 1], atol=1e-12)
+    np.testing.assert_array_equal(image.mirrored().faces, lump.faces)
+    np.testing.assert_array_equal(image.mirrored().vertices, lump.vertices)
+
+
+def test_descriptors_of_a_mirror_image_are_those_of_the_surface_in_another_order(lump):
+    of_image = shot_descriptors(lump.mirrored(), radius=0.2)
+    of_itself = shot_descriptors(lump, radius=0.2)
+    np.testing.assert_allclose(mirrored_descriptors(of_itself), of_image, atol=1e-5)
+    assert np.abs(of_itself - of_image).max() > 0.1
+
+
+@pytest.mark.parametrize("opposite", [False, True])
+def test_auto_finds_the_hand_of_a_lump(lump, opposite):
+    target = turned(lump.mirrored() if opposite else lump)
+    found = match(lump, target, preset="fast", mirror="auto")
+    assert found.mirrored is opposite
+    assert found.mirror_evidence is not None
+    assert (found.mirror_evidence > 0) is opposite
+    assert not found.suspicious
+    assert share_right(found.pointwise_map, lump) > 0.95
+    same = match(lump, target, preset="fast", mirror="yes" if opposite else "no")
+    np.testing.assert_array_equal(same.pointwise_map, found.pointwise_map)
+    assert same.mirror_evidence is None
+
+
+def test_the_given_hand_is_used(lump):
+    target = turned(lump)
+    given = match(lump, target, preset="fast", mirror="yes")
+    alone = match(lump.mirrored(), target, preset="fast")
+    assert (given.mirrored, alone.mirrored, given.mirror_evidence) == (True, False, None)
+    assert ", mirrored" in repr(given)
+    np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
+
+
+def test_a_mirrored_result_is_in_terms_of_the_source(lump):
+    target = turned(lump.mirrored())
+    found = match(lump, target, mirror="yes")
+    assert found.mesh_x is lump
+    own, _ = paired_spectra(Pair.make(lump, target), 20)
+    np.testing.assert_allclose(found.spectrum_x.positions, own.positions, atol=1e-6)
+    np.testing.assert_allclose(found.spectrum_x.normals, own.normals, atol=1e-6)
+    points = found.surface_points()
+    places = np.einsum("pc,pcd->pd", points.weights, target.vertices[target.faces[points.faces]])
+    right = target.vertices[order_of(lump)]
+    assert np.median(np.linalg.norm(places - right, axis=1)) < 0.02 * target.area**0.5
+    assert np.median(found.expected_error()) < 0.02
+    assert found.distortion < 1.1
+
+
+def test_a_creature_is_its_own_mirror_image(lump):
+    pair = creature_pair(vertices=1500)
+    found = match(pair.source, pair.target, preset="fast", mirror="auto")
+    assert not found.mirrored
+    alone = match(pair.source, pair.target, preset="fast", mirror="no")
+    np.testing.assert_array_equal(found.pointwise_map, alone.pointwise_map)
+
+
+def test_small_meshes_give_no_evidence():
+    small = bumpy_mesh(1)
+    found = match(small, turned(small), preset="paper", init="wks", mirror="auto")
+    assert found.mirror_evidence is None
+    assert not found.mirrored
+
+
+def test_the_hands_of_a_partial_pair_are_not_compared(lump):
+    kept = lump.vertices[lump.faces].mean(axis=1)[:, 2] > 0
+    part = make_mesh(lump.vertices, lump.faces[kept])
+    found = match(part, lump, preset="fast", partial=True, mirror="auto")
+    assert (found.mirrored, found.mirror_evidence) == (False, None)
+    assert match(part, lump.mirrored(), preset="fast", partial=True, mirror="yes").mirrored
+
+
+def test_decisions():
+    settings = ChiralitySettings()
+    assert decide(None) == (False, None, False)
+    assert decide(settings.mirrored_from + 1) == (True, settings.mirrored_from + 1, False)
+    assert not decide(settings.mirrored_from - 1).mirrored
+    assert decide(settings.mirrored_from - settings.doubt / 2).doubtful
+    assert decide(settings.mirrored_from + settings.doubt / 2)[::2] == (True, True)
+
+
+@pytest.mark.parametrize(("evidence", "mirrored"), [(0.07, False), (0.13, True)])
+def test_a_doubtful_hand_is_flagged(lump, monkeypatch, evidence, mirrored):
+    monkeypatch.setattr(Hands, "evidence", lambda self: evidence)
+    with pytest.warns(UserWarning, match="match the target about equally well"):
+        found = match(lump, turned(lump), preset="fast", mirror="auto")
+    assert found.suspicious
+    assert found.mirrored is mirrored
+    assert found.mirror_evidence == evidence
+
+
+def test_evidence_has_opposite_signs_for_opposite_hands(lump):
+    for target, sign in ((turned(lump), -1), (turned(lump.mirrored()), 1)):
+        pair = Pair.make(lump, target)
+        assert np.sign(Hands(pair, *paired_spectra(pair, 40)).evidence()) == sign
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("names", "opposite"), [(("T04", "J12"), True), (("T04", "Q28"), False)])
+def test_teeth(shared, names, opposite):
+    directory = shared / "data" / "primate_molars"
+    x, y = (jaxsmw.read_mesh(directory / f"{name}_sas.off") for name in names)
+    landmarks: dict[str, list[list[float]]] = {}
+    with open(directory / "landmarks.csv") as file:
+        for row in csv.DictReader(file):
+            landmarks.setdefault(row["mesh"], []).append([float(row[axis]) for axis in "xyz"])
+    on_x, on_y = (np.array(landmarks[f"{name}_sas.off"]) for name in names)
+    found = match(x, y, mirror="auto")
+    assert found.mirrored is opposite
+    assert not found.suspicious
+    _, vertices = KDTree(x.vertices).query(on_x)
+    matches = y.vertices[found.pointwise_map[vertices]]
+    errors = np.linalg.norm(matches - on_y, axis=1) / np.linalg.norm(np.ptp(y.vertices, axis=0))
+    assert errors.mean() < 0.1
