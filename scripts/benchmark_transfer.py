@@ -1,15 +1,15 @@
-"""Measures registered meshes on remeshed bodies, and landmarks carried between scans of teeth, jaws and skulls.
+"""Measures registered meshes on remeshed bodies, and landmarks carried between teeth, jaws and skulls.
 
-    python scripts/benchmark_transfer.py DATA_DIRECTORY --output docs/results/transfer
-    python scripts/benchmark_transfer.py DATA_DIRECTORY --pairs 5 --parts meshes mandibles
+    pip install -e ".[benchmark,peers]"
+    python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
+    python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars mouse_mandibles mouse_skulls --pairs 40
 
-`DATA_DIRECTORY` contains `faust_r`, `tosca_r`, `smal_r`, `primate_molars`, `mouse_mandibles` and `mouse_skulls`. The
-pairs are drawn with seed 0. Results are stored pair by pair in `OUTPUT/meshes.csv` and `OUTPUT/landmarks.csv`; the
-same command continues where it was interrupted.
-
-Registered meshes are compared with `surface_points`. Landmarks are compared with three other ways to carry them: rigid
-alignment and the nearest point (the best of several initial rotations), non-rigid coherent point drift (pycpd) after
-this alignment, and the map alone without projection. Distances are in thousandths of the diagonal of the target.
+Pairs are drawn with seed 0. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same
+command continues where it was interrupted. Distances of landmarks are in thousandths of the diagonal of the
+target's bounding box. Landmarks are carried by four methods: the registered mesh, the map alone, rigid
+alignment and the nearest point, and non-rigid coherent point drift (pycpd) after this alignment, with nine
+settings. Molars of opposite sides are matched with `mirror="yes"`, and all methods then use the mirror image
+of the source.
 """
 
 from __future__ import annotations
@@ -18,24 +18,222 @@ import argparse
 import csv
 import itertools
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation import geodesic_error, read_ground_truth
 from jaxsmw.evaluation.journal import Journal
-from jaxsmw.geometry import Mesh, farthest_point_samples, nearest_surface_points
+from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
-from jaxsmw.io import Landmarks, read_landmark_file, read_mesh
-from jaxsmw.matching import Correspondence, match
-from jaxsmw.runtime.provenance import provenance
+from jaxsmw.io import Landmarks, read_landmark_file
+from jaxsmw.matching import Correspondence
+from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import RegisteredMesh, transfer_landmarks
 
-BODIES = ("faust_r", "tosca_r", "smal_r")
-SCANS = ("primate_molars", "mouse_mandibles", "mouse_skulls")
+# The number of points of each shape for rigid alignment and for coherent point drift.
+_POINTS = 1000
+
+
+def main() -> None:
+    """Measure the data sets that the command line names, and print a summary of each."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument("sets", nargs="+", metavar="DATA_SET")
+    parser.add_argument(
+        "--pairs", type=int, default=20, help="number of pairs of each data set (default: 20)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("transfer"), help="directory of the results")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    for name in options.sets:
+        measure = _measure_body if name in _BODIES else _measure_scan
+        journal = Journal(options.output / f"{name}.csv", ("source", "target"))
+        for source, target in _draw(options.directory / name, options.pairs):
+            if (source.stem, target.stem) not in journal:
+                row = {"source": source.stem, "target": target.stem, **measure(source, target)}
+                journal.append([row])
+                print(row, flush=True)
+        print(f"{name}: {_summary(journal)}\n{made_with()}", flush=True)
+
+
+_BODIES = ("faust_r", "tosca_r", "smal_r")
+
+
+def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
+    """Return random pairs of meshes of a data set, or all pairs if there are fewer."""
+    listing = directory / "test_pairs.txt"
+    if listing.exists():
+        by_name = {file.stem: file for file in directory.rglob("*.off")}
+        pairs = [tuple(by_name[name.removesuffix(".off")] for name in line.split()[:2])
+                 for line in listing.read_text("utf-8").splitlines()]  # fmt: skip
+    else:
+        files = sorted(file for file in directory.rglob("*") if file.suffix in (".off", ".ply", ".vtk"))
+        pairs = list(itertools.permutations(files, 2))
+    if not pairs:
+        raise InputError(f"{directory}: contains no meshes: give the directory of the data sets.")
+    chosen = np.random.default_rng(0).permutation(len(pairs))[:number]
+    return [pairs[i] for i in chosen]  # type: ignore[misc]
+
+
+def _measure_body(source: Path, target: Path) -> dict[str, Any]:
+    """Measure the registered mesh of a pair with ground truth."""
+    mesh_x, mesh_y = read_mesh(source), read_mesh(target)
+    truth_files = [source.parents[1] / "corres" / f"{file.stem}.vts" for file in (source, target)]
+    truth = read_ground_truth(truth_files, mesh_x, mesh_y)
+    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=False)
+    points = found.surface_points()
+    return {
+        "error_of_points": 1e3 * geodesic_error(mesh_y, points, truth).mean,
+        "error_of_registered": 1e3 * geodesic_error(mesh_y, registered.surface_points, truth).mean,
+        "share_within": float((registered.distances < 0.005 * np.sqrt(mesh_y.area)).mean()),
+        "flipped": float(registered.flipped_faces.mean()),
+        **seconds,
+    }
+
+
+def _register(
+    mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool
+) -> tuple[Correspondence, RegisteredMesh, dict[str, float]]:
+    """Match and register a pair, and measure both times."""
+    start = time.perf_counter()
+    found = match(mesh_x, mesh_y, mirror="yes" if mirrored else "no")
+    matched = time.perf_counter()
+    registered = found.registered_mesh()
+    times = {"match_seconds": matched - start, "transfer_seconds": time.perf_counter() - matched}
+    return found, registered, times
+
+
+def _measure_scan(source: Path, target: Path) -> dict[str, Any]:
+    """Measure the distances of carried landmarks to manual landmarks, by several methods."""
+    mesh_x, mesh_y = read_mesh(source), read_mesh(target)
+    marks_x, marks_y = _landmarks(source), _landmarks(target)
+    names = [name for name in marks_x.names if name in set(marks_y.names)]
+    marks_x, marks_y = marks_x.select(names), marks_y.select(names)
+    mirrored = _side(source) != _side(target)
+    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored)
+    on_source, off_source = nearest_surface_points(marks_x.positions, mesh_x)
+    _, off_target = nearest_surface_points(marks_y.positions, mesh_y)
+    hand = np.array([-1.0 if mirrored else 1.0, 1, 1])
+    carried = {
+        "registered": transfer_landmarks(marks_x, registered).landmarks.positions,
+        "map": mesh_y.vertices[found.pointwise_map[on_source.nearest_corners(mesh_x)]],
+        **_aligned(mesh_x, mesh_y, marks_x.positions, hand),
+    }
+    unit = 1e-3 * bounding_box_diagonal(mesh_y)
+    row: dict[str, Any] = {"mirrored": mirrored}
+    for method, positions in carried.items():
+        distances = np.linalg.norm(positions - marks_y.positions, axis=1) / unit
+        row |= {f"{method}_mean": distances.mean(), f"{method}_median": float(np.median(distances))}
+    noise = (off_source / bounding_box_diagonal(mesh_x) * 1e3).mean(), (off_target / unit).mean()
+    return {**row, "manual_noise": float(np.mean(noise)), **seconds}
+
+
+def _landmarks(file: Path) -> Landmarks:
+    """Read the manual landmarks of a scan, from the file that its data set has."""
+    markups = file.with_suffix(".mrk.json")
+    if markups.exists():
+        return read_landmark_file(markups)
+    table = file.with_suffix(".csv")
+    if table.exists():
+        return read_landmark_file(table)
+    with open(file.parent / "landmarks.csv", encoding="utf-8") as rows:
+        own = [row for row in csv.DictReader(rows) if row["mesh"] == file.name]
+    positions = np.array([[float(row[axis]) for axis in "xyz"] for row in own])
+    return Landmarks(tuple(row["landmark"] for row in own), positions, name=str(file))
+
+
+def _side(file: Path) -> str:
+    """Return the side of a tooth, or an empty text for other scans."""
+    table = file.parent / "chirality.csv"
+    if not table.exists():
+        return ""
+    with open(table, encoding="utf-8") as rows:
+        sides = {row["name"]: row["side"] for row in csv.DictReader(rows)}
+    return sides.get(file.stem, sides.get(file.stem.removesuffix("_sas"), ""))
+
+
+def _aligned(
+    mesh_x: Mesh, mesh_y: Mesh, marks: Float64[np.ndarray, "l 3"], hand: Float64[np.ndarray, " 3"]
+) -> dict[str, Float64[np.ndarray, "l 3"]]:
+    """Carry landmarks by rigid alignment, and by coherent point drift after it."""
+    samples_x = mesh_x.vertices[farthest_point_samples(mesh_x, _POINTS)] * hand
+    samples_y = mesh_y.vertices[farthest_point_samples(mesh_y, _POINTS)]
+    (middle_x, size_x), (middle_y, size_y) = map(_placement, (samples_x, samples_y))
+    x, y = (samples_x - middle_x) / size_x, (samples_y - middle_y) / size_y
+    rotation = _best_rotation(x, y)
+    landmarks = (marks * hand - middle_x) / size_x @ rotation.T
+    moved = {"rigid": landmarks, **_drifted(x @ rotation.T, y, landmarks)}
+    placed = {name: positions * size_y + middle_y for name, positions in moved.items()}
+    return {name: nearest_surface_points(p, mesh_y)[0].positions(mesh_y) for name, p in placed.items()}
+
+
+def _placement(points: Float64[np.ndarray, "p 3"]) -> tuple[Float64[np.ndarray, " 3"], float]:
+    middle = points.mean(axis=0)
+    return middle, float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean()))
+
+
+def _best_rotation(
+    x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation of the best of many runs of iterative closest points, from rotations of a grid."""
+    tree = KDTree(y)
+    best, least = np.eye(3), np.inf
+    for start in [np.eye(3), *Rotation.create_group("O").as_matrix() @ _principal(x, y)]:
+        rotation = start
+        for _ in range(30):
+            _, nearest = tree.query(x @ rotation.T)
+            left, _, right = np.linalg.svd(y[nearest].T @ x)
+            rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+        distance = tree.query(x @ rotation.T)[0].mean() + KDTree(x @ rotation.T).query(y)[0].mean()
+        if distance < least:
+            best, least = rotation, distance
+    return best
+
+
+def _principal(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return a rotation between the principal axes of two point sets."""
+    axes = [np.linalg.svd(points.T @ points)[0] for points in (x, y)]
+    axes = [frame * np.linalg.det(frame) for frame in axes]
+    return axes[1] @ axes[0].T
+
+
+def _drifted(
+    x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"], landmarks: Float64[np.ndarray, "l 3"]
+) -> dict[str, Float64[np.ndarray, "l 3"]]:
+    """Return landmarks moved by coherent point drifts from x to y, with several settings.
+
+    The landmarks are further points of x, because pycpd moves only the points that it aligns.
+    """
+    from pycpd import DeformableRegistration
+
+    moved = {}
+    for alpha, beta in itertools.product((0.1, 1.0, 10.0), (0.5, 1.0, 2.0)):
+        points = np.vstack([x, landmarks])
+        drift = DeformableRegistration(X=y, Y=points, alpha=alpha, beta=beta, max_iterations=100)
+        moved[f"cpd_{alpha:g}_{beta:g}"] = drift.register()[0][len(x) :]
+    return moved
+
+
+def _summary(journal: Journal) -> str:
+    """Return the mean of each column, with a 95 % bootstrap interval over the pairs."""
+    generator = np.random.default_rng(0)
+    found = []
+    for column in journal.rows[0]:
+        if column not in ("source", "target", "mirrored"):
+            values = np.array([float(row[column]) for row in journal.rows])
+            means = values[generator.integers(len(values), size=(1000, len(values)))].mean(axis=1)
+            low, high = np.quantile(means, [0.025, 0.975])
+            found.append(f"{column} {values.mean():.4g} ({low:.4g} to {high:.4g})")
+    return f"{len(journal.rows)} pairs, " + ", ".join(found)
+
+
+if __name__ == "__main__":
+    main()

@@ -128,7 +128,7 @@ def test_stand_orients_faces_consistently() -> None:
 def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
     with pytest.raises(InputError, match="nothing to draw"):
         stand(replace(TALL, vertices=0 * TALL.vertices))
-    with pytest.raises(InputError, match="choose one of x, y, z"):
+    with pytest.raises(InputError, match="choose x, y, z"):
         stand(TALL, "w")  # type: ignore[arg-type]
 
 

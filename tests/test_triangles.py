@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import nnls
 from synthetic import bumpy_mesh
 
-from jaxsmw.core.triangles import nearest_point_on_triangles
+from jaxsmw.core.triangles import nearest_point_on_candidates, nearest_point_on_triangles
 
 
 @pytest.fixture
@@ -116,3 +116,17 @@ def test_no_array_of_all_queries_and_triangles_is_stored():
     )
     memory = jax.jit(nearest_point_on_triangles).lower(*shapes).compile().memory_analysis()
     assert memory.temp_size_in_bytes < m * f * 4 / 4
+
+
+def test_candidates_give_the_nearest_point_of_their_triangles(generator):
+    points, queries = generator.normal(size=(20, 5)), generator.normal(size=(40, 5))
+    faces = np.array([generator.choice(20, 3, replace=False) for _ in range(30)])
+    rows = np.repeat(np.arange(40), 7)
+    candidates = generator.integers(30, size=len(rows))
+    face, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, candidates)))
+    for query in range(40):
+        own = candidates[rows == query]
+        _, _, distance = found(queries[query : query + 1], points, faces[own])
+        there = weights[query] @ points[faces[face[query]]]
+        assert face[query] in own
+        np.testing.assert_allclose(np.linalg.norm(there - queries[query]), distance[0], rtol=1e-6)

@@ -93,7 +93,7 @@ def nearest_point_on_candidates(
     def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:
         row, face = pair
         corners = points[faces[face]]
-        edges, away = corners[1:] - corners[0], queries[row] - corners[0]
+        edges, away = corners[1:] - corners[:1], queries[row] - corners[0]
         along, gram = edges @ away, edges @ edges.T
         squared, s, t = _closest(away @ away, along[0], along[1], gram[0, 0], gram[0, 1], gram[1, 1])
         return squared, jnp.stack([s, t])

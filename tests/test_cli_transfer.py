@@ -1,0 +1,151 @@
+"""`jaxsmw transfer` writes registered meshes, landmarks and attributes, and refuses what it cannot use."""
+
+import json
+
+import numpy as np
+import pytest
+from command_line import SMALL, assert_refused, runner, write_pair
+
+import jaxsmw
+from jaxsmw.io import Landmarks, read_landmark_file, read_mesh_data, write_landmark_file, write_mesh_data
+from jaxsmw.io.mesh_data import MeshData
+
+
+@pytest.fixture
+def run(capsys):
+    return runner(capsys)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A pair with its true map; the source has labels, and landmarks."""
+    directory = write_pair(tmp_path_factory.mktemp("pair"))
+    mesh = jaxsmw.read_mesh(directory / "x.off")
+    labels = (mesh.vertices[:, 0] > 0).astype(np.int64)
+    write_mesh_data(directory / "x.ply", MeshData(mesh, mesh.faces, vertex_data={"side": labels}))
+    write_landmark_file(
+        directory / "x.mrk.json", Landmarks(("a", "b"), mesh.vertices[[3, 400]], coordinates="LPS")
+    )
+    return directory
+
+
+def test_all_files_are_written(run, pair, tmp_path):
+    outcome = run(
+        "transfer", pair / "x.ply", pair / "y.ply", *SMALL,
+        "--registered", tmp_path / "r.vtp", "--attributes", tmp_path / "a.ply",
+        "--landmarks", pair / "x.mrk.json", "--landmarks-output", tmp_path / "l.csv",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    source, target = jaxsmw.read_mesh(pair / "x.off"), jaxsmw.read_mesh(pair / "y.ply")
+    truth = np.loadtxt(pair / "truth.txt", dtype=int)
+    registered = read_mesh_data(tmp_path / "r.vtp")
+    np.testing.assert_array_equal(registered.faces, source.faces)
+    root = np.sqrt(target.area)
+    apart = np.linalg.norm(registered.mesh.vertices - target.vertices[truth], axis=1) / root
+    assert apart.mean() < 0.05
+    labels = read_mesh_data(tmp_path / "a.ply").vertex_data["side"]
+    assert set(np.unique(labels)) == {0, 1}
+    assert (labels[truth] == (source.vertices[:, 0] > 0)).mean() > 0.9
+    carried = read_landmark_file(tmp_path / "l.csv")
+    assert carried.names == ("a", "b")
+    assert np.linalg.norm(carried.positions - target.vertices[truth[[3, 400]]], axis=1).max() < 0.2 * root
+    assert "distance to the target" in outcome.output and "landmark b: expected error" in outcome.output
+    assert "are in LPS coordinates" in outcome.errors
+
+
+def test_a_map_replaces_the_match(run, pair, tmp_path):
+    outcome = run(
+        "transfer",
+        pair / "x.off",
+        pair / "y.ply",
+        "--map",
+        pair / "truth.txt",
+        "--registered",
+        tmp_path / "r.off",
+    )
+    assert outcome.code == 0, outcome.errors
+    assert "refinement" not in outcome.errors
+    target = jaxsmw.read_mesh(pair / "y.ply")
+    truth = np.loadtxt(pair / "truth.txt", dtype=int)
+    apart = np.linalg.norm(jaxsmw.read_mesh(tmp_path / "r.off").vertices - target.vertices[truth], axis=1)
+    assert np.quantile(apart, 0.99) < 0.02 * np.sqrt(target.area)
+
+
+def test_a_stiffer_mesh_is_farther_away(run, pair, tmp_path):
+    far = []
+    for stiffness in ("0.003", "0.1"):
+        outcome = run(
+            "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt",
+            "--registered", tmp_path / f"{stiffness}.off", "--stiffness", stiffness,
+        )  # fmt: skip
+        far.append(float(outcome.output.split("mean ")[1].split(" %")[0]))
+    assert far[1] > 2 * far[0]
+
+
+def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
+    target = jaxsmw.read_mesh(pair / "y.ply")
+    source = jaxsmw.read_mesh(pair / "x.off")
+    truth = np.loadtxt(pair / "truth.txt", dtype=int)
+    chosen = np.arange(0, len(truth), 60)
+    names = tuple(f"p{i}" for i in chosen)
+    write_landmark_file(tmp_path / "x.csv", Landmarks((*names, "alone"), source.vertices[[*chosen, 1]]))
+    write_landmark_file(tmp_path / "y.csv", Landmarks(names[::-1], target.vertices[truth[chosen]][::-1]))
+    np.savetxt(tmp_path / "pairs.txt", np.stack([chosen, truth[chosen]], axis=1), "%d")
+    for init, output in ((f"{tmp_path}/x.csv,{tmp_path}/y.csv", "a.txt"), (f"{tmp_path}/pairs.txt", "b.txt")):
+        outcome = run(
+            "match",
+            pair / "x.off",
+            pair / "y.ply",
+            *SMALL,
+            "--init",
+            f"landmarks:{init}",
+            "--output",
+            tmp_path / output,
+        )
+        assert outcome.code == 0, outcome.errors
+        assert ("without a partner, such as 'alone'" in outcome.errors) == (output == "a.txt")
+    assert (tmp_path / "a.txt").read_text() == (tmp_path / "b.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        ("", "nothing to write"),
+        ("--landmarks {p}/x.mrk.json", "nothing to write"),
+        ("--landmarks-output {t}/l.csv", "--landmarks-output: has no effect without --landmarks"),
+        ("--registered {t}/r.off --landmarks {p}/x.mrk.json", "--landmarks: has no effect without --landmarks-output"),
+        ("--registered {t}/r.off --coordinates LPS", "--coordinates: has no effect without --landmarks"),
+        ("--registered {t}/r.xyz", "r.xyz: meshes cannot be written"),
+        ("--attributes {t}/r", "meshes cannot be written as"),
+        ("--registered {p}/x.off", "would be overwritten"),
+        ("--registered {t}/a.off --attributes {t}/a.off", "two outputs have this name"),
+        ("--registered {t}/r.off --stiffness 0", "is not a positive number"),
+        ("--registered {t}/r.off --stiffness nan", "is not a positive number"),
+        ("--registered {t}/r.off --map {t}/missing.txt", "missing.txt"),
+        ("--registered {t}/r.off --map {p}/truth.txt --preset fast", "--preset has no effect with --map"),
+        ("--registered {t}/r.off --map {p}/truth.txt --init wks", "--init has no effect with --map"),
+        ("--registered {t}/r.off --index-base 1", "--index-base: has no effect without --map"),
+        ("--landmarks {p}/x.mrk.json --landmarks-output {t}/l.mps", "l.mps"),
+        ("--landmarks {p}/x.off --landmarks-output {t}/l.csv", "x.off"),
+        ("--landmarks {t}/missing.pp --landmarks-output {t}/l.csv", "missing.pp"),
+        ("--landmarks {p}/x.mrk.json --landmarks-output {t}/l.csv --coordinates XYZ", "invalid choice: 'XYZ'"),
+        ("--registered {t}/r.off --init landmarks:{p}/x.mrk.json,{t}/missing.csv", "missing.csv"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
+    given = arguments.format(p=pair, t=tmp_path).split()
+    outcome = run("transfer", pair / "x.off", pair / "y.ply", *given, "--quiet")
+    assert_refused(outcome, naming=fault)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_landmarks_without_a_common_name_are_refused(run, pair, tmp_path):
+    other = json.loads((pair / "x.mrk.json").read_text())
+    for point in other["markups"][0]["controlPoints"]:
+        point["label"] += "2"
+    (tmp_path / "y.mrk.json").write_text(json.dumps(other))
+    init = f"landmarks:{pair / 'x.mrk.json'},{tmp_path / 'y.mrk.json'}"
+    outcome = run(
+        "match", pair / "x.off", pair / "y.ply", "--init", init, "--output", tmp_path / "m.txt", "--quiet"
+    )
+    assert_refused(outcome, naming="has no landmark with the name of a landmark of")
