@@ -124,6 +124,7 @@ def test_candidates_give_the_nearest_point_of_their_triangles(generator):
     rows = np.repeat(np.arange(40), 7)
     candidates = generator.integers(30, size=len(rows))
     face, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, candidates)))
+    face, weights = np.asarray(face), np.asarray(weights)
     for query in range(40):
         own = candidates[rows == query]
         _, _, distance = found(queries[query : query + 1], points, faces[own])
