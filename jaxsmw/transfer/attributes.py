@@ -37,10 +37,7 @@ class _Corners(NamedTuple):
     def matrix(self, n: int) -> csr_array:
         """The matrix (p, n) that computes weighted means of n rows."""
         p, k = self.rows.shape
-        entries = self.weights.ravel(), self.rows.ravel(), np.arange(p + 1) * k
-        matrix = csr_array(entries, shape=(p, n))
-        matrix.sum_duplicates()
-        return matrix
+        return csr_array((self.weights.ravel(), self.rows.ravel(), np.arange(p + 1) * k), shape=(p, n))
 
 
 def transfer_attributes(
@@ -56,6 +53,7 @@ def transfer_attributes(
       rotation.
     - Integers, such as labels, are never averaged. They are decided by a vote of the three corners with
       barycentric weights, or of the four points of a face. A row of several integers is one label.
+      Labels are not smoothed, so a region that is thinner than a face of Y may leave single faces.
     - Texture coordinates: each face of Y is mapped to one side of the seams of X, the side at its centroid.
       Along seams, vertices of Y have several texture vertices. A face whose nearest face of X has no texture
       has none.
