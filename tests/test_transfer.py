@@ -393,6 +393,20 @@ class TestAttributes:
         used = data.mesh.referenced_vertices
         assert np.allclose(out.vertex_data["place"][used], data.mesh.vertices[used], atol=1e-3)
 
+    def test_a_target_with_duplicates_and_a_speck(self):
+        target, _ = with_loose_vertices()
+        data = cylinder(30, 60)
+        points = nearest_surface_points(data.mesh.vertices, target.mesh)[0]
+        out = transfer_attributes(
+            replace(data, vertex_data={"place": data.mesh.vertices}),
+            register_mesh(data.mesh, target.mesh, points),
+            target,
+        )
+        assert np.array_equal(out.faces, target.faces) and out.texture.corners.shape == target.faces.shape
+        assert np.array_equal(out.vertex_data["place"][642:648], out.vertex_data["place"][:6])
+        assert np.array_equal(out.vertex_data["number"], target.vertex_data["number"])
+        assert np.array_equal(out.blend_shapes["smile"], target.blend_shapes["smile"])
+
 
 class TestRegisteredData:
     def test_faces_and_order_are_kept(self, tmp_path):
