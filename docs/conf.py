@@ -71,6 +71,7 @@ _MODULES = (
     "jaxsmw.learning",
     "jaxsmw.geometry",
     "jaxsmw.io",
+    "jaxsmw.transfer",
     "jaxsmw.evaluation",
 )
 # The documented path of each public name.

@@ -1,4 +1,4 @@
-from . import banks, evaluation, functional_maps, geometry, io, learning
+from . import banks, evaluation, functional_maps, geometry, io, learning, transfer
 from .core.banks import CubicSpline, FilterBank, Meyer
 from .core.functional_map import encode
 from .core.pointwise_map import decode
@@ -79,6 +79,7 @@ __all__ = [
     "refine",
     "refine_pairs",
     "stack",
+    "transfer",
     "write_mesh",
     "write_pointwise_map",
 ]

@@ -58,3 +58,46 @@ def distances_to_surface(points: Float64[np.ndarray, "p 3"], mesh: Mesh) -> Floa
 def bounding_box_diagonal(mesh: Mesh) -> float:
     """Return the length of the diagonal of the box around all faces of a mesh, in the unit of the mesh."""
     return float(np.linalg.norm(np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0)))
+
+
+def nearest_points_of_triangles(
+    points: Float64[np.ndarray, "p 3"], triangles: Float64[np.ndarray, "p 3 3"]
+) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
+    """Find the nearest point of one triangle for each point in space.
+
+    **Arguments:**
+
+    - `points`: positions (p, 3).
+    - `triangles`: the positions of the three corners of each point's triangle (p, 3, 3).
+
+    **Returns:** The barycentric weights of the nearest points (p, 3), and the distances to them (p,).
+    """
+    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    away = points - a
+    uu, uv, vv = (u * u).sum(axis=1), (u * v).sum(axis=1), (v * v).sum(axis=1)
+    along_u, along_v = (away * u).sum(axis=1), (away * v).sum(axis=1)
+
+    def ratio(along: np.ndarray, length: np.ndarray) -> np.ndarray:
+        return np.divide(along, length, out=np.zeros_like(along), where=length > 0)
+
+    # The nearest point a + s u + t v lies on one of the three edges, or inside the triangle.
+    on_u, on_v = np.clip(ratio(along_u, uu), 0, 1), np.clip(ratio(along_v, vv), 0, 1)
+    across = np.clip(ratio(along_v - along_u + uu - uv, uu - 2 * uv + vv), 0, 1)
+    determinant = uu * vv - uv**2
+    s = ratio(vv * along_u - uv * along_v, determinant)
+    t = ratio(uu * along_v - uv * along_u, determinant)
+    inside = (determinant > 0) & (s >= 0) & (t >= 0) & (s + t <= 1)
+    zero = np.zeros_like(on_u)
+    options = np.stack(
+        [
+            np.stack([np.where(inside, s, on_u), np.where(inside, t, zero)]),
+            np.stack([on_u, zero]),
+            np.stack([zero, on_v]),
+            np.stack([1 - across, across]),
+        ]
+    )
+    rest = away - options[:, 0, :, None] * u - options[:, 1, :, None] * v
+    squared = (rest**2).sum(axis=2)
+    best, rows = squared.argmin(axis=0), np.arange(len(points))
+    s, t = options[best, 0, rows], options[best, 1, rows]
+    return np.stack([np.maximum(1 - s - t, 0), s, t], axis=1), np.sqrt(squared[best, rows])

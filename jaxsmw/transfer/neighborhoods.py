@@ -19,6 +19,8 @@ _WEIGHT_RANGE = 10.0
 # The scale of a neighbourhood is limited to the range from 1/_SCALE_RANGE to _SCALE_RANGE. Where a map
 # collapses a region to a point, the scale would otherwise be zero.
 _SCALE_RANGE = 5.0
+# A mesh is flat if the determinants of its moments are below this fraction of the cubed largest moments.
+_FLAT = 1e-12
 
 
 class Similarities(NamedTuple):
@@ -32,6 +34,10 @@ class Similarities(NamedTuple):
 
     rotations: Float64[np.ndarray, "n 3 3"]
     scales: Float64[np.ndarray, " n"]
+
+    def of_vectors(self, vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """Return the vector at each vertex (n, 3), rotated and scaled."""
+        return self.scales[:, None] * np.einsum("nij,nj->ni", self.rotations, vectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +111,8 @@ class Neighborhoods:
             sums = self.averaging @ sums
         moments, lengths = sums[:, :9].reshape(-1, 3, 3), sums[:, 9]
         left, singular, right = np.linalg.svd(moments)
-        hand = -1.0 if np.linalg.det(moments).sum() < 0 else 1.0
+        # A flat mesh has no hand: its determinants are rounding errors.
+        hand = -1.0 if np.linalg.det(moments).sum() < -_FLAT * (singular[:, 0] ** 3).sum() else 1.0
         flip = np.where(np.linalg.det(left @ right) * hand < 0, -1.0, 1.0)
         left[:, :, 2] *= flip[:, None]
         singular[:, 2] *= flip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.geometry.mesh import Mesh, count_of, extend_to_unreferenced
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 
@@ -43,8 +43,11 @@ class RegisteredMesh:
     - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
     - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
       X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of the neighbourhood of each vertex, from X to the registered
-      mesh.
+    - `similarities`: the rotation and the scale of the neighbourhood of each vertex, from X in X's unit of
+      length to the registered mesh in Y's unit.
+
+    An unreferenced vertex of X has the similarity of the nearest referenced vertex and moves with it. A
+    duplicate that welding replaced has exactly the position of its twin.
     """
 
     mesh_x: Mesh
@@ -58,7 +61,7 @@ class RegisteredMesh:
     @cached_property
     def mesh(self) -> Mesh:
         """The registered mesh, with the faces of X in the order of X."""
-        return Mesh(self.vertices, self.mesh_x.faces, name=f"{self.mesh_x.name} on {self.mesh_y.name}")
+        return replace(self.mesh_x, vertices=self.vertices, name=f"{self.mesh_x.name} on {self.mesh_y.name}")
 
     @cached_property
     def surface_points(self) -> SurfacePoints:
@@ -120,22 +123,26 @@ class RegisteredMesh:
 
         The point of a vertex of Y is the nearest point of the registered mesh.
         """
-        return nearest_surface_points(self.mesh_y.vertices, self.mesh)[0]
+        return self._nearest_of_target[0]
 
     @cached_property
     def target_distances(self) -> Float64[np.ndarray, " n"]:
         """The distance from each vertex of Y to the registered mesh (n,), in Y's unit of length."""
-        return nearest_surface_points(self.mesh_y.vertices, self.mesh)[1]
+        return self._nearest_of_target[1]
+
+    @cached_property
+    def _nearest_of_target(self) -> tuple[SurfacePoints, Float64[np.ndarray, " n"]]:
+        return nearest_surface_points(self.mesh_y.vertices, self.mesh)
 
     def sentences(self) -> tuple[str, ...]:
         """Return sentences about the quality of the registered mesh."""
         unit = np.sqrt(self.mesh_y.area) / 100
-        far = np.quantile(self.distances, 0.99) / unit
+        distances = self.distances[self.mesh_x.referenced_vertices] / unit
         flipped = int(self.flipped_faces.sum())
         areas = np.quantile(self.area_ratios, [0.05, 0.95])
         return (
-            f"distance to the target: mean {self.distances.mean() / unit:.3f} %, 99th percentile {far:.3f} % "
-            "of the square root of the target's area.",
+            f"distance to the target: mean {distances.mean():.3f} %, 99th percentile "
+            f"{np.quantile(distances, 0.99):.3f} % of the square root of the target's area.",
             f"{count_of(flipped, 'flipped triangle')} of {len(self.mesh_x.faces)} "
             f"({flipped / len(self.mesh_x.faces):.3%}).",
             f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
@@ -203,7 +210,18 @@ def register_mesh(
             corners = np.zeros(len(weights))
             corners[mesh_x.faces[flipped]] = 1
             weights = np.where(around.averaging @ corners > 0, _REDUCED * weights, weights)
-    return RegisteredMesh(mesh_x, mesh_y, positions + middle, similarities)
+    similarities = Similarities(similarities.rotations, around.size * similarities.scales)
+    return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
+
+
+def _with_unreferenced(
+    mesh_x: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
+) -> tuple[Float64[np.ndarray, "m 3"], Similarities]:
+    """Move each unreferenced vertex with the nearest referenced vertex."""
+    nearest = extend_to_unreferenced(mesh_x, np.arange(len(positions)))
+    followed = Similarities(similarities.rotations[nearest], similarities.scales[nearest])
+    offsets = followed.of_vectors(mesh_x.vertices - mesh_x.vertices[nearest])
+    return positions[nearest] + offsets, followed
 
 
 def points_of_map(

@@ -1,0 +1,254 @@
+"""Transfer of the data on the source to the target, and to the registered mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int64, Shaped
+from scipy.sparse import csr_array
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.io.formats.data import COLORS, NORMALS
+from jaxsmw.io.mesh_data import MeshData, Skin, Texture
+from jaxsmw.transfer.registered_mesh import RegisteredMesh
+from jaxsmw.transfer.textures import transfer_texture
+
+# A vertex of the target is far from the registered mesh beyond this distance, in units of the square root of
+# the target's area. The vertex then probably belongs to a part that the source lacks.
+_FAR = 0.03
+# Each face of the target has the data of four points: its centroid, and the centroids of the three triangles
+# at its corners that arise when its edges are halved. The centroid decides when two labels have two votes.
+_SAMPLES = np.vstack([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])
+_VOTES = np.array([1.5, 1, 1, 1])
+_Value = TypeVar("_Value")
+
+
+class _Corners(NamedTuple):
+    """Rows of an array and their weights (p, k), for each of p results."""
+
+    rows: Int64[np.ndarray, "p k"]
+    weights: Float64[np.ndarray, "p k"]
+
+    def matrix(self, n: int) -> csr_array:
+        """The matrix (p, n) that computes weighted means of n rows."""
+        p, k = self.rows.shape
+        return csr_array((self.weights.ravel(), self.rows.ravel(), np.arange(p + 1) * k), shape=(p, n))
+
+
+def transfer_attributes(
+    data: MeshData, registered: RegisteredMesh, target: MeshData | Mesh | None = None
+) -> MeshData:
+    """Transfer all data on the vertices and faces of X to Y.
+
+    Each vertex of Y receives the values at the nearest point of the registered mesh, and each face of Y the
+    values at four of its points:
+
+    - Floats and colours are interpolated. A value that is not finite is never mixed with others: it spreads
+      only to where its vertex has the largest weight. Components of vectors are interpolated without a
+      rotation.
+    - Integers, such as labels, are never averaged. They are decided by a vote of the three corners with
+      barycentric weights, or of the four points of a face. A row of several integers is one label.
+      Labels are not smoothed, so a region that is thinner than a face of Y may leave single faces.
+    - Texture coordinates: each face of Y is mapped to one side of the seams of X, the side at its centroid.
+      Along seams, vertices of Y have several texture vertices. A face whose nearest face of X has no texture
+      has none.
+    - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertices of X; the
+      smallest weights are left out. Each row sums to 1, unless all weights of the nearest face are 0.
+    - Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and then
+      interpolated.
+    - Normals describe the shape of X, so they are not transferred.
+
+    Data of Y are kept where X has no data of the same name. Names of vertex data and face data are compared
+    together, because they share the names of labels.
+
+    **Arguments:**
+
+    - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
+    - `registered`: the `RegisteredMesh` of X on Y.
+    - `target`: Y, a `MeshData` whose `mesh` is `registered.mesh_y`, or a `Mesh`. With None (the default), it
+      is `registered.mesh_y`.
+
+    **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
+    which data of Y were replaced, and how many vertices of Y are farther from the registered mesh than 3 % of
+    the square root of Y's area. Such vertices have the values of the nearest point as well.
+
+    **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
+    """
+    numbers = _face_numbers(data, registered.mesh_x)
+    whole = _as_data(registered.mesh_y if target is None else target)
+    _check_mesh(whole.mesh, registered.mesh_y)
+    points = registered.points_of_target
+    corners = _Corners(data.faces[numbers[points.faces]], points.weights)
+    own = {name: values for name, values in data.vertex_data.items() if name != NORMALS}
+    vertex_data = {name: _mixed(name, values, corners) for name, values in own.items()}
+    face_data: dict[str, np.ndarray] = {}
+    if data.face_data:
+        sampled = _sampled_faces(registered, whole.faces, numbers)
+        face_data = {name: _mixed(name, values, sampled, _VOTES) for name, values in data.face_data.items()}
+    matrix = corners.matrix(len(data.mesh.vertices))
+    blend_shapes = {
+        name: matrix @ registered.similarities.of_vectors(moves) for name, moves in data.blend_shapes.items()
+    }
+    texture = whole.texture
+    if data.texture is not None:
+        coordinates, texture_corners = data.texture
+        texture = transfer_texture(Texture(coordinates, texture_corners[numbers]), registered, whole.faces)
+    taken = {*vertex_data, *face_data}
+    return replace(
+        whole,
+        mesh=replace(whole.mesh, notes=(*whole.mesh.notes, *_notes(data, whole, registered))),
+        vertex_data=_without(whole.vertex_data, taken) | vertex_data,
+        face_data=_without(whole.face_data, taken) | face_data,
+        blend_shapes=_without(whole.blend_shapes, blend_shapes) | blend_shapes,
+        texture=texture,
+        skin=whole.skin if data.skin is None else _mixed_skin(Skin(*data.skin), matrix),
+        label_names=_without(whole.label_names, taken) | dict(data.label_names),
+    )
+
+
+def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
+    """Return the data of X at the positions of the registered mesh.
+
+    The vertices, the faces, the texture, the skin, the labels and all other data keep their order and values.
+    Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and normals
+    are rotated. Vertices that only the file's own faces use, such as welded duplicates and the vertices of
+    small components, move with the nearest vertex of the mesh.
+
+    **Arguments:**
+
+    - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
+    - `registered`: the `RegisteredMesh` of X on Y.
+
+    **Returns:** A `MeshData` with m vertices in the unit of Y.
+
+    **Raises:** `InputError` if `data` does not belong to the registered mesh.
+    """
+    _check_mesh(data.mesh, registered.mesh_x)
+    similarities = registered.similarities
+    vertex_data = dict(data.vertex_data)
+    normals = vertex_data.get(NORMALS)
+    if normals is not None and normals.dtype.kind == "f" and normals.shape[1:] == (3,):
+        rotated = np.einsum("mij,mj->mi", similarities.rotations, normals.astype(np.float64))
+        vertex_data[NORMALS] = rotated.astype(normals.dtype)
+    return replace(
+        data,
+        mesh=replace(registered.mesh, notes=data.mesh.notes, dropped_faces=data.mesh.dropped_faces),
+        vertex_data=vertex_data,
+        blend_shapes={name: similarities.of_vectors(moves) for name, moves in data.blend_shapes.items()},
+    )
+
+
+def _as_data(target: MeshData | Mesh) -> MeshData:
+    """Return the data of the target. A mesh alone has no faces besides its own."""
+    if isinstance(target, MeshData):
+        return target
+    return MeshData(replace(target, dropped_faces=np.empty(0, np.int64)), target.faces)
+
+
+def _check_mesh(mesh: Mesh, expected: Mesh) -> None:
+    """Refuse a mesh that differs from a registered mesh."""
+    if not (np.array_equal(mesh.vertices, expected.vertices) and np.array_equal(mesh.faces, expected.faces)):
+        raise InputError(
+            f"{mesh.name}: the vertices or faces differ from those of {expected.name}, which was registered: "
+            "give the data of the registered mesh, or register the mesh of these data."
+        )
+
+
+def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
+    """Return the row of `MeshData.faces` for each face of the mesh."""
+    _check_mesh(data.mesh, mesh_x)
+    numbers = np.arange(len(mesh_x.faces))
+    if len(data.faces) != len(numbers):
+        numbers = data.mesh.face_numbers
+    fits = len(numbers) == 0 or numbers[-1] < len(data.faces)
+    # Welding replaces vertices, but only by vertices at the same position.
+    if not fits or not np.array_equal(mesh_x.vertices[data.faces[numbers]], mesh_x.vertices[data.mesh.faces]):
+        raise InputError(
+            f"{data.mesh.name}: the faces of the data are not those of their mesh: make the data with "
+            "read_mesh_data, or give the faces from which the mesh was made."
+        )
+    return numbers
+
+
+def _sampled_faces(
+    registered: RegisteredMesh, faces: Int64[np.ndarray, "f 3"], numbers: Int64[np.ndarray, " g"]
+) -> _Corners:
+    """Return the faces of the source's data at four points of each face of the target."""
+    samples = np.einsum("sk,fkx->fsx", _SAMPLES, registered.mesh_y.vertices[faces])
+    found, _ = nearest_surface_points(samples.reshape(-1, 3), registered.mesh)
+    weights = np.full(samples.shape[:2], 1 / len(_SAMPLES))
+    return _Corners(numbers[found.faces].reshape(weights.shape), weights)
+
+
+def _mixed(
+    name: str, values: Shaped[np.ndarray, "n ..."], corners: _Corners, votes: np.ndarray | None = None
+) -> Shaped[np.ndarray, "p ..."]:
+    """Return the interpolated values, or the values with most votes. Types do not change."""
+    if values.dtype.kind == "f":
+        return _interpolated(values, corners).astype(values.dtype)
+    if name == COLORS and values.dtype == np.uint8:
+        mean = corners.matrix(len(values)) @ values.astype(np.float64)
+        return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+    labels = values if values.ndim == 1 else np.unique(values, axis=0, return_inverse=True)[1].ravel()
+    at = labels[corners.rows]
+    weights = corners.weights if votes is None else np.broadcast_to(votes, at.shape)
+    totals = np.stack([((at == at[:, [k]]) * weights).sum(axis=1) for k in range(at.shape[1])], axis=1)
+    return values[corners.rows[np.arange(len(at)), totals.argmax(axis=1)]]
+
+
+def _interpolated(values: Shaped[np.ndarray, "n ..."], corners: _Corners) -> Float64[np.ndarray, "p ..."]:
+    """Return weighted means of floats. Values that are not finite count only where they weigh most."""
+    matrix, values = corners.matrix(len(values)), values.astype(np.float64)
+    finite = np.isfinite(values)
+    if finite.all():
+        return matrix @ values
+    total, share = matrix @ np.where(finite, values, 0), matrix @ finite.astype(np.float64)
+    means = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    heaviest = values[corners.rows[np.arange(len(corners.rows)), corners.weights.argmax(axis=1)]]
+    return np.where(np.isfinite(heaviest), means, heaviest)
+
+
+def _mixed_skin(skin: Skin, matrix: csr_array) -> Skin:
+    """Return interpolated weights, with at most as many joints per vertex as the source has."""
+    own = np.maximum(skin.weights, 0)
+    most = int((own > 0).sum(axis=1).max(initial=0))
+    weights = matrix @ own
+    if 0 < most < weights.shape[1]:
+        # A stable sort makes the choice between equal weights independent of the machine.
+        omitted = np.argsort(-weights, axis=1, kind="stable")[:, most:]
+        np.put_along_axis(weights, omitted, 0, axis=1)
+    totals = weights.sum(axis=1, keepdims=True)
+    return Skin(skin.joints, np.divide(weights, totals, out=np.zeros_like(weights), where=totals > 0))
+
+
+def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, _Value]:
+    return {name: value for name, value in values.items() if name not in names}
+
+
+def _notes(data: MeshData, target: MeshData, registered: RegisteredMesh) -> list[str]:
+    """Return sentences about normals, replaced data of the target, and vertices far from the source."""
+    notes = []
+    if NORMALS in data.vertex_data:
+        notes.append("normals were not transferred, because they describe the shape of the source.")
+    own = {*data.vertex_data, *data.face_data} - {NORMALS}
+    replaced = [name for name in (*target.vertex_data, *target.face_data) if name in own]
+    replaced += [name for name in target.blend_shapes if name in data.blend_shapes]
+    named = [repr(name) for name in dict.fromkeys(replaced)]
+    for what in ("texture", "skin"):
+        if getattr(data, what) is not None and getattr(target, what) is not None:
+            named.append(f"the {what}")
+    if named:
+        notes.append(f"the data of the target were replaced by those of the source: {', '.join(named)}.")
+    far = int((registered.target_distances > _FAR * np.sqrt(registered.mesh_y.area)).sum())
+    if far:
+        notes.append(
+            f"{count_of(far, 'vertex')} of {len(registered.mesh_y.vertices)} farther from the registered "
+            f"source than {_FAR:.0%} of the square root of the target's area: the data there are those of "
+            "the nearest point, and the source may lack this part."
+        )
+    return notes

@@ -1,0 +1,560 @@
+"""Transfer moves positions, landmarks and data between meshes without flips, averaged labels or torn textures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
+
+from jaxsmw import Mesh, creature_pair, make_mesh, read_ground_truth, read_mesh
+from jaxsmw.errors import InputError
+from jaxsmw.geometry import SurfacePoints
+from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, nearest_surface_points
+from jaxsmw.io import Landmarks, MeshData, Skin, Texture, read_mesh_data, write_mesh_data
+from jaxsmw.transfer import (
+    RegisteredMesh,
+    register_mesh,
+    registered_data,
+    transfer_attributes,
+    transfer_landmarks,
+)
+
+TURN = Rotation.from_euler("zyx", [40, -70, 110], degrees=True).as_matrix()
+MIRROR = TURN @ np.diag([-1.0, 1, 1])
+SHIFT = np.array([3.0, -20, 7])
+
+
+def moved(mesh: Mesh, matrix: np.ndarray, shift: np.ndarray = SHIFT, *, turned_over: bool = False) -> Mesh:
+    faces = mesh.faces[:, ::-1].copy() if turned_over else mesh.faces
+    return Mesh(mesh.vertices @ matrix.T + shift, faces, "moved")
+
+
+def at_vertices(mesh: Mesh, vertices: np.ndarray) -> SurfacePoints:
+    """The points at vertices of a mesh."""
+    corner = np.zeros(len(mesh.vertices), np.int64)
+    corner[mesh.faces.ravel()] = np.arange(mesh.faces.size)
+    faces, corners = np.divmod(corner[vertices], 3)
+    return SurfacePoints(faces, np.eye(3)[corners])
+
+
+def on_same_numbering(mesh_x: Mesh, mesh_y: Mesh) -> RegisteredMesh:
+    return register_mesh(mesh_x, mesh_y, at_vertices(mesh_y, np.arange(len(mesh_y.vertices))))
+
+
+def by_position(mesh_x: Mesh, mesh_y: Mesh) -> RegisteredMesh:
+    """Register a mesh on a mesh with (almost) the same shape at the same place."""
+    return register_mesh(mesh_x, mesh_y, nearest_surface_points(mesh_x.vertices, mesh_y)[0])
+
+
+def in_percent(offsets: np.ndarray, mesh: Mesh) -> np.ndarray:
+    return 100 * np.linalg.norm(offsets, axis=1) / np.sqrt(mesh.area)
+
+
+class TestRegisteredMesh:
+    @pytest.mark.parametrize(
+        ("matrix", "turned_over"),
+        [(np.eye(3), False), (2.5 * TURN, False), (1000 * TURN, False), (MIRROR, False), (MIRROR, True)],
+    )
+    def test_similar_meshes_are_exact(self, matrix, turned_over):
+        mesh_x = bumpy_mesh(3)
+        mesh_y = moved(mesh_x, matrix, turned_over=turned_over)
+        registered = on_same_numbering(mesh_x, mesh_y)
+        assert in_percent(registered.vertices - mesh_y.vertices, mesh_y).max() < 1e-3
+        assert not registered.flipped_faces.any()
+        found = registered.similarities.scales[:, None, None] * registered.similarities.rotations
+        assert np.abs(found - matrix).max() < 1e-3 * np.abs(matrix).max()
+        assert np.abs(registered.area_ratios - 1).max() < 1e-3
+        assert registered.angle_distortions.max() < 0.01
+        assert "0 flipped triangles" in registered.sentences()[1]
+
+    def test_noise_is_smoothed_without_flips(self):
+        mesh_x = bumpy_mesh(4)
+        mesh_y = moved(mesh_x, TURN)
+        noise = np.random.default_rng(0).normal(size=mesh_x.vertices.shape) * 0.04  # about half an edge
+        points, _ = nearest_surface_points(mesh_y.vertices + noise, mesh_y)
+        before = in_percent(points.positions(mesh_y) - mesh_y.vertices, mesh_y)
+        raw = Mesh(points.positions(mesh_y), mesh_x.faces)
+        normals = [np.cross(*np.diff(m.vertices[m.faces], axis=1).swapaxes(0, 1)) for m in (raw, mesh_y)]
+        assert ((normals[0] * normals[1]).sum(axis=1) < 0).sum() > 20
+        registered, stiffer = (
+            register_mesh(mesh_x, mesh_y, points, stiffness=stiffness) for stiffness in (0.01, 0.05)
+        )
+        assert registered.flipped_faces.sum() == stiffer.flipped_faces.sum() == 0
+        after = [in_percent(r.vertices - mesh_y.vertices, mesh_y).mean() for r in (registered, stiffer)]
+        assert after[1] < after[0] < 0.7 * before.mean()
+        assert stiffer.angle_distortions.mean() < 0.7 * registered.angle_distortions.mean()
+
+    @pytest.mark.parametrize(("level_x", "level_y"), [(3, 4), (4, 3)])
+    def test_other_resolutions(self, level_x, level_y):
+        mesh_x, mesh_y = bumpy_mesh(level_x), bumpy_mesh(level_y)
+        registered = by_position(mesh_x, moved(mesh_y, np.eye(3), np.zeros(3)))
+        assert np.quantile(100 * registered.distances / np.sqrt(mesh_y.area), 0.99) < 0.5
+        assert not registered.flipped_faces.any()
+        assert np.allclose(registered.surface_points.positions(mesh_y), registered.vertices, atol=0.05)
+
+    def test_creatures_in_two_poses(self):
+        pair = creature_pair(vertices=1500)
+        registered = register_mesh(pair.source, pair.target, pair.truth)
+        assert np.quantile(100 * registered.distances / np.sqrt(pair.target.area), 0.99) < 0.5
+        assert registered.flipped_faces.mean() < 1e-3
+        offsets = registered.vertices - pair.truth.positions(pair.target)
+        assert np.quantile(in_percent(offsets, pair.target), 0.99) < 0.5
+        back = registered.points_of_target.positions(registered.mesh)
+        assert np.allclose(
+            np.linalg.norm(back - pair.target.vertices, axis=1), registered.target_distances, atol=1e-12
+        )
+
+    def test_units_and_places_do_not_matter(self):
+        pair = creature_pair(vertices=700)
+        usual = register_mesh(pair.source, pair.target, pair.truth)
+        large = moved(pair.target, 1000 * np.eye(3), np.array([1e6, -1e6, 1e6]))
+        for size in (1e-3, 1e3):
+            other = register_mesh(moved(pair.source, size * np.eye(3), size * SHIFT * 100), large, pair.truth)
+            offsets = (other.vertices - [1e6, -1e6, 1e6]) / 1000 - usual.vertices
+            assert in_percent(offsets, pair.target).max() < 1e-3
+            assert np.allclose(other.similarities.scales, usual.similarities.scales * 1000 / size, rtol=1e-4)
+            assert np.allclose(other.similarities.rotations, usual.similarities.rotations, atol=1e-4)
+
+    def test_a_small_partial_shape_keeps_its_size(self):
+        mesh_y = bumpy_mesh(4)
+        mesh_x = make_mesh(
+            mesh_y.vertices, mesh_y.faces[(mesh_y.vertices[mesh_y.faces, 0] > 0.95).all(axis=1)]
+        )
+        points = nearest_surface_points(mesh_x.vertices, mesh_y)[0]
+        used = mesh_x.referenced_vertices
+        scales, offsets = [], []
+        for same_unit in (True, False):
+            registered = register_mesh(mesh_x, mesh_y, points, same_unit=same_unit)
+            scales.append(np.abs(registered.similarities.scales[used] - 1).max())
+            offsets.append(in_percent((registered.vertices - mesh_y.vertices)[used], mesh_y).max())
+        assert scales[0] < 1e-4 and offsets[0] < 1e-3
+        assert scales[1] > 0.1  # the size of the whole would be the size of the part
+
+    def test_a_flat_mesh_is_rotated_and_not_mirrored(self):
+        mesh_x = make_mesh(*grid_mesh(9, 9))
+        registered = on_same_numbering(mesh_x, moved(mesh_x, TURN))
+        assert np.allclose(registered.similarities.rotations, TURN, atol=1e-4)
+        assert not registered.flipped_faces.any()
+
+    def test_degenerate_triangles(self):
+        vertices, faces = sphere_mesh(2)
+        a, b = faces[0, :2]
+        vertices = np.vstack([vertices, (vertices[a] + vertices[b]) / 2, vertices[a]])
+        n = len(vertices)
+        mesh_x = make_mesh(vertices, np.vstack([faces, [a, n - 2, b], [a, n - 1, b]]))
+        assert mesh_x.degenerate_faces.sum() == 2
+        mesh_y = moved(mesh_x, 2 * TURN)
+        registered = on_same_numbering(mesh_x, mesh_y)
+        assert in_percent(registered.vertices - mesh_y.vertices, mesh_y).max() < 1e-2
+
+    def test_vertices_without_faces_move_with_their_neighbours(self):
+        data, mesh_y = with_loose_vertices()
+        mesh_x = data.mesh
+        registered = register_mesh(mesh_x, mesh_y, nearest_surface_points(mesh_y.vertices, mesh_y)[0])
+        assert (~mesh_x.referenced_vertices).sum() == 11
+        assert in_percent(registered.vertices - mesh_y.vertices, mesh_y).max() < 1e-2
+        at = np.flatnonzero(~mesh_x.referenced_vertices)[:6]
+        assert np.array_equal(registered.vertices[at], registered.vertices[:6])
+        assert registered.mesh.dropped_faces.tolist() == mesh_x.dropped_faces.tolist()
+
+    def test_invalid_arguments_are_refused(self):
+        mesh = bumpy_mesh(2)
+        points = at_vertices(mesh, np.arange(len(mesh.vertices)))
+        with pytest.raises(InputError, match="161 points for 162 vertices: give one"):
+            register_mesh(mesh, mesh, points[np.arange(161)])
+        for stiffness in (0.0, -1.0, np.inf, np.nan):
+            with pytest.raises(InputError, match="give a positive number"):
+                register_mesh(mesh, mesh, points, stiffness=stiffness)
+        with pytest.raises(InputError, match="points on mesh: face indices must lie between"):
+            register_mesh(mesh, mesh, SurfacePoints(points.faces + 5, points.weights))
+        with pytest.raises(InputError, match="barycentric weights"):
+            register_mesh(mesh, mesh, SurfacePoints(points.faces, 2 * points.weights))
+        with pytest.raises(InputError, match="points on mesh"):
+            on_same_numbering(mesh, mesh).carry(SurfacePoints(np.array([999]), np.array([[1.0, 0, 0]])))
+
+
+def with_loose_vertices() -> tuple[MeshData, Mesh]:
+    """A mesh with six welded duplicates, a speck of four vertices and one vertex alone, and the same moved."""
+    vertices, faces = sphere_mesh(3)
+    n = len(vertices)
+    speck = np.array([1.2, 0.1, 0.3]) + 0.01 * np.vstack([np.zeros(3), np.eye(3)])
+    everything = np.vstack([vertices, vertices[:6], speck, [[0, 1.5, 0]]])
+    first = np.unique(faces, return_index=True)[1][:6]
+    faces = faces.copy()
+    faces.ravel()[first] = n + np.arange(6)
+    tetrahedron = n + 6 + np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    faces = np.vstack([tetrahedron[:2], faces, tetrahedron[2:]])
+    mesh = make_mesh(everything, faces, name="loose", weld=True)
+    smile = np.random.default_rng(0).normal(size=(len(everything), 3))
+    data = MeshData(mesh, faces, blend_shapes={"smile": smile}, vertex_data={"number": np.arange(n + 11)})
+    return data, moved(mesh, 3 * TURN)
+
+
+class TestLandmarks:
+    mesh_x = bumpy_mesh(4)
+    mesh_y = moved(mesh_x, 10 * TURN)
+    registered = on_same_numbering(mesh_x, mesh_y)
+
+    def landmarks(self, **changes) -> Landmarks:
+        points = SurfacePoints(np.arange(0, 5000, 1000), np.tile([0.2, 0.3, 0.5], (5, 1)))
+        positions = points.positions(self.mesh_x)
+        return Landmarks(tuple("abcde"), positions, **changes)
+
+    def test_similar_meshes_are_exact(self):
+        landmarks = self.landmarks(coordinates="RAS")
+        moved = transfer_landmarks(landmarks, self.registered)
+        assert np.allclose(moved.landmarks.positions, 10 * landmarks.positions @ TURN.T + SHIFT, atol=1e-3)
+        assert moved.landmarks.names == landmarks.names and moved.landmarks.coordinates == "RAS"
+        assert moved.source_distances.max() < 1e-12
+        assert moved.expected_errors is None and moved.notes == ()
+
+    def test_a_far_landmark_is_noted(self):
+        landmarks = self.landmarks()
+        positions = landmarks.positions.copy()
+        positions[2] *= 1.5
+        moved = transfer_landmarks(replace(landmarks, positions=positions), self.registered)
+        assert len(moved.notes) == 1 and "'c'" in moved.notes[0]
+        assert moved.source_distances[2] > 0.3 > 1e-9 > moved.source_distances[[0, 1, 3, 4]].max()
+
+    def test_the_other_coordinate_system_is_refused(self):
+        mesh_x = moved(self.mesh_x, np.eye(3))
+        registered = on_same_numbering(mesh_x, self.mesh_y)
+        landmarks = self.landmarks(coordinates="LPS")
+        flipped = (landmarks.positions + SHIFT) * [-1, -1, 1]
+        with pytest.raises(InputError, match="--coordinates RAS"):
+            transfer_landmarks(replace(landmarks, positions=flipped), registered)
+
+    def test_expected_errors_have_the_unit_of_the_target(self):
+        expected = np.random.default_rng(0).uniform(size=len(self.mesh_x.vertices))
+        found = transfer_landmarks(self.landmarks(), self.registered, expected_error=expected).expected_errors
+        at = expected[self.mesh_x.faces[:5000:1000]] @ [0.2, 0.3, 0.5]
+        assert np.allclose(found, at * np.sqrt(self.mesh_y.area), rtol=1e-9)
+        with pytest.raises(InputError, match="one for each vertex"):
+            transfer_landmarks(self.landmarks(), self.registered, expected_error=expected[:-1])
+
+
+def decorated(mesh: Mesh) -> MeshData:
+    """A mesh with smooth functions, labels of halves, and four joints per vertex."""
+    random, n, f = np.random.default_rng(0), len(mesh.vertices), len(mesh.faces)
+    weights = np.zeros((n, 12))
+    joints = (8 * (mesh.vertices[:, 2] - mesh.vertices[:, 2].min()) / np.ptp(mesh.vertices[:, 2])).astype(int)
+    for k in range(4):
+        weights[np.arange(n), joints + k] = random.uniform(0.1, 1, n)
+    upper = mesh.vertices[:, 2] > 0
+    return MeshData(
+        mesh,
+        mesh.faces,
+        vertex_data={
+            "colors": np.clip(128 + 60 * mesh.vertices, 0, 255).astype(np.uint8),
+            "height": mesh.vertices[:, 2].astype(np.float32),
+            "place": mesh.vertices,
+            "half": np.where(upper, 9, 2),
+            "flag": upper,
+            "pair": np.where(upper[:, None], [[5, -1]], [[-1, 5]]).astype(np.int16),
+        },
+        face_data={
+            "group": (mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0) * 2,
+            "middle": mesh.vertices[mesh.faces].mean(axis=1),
+            "colors": np.full((f, 3), 200, np.uint8),
+        },
+        skin=Skin(tuple(map(str, range(12))), weights / weights.sum(axis=1, keepdims=True)),
+        blend_shapes={"smile": random.normal(size=(n, 3))},
+        label_names={"group": ("left", "unused", "right")},
+    )
+
+
+class TestAttributes:
+    @pytest.mark.parametrize("level", [3, 5])
+    def test_values_of_other_resolutions(self, level):
+        data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(level)
+        out = transfer_attributes(data, by_position(data.mesh, mesh_y), mesh_y)
+        for name, values in data.vertex_data.items():
+            assert out.vertex_data[name].dtype == values.dtype
+            assert out.vertex_data[name].shape[1:] == values.shape[1:]
+        assert np.abs(out.vertex_data["place"] - mesh_y.vertices).max() < 0.03
+        assert np.abs(out.vertex_data["height"] - mesh_y.vertices[:, 2]).max() < 0.03
+        assert np.abs(out.vertex_data["colors"] - (128 + 60 * mesh_y.vertices)).max() < 3
+        assert np.abs(out.face_data["middle"] - mesh_y.vertices[mesh_y.faces].mean(axis=1)).max() < 0.08
+        assert (out.face_data["colors"] == 200).all() and out.face_data["colors"].dtype == np.uint8
+        assert out.label_names == data.label_names and np.array_equal(out.faces, mesh_y.faces)
+
+    @pytest.mark.parametrize("level", [3, 5])
+    def test_labels_are_never_averaged(self, level):
+        data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(level)
+        out = transfer_attributes(data, by_position(data.mesh, mesh_y))
+        assert set(out.vertex_data["half"]) == {2, 9} and set(out.vertex_data["flag"]) == {0, 1}
+        assert {tuple(row) for row in out.vertex_data["pair"].tolist()} == {(5, -1), (-1, 5)}
+        assert set(out.face_data["group"]) == {0, 2}
+        clear = np.abs(mesh_y.vertices[:, 2]) > 0.08
+        assert np.array_equal(out.vertex_data["half"][clear] == 9, mesh_y.vertices[clear, 2] > 0)
+        middles = mesh_y.vertices[mesh_y.faces].mean(axis=1)[:, 0]
+        clear = np.abs(middles) > 0.12
+        assert np.array_equal(out.face_data["group"][clear] == 2, middles[clear] > 0)
+
+    def test_the_same_mesh_keeps_everything(self):
+        data = decorated(bumpy_mesh(3))
+        rows = np.random.default_rng(1).integers(0, 99, (2, len(data.faces)))
+        data = replace(data, face_data={**data.face_data, "random": rows[0], "rows": rows.T})
+        out = transfer_attributes(data, on_same_numbering(data.mesh, moved(data.mesh, MIRROR)))
+        for found, own in [(out.vertex_data, data.vertex_data), (out.face_data, data.face_data)]:
+            for name, values in own.items():
+                exact = values.dtype.kind in "iu" and name != "colors"
+                assert np.allclose(found[name], values, atol=0 if exact else 1 if name == "colors" else 1e-4)
+        assert np.allclose(out.skin.weights, data.skin.weights, atol=1e-3)
+        assert out.mesh.notes == ()
+
+    @pytest.mark.parametrize("matrix", [2 * TURN, 0.01 * MIRROR])
+    def test_blend_shapes_turn_with_the_target(self, matrix):
+        data = decorated(bumpy_mesh(3))
+        registered = on_same_numbering(data.mesh, moved(data.mesh, matrix))
+        expected = data.blend_shapes["smile"] @ matrix.T
+        limit = 1e-3 * np.abs(expected).max()
+        found = transfer_attributes(data, registered).blend_shapes["smile"]
+        assert np.abs(found - expected).max() < 3 * limit
+        assert np.abs(registered_data(data, registered).blend_shapes["smile"] - expected).max() < 3 * limit
+
+    def test_skin_weights(self):
+        data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(5)
+        skin = transfer_attributes(data, by_position(data.mesh, mesh_y)).skin
+        assert skin.joints == data.skin.joints
+        assert skin.weights.min() == 0 and np.allclose(skin.weights.sum(axis=1), 1, atol=1e-12)
+        assert (skin.weights > 0).sum(axis=1).max() == 4
+
+    def test_values_that_are_not_finite_do_not_spread(self):
+        data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(5)
+        height = np.where(data.mesh.vertices[:, 2] > 0.5, np.nan, 1.0)
+        data = replace(data, vertex_data={"height": height})
+        out = transfer_attributes(data, by_position(data.mesh, mesh_y)).vertex_data["height"]
+        known = np.isfinite(out)
+        assert np.allclose(out[known], 1)
+        assert known[mesh_y.vertices[:, 2] < 0.45].all() and not known[mesh_y.vertices[:, 2] > 0.55].any()
+
+    def test_data_of_the_target_are_kept_without_a_clash(self):
+        data, mesh_y = decorated(bumpy_mesh(3)), bumpy_mesh(4)
+        n, f = len(mesh_y.vertices), len(mesh_y.faces)
+        up = np.tile([0.0, 0, 1], (n, 1))
+        target = MeshData(
+            mesh_y,
+            mesh_y.faces,
+            vertex_data={"own": np.arange(n), "half": np.zeros(n), "group": np.ones(n, int), "normals": up},
+            face_data={"kind": np.ones(f, int)},
+            label_names={"kind": ("a", "b"), "group": ("one", "two")},
+            blend_shapes={"frown": up, "smile": up},
+            skin=Skin(("j",), np.ones((n, 1))),
+        )
+        data = replace(
+            data, vertex_data={**data.vertex_data, "normals": np.zeros((len(data.mesh.vertices), 3))}
+        )
+        out = transfer_attributes(data, by_position(data.mesh, mesh_y), target)
+        assert np.array_equal(out.vertex_data["own"], np.arange(n))
+        assert np.array_equal(out.vertex_data["normals"], up) and "group" not in out.vertex_data
+        assert out.label_names == {"kind": ("a", "b"), "group": ("left", "unused", "right")}
+        assert set(out.blend_shapes) == {"frown", "smile"} and len(out.skin.joints) == 12
+        assert np.array_equal(out.blend_shapes["frown"], up)
+        first, second = out.mesh.notes
+        assert "normals" in first
+        assert second.endswith("by those of the source: 'half', 'group', 'smile', the skin.")
+
+    def test_parts_that_the_source_lacks_are_noted(self):
+        mesh_y = bumpy_mesh(4)
+        kept = (mesh_y.vertices[mesh_y.faces, 0] < 0.3).all(axis=1)
+        data = decorated(make_mesh(mesh_y.vertices, mesh_y.faces[kept]))
+        points = nearest_surface_points(mesh_y.vertices, mesh_y)[0]
+        registered = register_mesh(data.mesh, mesh_y, points, same_unit=True)
+        out = transfer_attributes(data, registered)
+        far = (registered.target_distances > 0.03 * np.sqrt(mesh_y.area)).sum()
+        assert 500 < far < 1200
+        (note,) = out.mesh.notes
+        assert note.startswith(f"{far} vertices of 2562 farther from the registered source than 3%")
+        assert np.isfinite(out.vertex_data["place"]).all()
+
+    def test_data_of_other_meshes_are_refused(self):
+        data, other = decorated(bumpy_mesh(3)), bumpy_mesh(2)
+        registered = on_same_numbering(data.mesh, moved(data.mesh, TURN))
+        with pytest.raises(InputError, match="differ from those of moved"):
+            transfer_attributes(data, registered, other)
+        for function in (transfer_attributes, registered_data):
+            with pytest.raises(InputError, match="differ from those of mesh"):
+                function(decorated(other), registered)
+        for faces in (data.faces[:-1], data.faces[::-1]):
+            with pytest.raises(InputError, match="not those of their mesh"):
+                transfer_attributes(MeshData(data.mesh, faces), registered)
+
+    def test_welded_duplicates_and_dropped_faces(self):
+        data, mesh_y = with_loose_vertices()
+        registered = register_mesh(data.mesh, mesh_y, nearest_surface_points(mesh_y.vertices, mesh_y)[0])
+        faces = data.faces
+        data = replace(
+            data, face_data={"number": np.arange(len(faces))}, vertex_data={"place": data.mesh.vertices}
+        )
+        out = transfer_attributes(data, registered)
+        assert np.array_equal(out.face_data["number"], data.mesh.face_numbers)
+        used = data.mesh.referenced_vertices
+        assert np.allclose(out.vertex_data["place"][used], data.mesh.vertices[used], atol=1e-3)
+
+    def test_a_target_with_duplicates_and_a_speck(self):
+        target, _ = with_loose_vertices()
+        data = cylinder(30, 60)
+        points = nearest_surface_points(data.mesh.vertices, target.mesh)[0]
+        out = transfer_attributes(
+            replace(data, vertex_data={"place": data.mesh.vertices}),
+            register_mesh(data.mesh, target.mesh, points),
+            target,
+        )
+        assert np.array_equal(out.faces, target.faces) and out.texture.corners.shape == target.faces.shape
+        assert np.array_equal(out.vertex_data["place"][642:648], out.vertex_data["place"][:6])
+        assert np.array_equal(out.vertex_data["number"], target.vertex_data["number"])
+        assert np.array_equal(out.blend_shapes["smile"], target.blend_shapes["smile"])
+
+
+class TestRegisteredData:
+    def test_faces_and_order_are_kept(self, tmp_path):
+        data, mesh_y = with_loose_vertices()
+        normals = data.mesh.vertices.astype(np.float32)
+        data = replace(data, vertex_data={**data.vertex_data, "normals": normals})
+        registered = register_mesh(data.mesh, mesh_y, nearest_surface_points(mesh_y.vertices, mesh_y)[0])
+        out = registered_data(data, registered)
+        assert np.array_equal(out.faces, data.faces)
+        assert np.array_equal(out.mesh.vertices, registered.vertices)
+        assert np.array_equal(out.vertex_data["number"], data.vertex_data["number"])
+        assert np.allclose(out.blend_shapes["smile"], 3 * data.blend_shapes["smile"] @ TURN.T, atol=0.01)
+        found = out.vertex_data["normals"]
+        assert found.dtype == np.float32 and np.allclose(found, normals @ TURN.T, atol=0.01)
+        assert write_mesh_data(tmp_path / "out.npz", out) == ()
+        assert np.array_equal(read_mesh_data(tmp_path / "out.npz").faces, data.faces)
+
+
+def cylinder(rows: int, columns: int, turn: float = 0.0) -> MeshData:
+    """A tube around the z axis. Its texture is the unit square: one chart, which meets itself at one seam."""
+    flat, corners = grid_mesh(rows, columns + 1)
+    faces = corners // (columns + 1) * columns + corners % (columns + 1) % columns
+    kept = np.arange(rows * (columns + 1)).reshape(rows, -1)[:, :-1].ravel()
+    angle = 2 * np.pi * flat[kept, 0] + turn
+    vertices = np.stack([np.cos(angle), np.sin(angle), 3 * flat[kept, 1]], axis=1)
+    return MeshData(make_mesh(vertices, faces), faces, texture=Texture(flat[:, :2], corners))
+
+
+def uv_areas(texture: Texture) -> np.ndarray:
+    a, b, c = np.moveaxis(texture.coordinates[texture.corners], 1, 0)
+    return 0.5 * np.linalg.det(np.stack([b - a, c - a], axis=1))
+
+
+class TestTexture:
+    @pytest.mark.parametrize(
+        ("rows", "columns", "turn"), [(20, 33, 0.1), (41, 80, 0.3), (9, 17, 0.05), (12, 24, 0)]
+    )
+    def test_no_face_crosses_the_seam_of_a_tube(self, rows, columns, turn):
+        data, mesh_y = cylinder(24, 40), cylinder(rows, columns, turn).mesh
+        out = transfer_attributes(data, by_position(data.mesh, mesh_y)).texture
+        at = out.coordinates[out.corners]
+        assert np.ptp(at[..., 0], axis=1).max() < 1.5 / columns + 0.005
+        areas = uv_areas(out)
+        assert areas.min() > -1e-9 and areas.sum() == pytest.approx(1, abs=0.02)
+        assert 0.5 * len(areas) < (areas > 0.5 / len(areas)).sum()
+        # Vertices at the seam have two texture vertices, and the others have one.
+        pairs = np.unique(np.column_stack([mesh_y.faces.ravel(), out.corners.ravel()]), axis=0)
+        counts = np.bincount(pairs[:, 0])
+        assert counts.max() == 2 and rows <= (counts == 2).sum() <= 2 * rows + 2
+        assert len(pairs) == len(out.coordinates)
+
+    def test_the_same_mesh_keeps_its_seam(self):
+        data = cylinder(12, 20)
+        out = transfer_attributes(data, on_same_numbering(data.mesh, moved(data.mesh, MIRROR)))
+        own = data.texture.coordinates[data.texture.corners]
+        assert np.allclose(out.texture.coordinates[out.texture.corners], own, atol=1e-3)
+        assert len(out.texture.coordinates) == len(data.texture.coordinates)
+
+    @pytest.mark.parametrize("level", [2, 3, 5])
+    @pytest.mark.parametrize("split", [False, True])
+    def test_no_face_crosses_two_charts(self, level, split):
+        """Each half of a sphere is a disc in the texture. Texture vertices may be listed once per corner."""
+        mesh_x, mesh_y = make_mesh(*sphere_mesh(4)), make_mesh(*sphere_mesh(level))
+        upper = mesh_x.vertices[mesh_x.faces].mean(axis=1)[:, 2] > 0
+        uv = mesh_x.vertices[mesh_x.faces][..., :2] + np.where(upper, 2, -2)[:, None, None] * [1, 0]
+        coordinates, corners = uv.reshape(-1, 2), np.arange(uv.size // 2).reshape(-1, 3)
+        if not split:
+            coordinates, inverse = np.unique(coordinates, axis=0, return_inverse=True)
+            corners = inverse.reshape(-1, 3)
+        data = MeshData(mesh_x, mesh_x.faces, texture=Texture(coordinates, corners))
+        out = transfer_attributes(data, by_position(mesh_x, mesh_y)).texture
+        at = out.coordinates[out.corners]
+        side = np.sign(at[..., 0])
+        assert (side == side[:, :1]).all()
+        middle = mesh_y.vertices[mesh_y.faces].mean(axis=1)[:, 2]
+        clear = np.abs(middle) > 0.2
+        assert np.array_equal(side[clear, 0] > 0, middle[clear] > 0)
+        area = np.abs(uv_areas(out)[side[:, 0] > 0]).sum()
+        assert area == pytest.approx(np.abs(uv_areas(data.texture)[upper]).sum(), rel=0.15 / level)
+        pairs = np.unique(np.column_stack([mesh_y.faces.ravel(), out.corners.ravel()]), axis=0)
+        assert np.bincount(pairs[:, 0]).max() == 2 and len(pairs) == len(out.coordinates)
+
+    def test_faces_without_texture(self):
+        mesh_x, mesh_y = make_mesh(*sphere_mesh(4)), make_mesh(*sphere_mesh(3))
+        upper = mesh_x.vertices[mesh_x.faces].mean(axis=1)[:, 2] > 0
+        corners = np.where(upper[:, None], mesh_x.faces, -1)
+        data = MeshData(mesh_x, mesh_x.faces, texture=Texture(mesh_x.vertices[:, :2], corners))
+        registered = by_position(mesh_x, mesh_y)
+        out = transfer_attributes(data, registered).texture
+        shown = out.corners >= 0
+        assert (shown == shown[:, :1]).all()
+        middle = mesh_y.vertices[mesh_y.faces].mean(axis=1)[:, 2]
+        assert np.array_equal(shown[np.abs(middle) > 0.1, 0], middle[np.abs(middle) > 0.1] > 0)
+        bare = replace(data, texture=Texture(np.empty((0, 2)), np.full_like(corners, -1)))
+        assert (transfer_attributes(bare, registered).texture.corners == -1).all()
+
+    def test_nearest_points_of_single_triangles(self):
+        random = np.random.default_rng(0)
+        points, triangles = random.normal(size=(300, 3)), random.normal(size=(300, 3, 3))
+        triangles[:20, 2] = triangles[:20, 1]  # a segment
+        triangles[20:40] = triangles[20:40, :1]  # a point
+        weights, distances = nearest_points_of_triangles(points, triangles)
+        faces = np.array([[0, 1, 2]])
+        expected = [
+            nearest_surface_points(p[None], Mesh(t, faces))[1][0]
+            for p, t in zip(points, triangles, strict=True)
+        ]
+        assert np.allclose(distances, expected, atol=1e-12)
+        reached = np.einsum("pk,pkx->px", weights, triangles)
+        assert np.allclose(np.linalg.norm(points - reached, axis=1), distances, atol=1e-12)
+        assert weights.min() >= 0 and np.allclose(weights.sum(axis=1), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("y", ["tr_reg_001", "tr_reg_004"])
+def test_real_people(shared, y):
+    directory = shared / "data" / "faust_r"
+    mesh_x, mesh_y = (read_mesh(directory / "off" / f"{name}.off") for name in ("tr_reg_000", y))
+    truth = read_ground_truth(
+        [directory / "corres" / f"{name}.vts" for name in ("tr_reg_000", y)], mesh_x, mesh_y
+    )
+    # The ground truth lists points of a common template, not one for each vertex.
+    first = np.unique(truth.source_vertices, return_index=True)
+    matches = np.full(len(mesh_x.vertices), -1)
+    matches[first[0]] = truth.targets[first[1]]
+    known = matches >= 0
+    nearest = nearest_known(mesh_x, known)
+    registered = register_mesh(mesh_x, mesh_y, at_vertices(mesh_y, matches[nearest]))
+    assert np.quantile(registered.distances, 0.95) < 0.005 * np.sqrt(mesh_y.area)
+    assert not registered.flipped_faces.any()
+    assert np.median(in_percent((registered.vertices - mesh_y.vertices[matches])[known], mesh_y)) < 0.2
+
+
+def nearest_known(mesh: Mesh, known: np.ndarray) -> np.ndarray:
+    """The nearest vertex with a known match for each vertex."""
+    distances = np.linalg.norm(mesh.vertices[:, None] - mesh.vertices[known], axis=2)
+    return np.flatnonzero(known)[distances.argmin(axis=1)]
+
+
+@pytest.mark.slow
+def test_real_wolves(shared):
+    """The poses of TOSCA's wolf have the same triangles."""
+    mesh_x, mesh_y = (read_mesh(shared / "data" / "tosca" / "off" / f"wolf{pose}.off") for pose in (0, 1))
+    data = decorated(mesh_x)
+    registered = on_same_numbering(mesh_x, mesh_y)
+    assert in_percent(registered.vertices - mesh_y.vertices, mesh_y).max() < 0.5
+    assert registered.flipped_faces.mean() < 1e-3
+    out = transfer_attributes(data, registered)
+    offsets = out.vertex_data["place"] - mesh_x.vertices
+    assert np.quantile(in_percent(offsets, mesh_x), 0.99) < 0.5
+    assert (out.face_data["group"] == data.face_data["group"]).mean() > 0.99
