@@ -7,7 +7,7 @@
 Pairs are drawn with seed 0. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same
 command continues where it was interrupted. Distances of landmarks are in thousandths of the diagonal of the
 target's bounding box. Landmarks are carried by four methods: the registered mesh, the map alone, rigid
-alignment and the nearest point, and non-rigid coherent point drift (pycpd) after this alignment, with nine
+alignment and the nearest point, and non-rigid coherent point drift (pycpd) after this alignment, with four
 settings. Molars of opposite sides are matched with `mirror="yes"`, and all methods then use the mirror image
 of the source.
 """
@@ -215,7 +215,7 @@ def _drifted(
     from pycpd import DeformableRegistration
 
     moved = {}
-    for alpha, beta in itertools.product((0.1, 1.0, 10.0), (0.5, 1.0, 2.0)):
+    for alpha, beta in itertools.product((1.0, 10.0), (1.0, 2.0)):
         points = np.vstack([x, landmarks])
         drift = DeformableRegistration(X=y, Y=points, alpha=alpha, beta=beta, max_iterations=100)
         moved[f"cpd_{alpha:g}_{beta:g}"] = drift.register()[0][len(x) :]

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/tutorial.md and docs/failures.md, and prints the table of docs/failures.md.
+"""Draws the pictures of the tutorial, the failures and the transfers, and prints the table of failures.
 
     pip install -e ".[report]"
     python scripts/draw_documentation.py [DATA_DIRECTORY]
@@ -22,13 +22,14 @@ from typing import Any, NamedTuple
 import igl
 import numpy as np
 from jaxtyping import Float
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
-from jaxsmw.report.figures import draw_correspondence
+from jaxsmw.report.figures import draw_correspondence, draw_mesh
 from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -200,18 +201,87 @@ def draw_tutorial() -> None:
             save_small(PICTURES / name, Path(directory) / name)
 
 
+def draw_transfers() -> None:
+    """Draws landmarks, a registered mesh and a transferred texture on a pair of creatures."""
+    pair = jaxsmw.creature_pair("quadruped", vertices=3000)
+    mesh_x, mesh_y = pair.source, pair.target
+    registered = jaxsmw.match(mesh_x, mesh_y).registered_mesh()
+    chosen = jaxsmw.geometry.farthest_point_samples(mesh_x, 40)
+    points = jaxsmw.io.Landmarks(tuple(map(str, range(40))), mesh_x.vertices[chosen])
+    carried = jaxsmw.transfer.transfer_landmarks(points, registered).landmarks
+    hues = hsv_to_rgb(np.stack([np.arange(40) / 40, np.ones(40), np.full(40, 0.85)], axis=1))
+    marked = {"Source": (mesh_x, points), "Target": (mesh_y, carried)}
+    draw_side_by_side(
+        "landmarks", {t: (mesh, spots(mesh, p.positions, hues)) for t, (mesh, p) in marked.items()}
+    )
+    folded = fold_lines(mesh_x)
+    draw_side_by_side(
+        "registered",
+        {
+            "Source": (mesh_x, folded),
+            "Source registered on the target": (registered.mesh, folded),
+            "Target": (mesh_y, fold_lines(mesh_y)),
+        },
+    )
+    size = np.ptp(mesh_x.vertices, axis=0).max()
+    checks = np.floor(20 * mesh_x.vertices / size).sum(axis=1) % 2
+    stripes = np.where(checks[:, None] > 0, [0.95, 0.75, 0.3], [0.2, 0.4, 0.65])
+    data = jaxsmw.io.MeshData(mesh_x, mesh_x.faces, vertex_data={"colors": stripes})
+    moved = jaxsmw.transfer.transfer_attributes(data, registered).vertex_data["colors"]
+    draw_side_by_side("attributes", {"Source": (mesh_x, stripes), "Target": (mesh_y, moved)})
+
+
+def spots(
+    mesh: jaxsmw.Mesh, points: Float[np.ndarray, "l 3"], hues: Float[np.ndarray, "l 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Returns the colours of a grey mesh with a coloured spot at each point."""
+    distances, nearest = KDTree(points).query(mesh.vertices)
+    near = distances < 0.025 * np.sqrt(mesh.area)
+    return np.where(near[:, None], hues[nearest], 0.8)
+
+
+def fold_lines(mesh: jaxsmw.Mesh) -> Float[np.ndarray, "n 3"]:
+    """Returns the colours of a mesh whose every fourth vertex is dark, which shows the triangulation."""
+    dark = np.zeros(len(mesh.vertices), bool)
+    dark[::4] = True
+    return np.where(dark[:, None], [0.25, 0.3, 0.4], [0.85, 0.87, 0.9])
+
+
+def draw_side_by_side(name: str, panels: dict[str, tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]]) -> None:
+    """Writes a picture with one coloured mesh per panel."""
+    images = []
+    for mesh, colors in panels.values():
+        buffer = io.BytesIO()
+        draw_mesh(mesh, colors, up="y").savefig(buffer, format="png", dpi=200)
+        images.append(Image.open(buffer).convert("RGB"))
+    height = max(image.height for image in images)
+    sheet = Image.new("RGB", (sum(image.width for image in images), height), "white")
+    left = 0
+    for image in images:
+        sheet.paste(image, (left, height - image.height))
+        left += image.width
+    with tempfile.TemporaryDirectory() as directory:
+        sheet.save(Path(directory) / f"{name}.png")
+        save_small(PICTURES / f"{name}.png", Path(directory) / f"{name}.png")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument(
-        "--only", nargs="+", metavar="NAME", help="draw only these pictures: `tutorial`, or names of cases"
+        "--only",
+        nargs="+",
+        metavar="NAME",
+        help="draw only these pictures: `tutorial`, `transfers`, or names of cases",
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
     if not options.only or "tutorial" in options.only:
         draw_tutorial()
+    if not options.only or "transfers" in options.only:
+        draw_transfers()
     cases = [*procedural_cases(), *(real_cases(options.data) if options.data else ())]
     print("| case | error | expected | error, cured | expected, cured |\n| --- | --- | --- | --- | --- |")
     for case in cases:

@@ -129,6 +129,8 @@ def run(options: argparse.Namespace) -> None:
         report_progress("attributes ...")
         with stopwatch.step("attributes"):
             carried = transfer_attributes(source, registered, target)
+        for note in carried.mesh.notes[len(target.mesh.notes) :]:
+            say(f"note: {note}")
         _write(options.attributes, carried, stopwatch)
     if landmarks:
         _transfer_landmarks(options, landmarks, correspondence, registered, stopwatch)

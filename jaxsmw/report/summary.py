@@ -130,7 +130,7 @@ def write_report(
         error_meanings=_ERROR_MEANINGS,
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
-        registered=_registered(correspondence),
+        registered=correspondence.registered_mesh().vertices,
     )
     summary = {
         "settings": dict(settings or {}),
@@ -171,13 +171,6 @@ def _shown_maps(
         _error_statistics(initial),
     )
     return {"refined": refined, "initial": before}
-
-
-def _registered(correspondence: Correspondence) -> Float64[np.ndarray, "m 3"]:
-    """The positions of X's vertices on Y: their matches as points on triangles."""
-    points, mesh_y = correspondence.surface_points(), correspondence.mesh_y
-    corners = mesh_y.vertices[mesh_y.faces[points.faces]]
-    return np.einsum("mc,mcd->md", points.weights, corners)
 
 
 def _save_figures(
