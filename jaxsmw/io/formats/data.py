@@ -145,7 +145,7 @@ class MeshData:
             checked[name] = _canonical(array[:, 0] if array.shape[1:] == (1,) else array)
         return checked
 
-    def _real(self, values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    def _real(self, values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "*shape"]:
         array = np.asarray(values)
         if array.shape != shape or array.dtype.kind not in "biuf":
             raise self._fail(
