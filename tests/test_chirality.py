@@ -1,10 +1,7 @@
 """The search for the hand of a pair: left and right teeth, and bodies that are their own mirror image."""
 
-import csv
-
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -145,18 +142,8 @@ def test_evidence_has_opposite_signs_for_opposite_hands(lump):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("names", "opposite"), [(("T04", "J12"), True), (("T04", "Q28"), False)])
-def test_teeth(shared, names, opposite):
+def test_hands_of_teeth(shared, names, opposite):
     directory = shared / "data" / "primate_molars"
-    x, y = (jaxsmw.read_mesh(directory / f"{name}_sas.off") for name in names)
-    landmarks: dict[str, list[list[float]]] = {}
-    with open(directory / "landmarks.csv") as file:
-        for row in csv.DictReader(file):
-            landmarks.setdefault(row["mesh"], []).append([float(row[axis]) for axis in "xyz"])
-    on_x, on_y = (np.array(landmarks[f"{name}_sas.off"]) for name in names)
-    found = match(x, y, mirror="auto")
-    assert found.mirrored is opposite
-    assert not found.suspicious
-    _, vertices = KDTree(x.vertices).query(on_x)
-    matches = y.vertices[found.pointwise_map[vertices]]
-    errors = np.linalg.norm(matches - on_y, axis=1) / np.linalg.norm(np.ptp(y.vertices, axis=0))
-    assert errors.mean() < 0.1
+    pair = Pair.make(*(jaxsmw.read_mesh(directory / f"{name}_sas.off") for name in names))
+    decision = decide(Hands(pair, *paired_spectra(pair, 20)).evidence())
+    assert decision.mirrored is opposite and not decision.doubtful

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import scipy.io
 import trimesh
-from command_line import COMMANDS, SMALL, assert_refused, runner, write_pair
+from command_line import COMMANDS, SMALL, Outcome, assert_refused, runner, write_pair
 from synthetic import grid_mesh
 
 import jaxsmw
@@ -527,9 +527,6 @@ def test_a_note_names_all_options_that_replace_the_preset(run, tmp_path):
 def test_written_files_are_named(run, pair, tmp_path):
     meshes, truth = (pair / "x.off", pair / "y.ply"), pair / "truth.txt"
     for arguments in (
-        ["match", *meshes, *SMALL, "--output", tmp_path / "m.txt", "--surface-points", tmp_path / "p.baryc_gt",
-         "--expected-error", tmp_path / "e.txt", "--one-to-one", tmp_path / "o.npy",
-         "--texture", tmp_path / "texture", "--report", tmp_path / "report"],
         ["demo", "--vertices", "500", *SMALL, "--init", "wks", "--output", tmp_path / "demo"],
         ["evaluate", *meshes, truth, "--ground-truth", truth, "--output", tmp_path / "e.json",
          "--figure", tmp_path / "e.png", "--page", tmp_path / "e.html"],
@@ -540,9 +537,13 @@ def test_written_files_are_named(run, pair, tmp_path):
     ):  # fmt: skip
         before = files_in(tmp_path)
         outcome = run(*arguments)
-        assert outcome.code == 0, outcome.errors
-        named = re.findall(r"^wrote (.*)$", outcome.errors, flags=re.MULTILINE)
-        assert sorted(named) == sorted(files_in(tmp_path) - before)
+        assert_written_files_are_named(outcome, files_in(tmp_path) - before)
+
+
+def assert_written_files_are_named(outcome: Outcome, files: set[str]) -> None:
+    assert outcome.code == 0, outcome.errors
+    named = re.findall(r"^wrote (.*)$", outcome.errors, flags=re.MULTILINE)
+    assert sorted(named) == sorted(files)
 
 
 def files_in(directory: Path) -> set[str]:
@@ -550,7 +551,7 @@ def files_in(directory: Path) -> set[str]:
 
 
 @pytest.mark.slow
-def test_the_times_account_for_the_whole_run(run, pair, tmp_path):
+def test_the_times_account_for_the_whole_run_and_all_files_are_named(run, pair, tmp_path):
     began = time.perf_counter()
     outcome = run(
         "match", pair / "x.off", pair / "y.ply", *SMALL, "--output", tmp_path / "m.txt", "--surface-points",
@@ -558,6 +559,7 @@ def test_the_times_account_for_the_whole_run(run, pair, tmp_path):
         "--texture", tmp_path / "t", "--report", tmp_path / "r", "--ground-truth", pair / "truth.txt",
     )  # fmt: skip
     wall = time.perf_counter() - began
+    assert_written_files_are_named(outcome, files_in(tmp_path))
     line = next(line for line in outcome.output.splitlines() if line.startswith("time:"))
     total = float(re.match(r"time: +([\d.]+) s: ", line)[1])
     steps = {name: float(seconds) for name, seconds in re.findall(r"([a-z-][a-z -]+) ([\d.]+) s\b", line)}

@@ -158,7 +158,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     """Above 15 000 vertices, the search in patches also compares columns that are not eigenvectors."""
     creature = creature_pair(vertices=15_600)
     truth = creature.truth.nearest_corners(creature.target)
-    stage = Stage(Registration((20, 30)), number_of_samples=400)
+    stage = Stage(Registration((20, 30)), number_of_eigenvectors=30, number_of_samples=400)
     found = match(creature.source, creature.target, preset=stage, init=truth)
     queries, database = (np.asarray(points) for points in found._embeddings())
     assert database.shape[1] > found.functional_map.shape[0]

@@ -42,12 +42,13 @@ def read(directory: Path) -> tuple[dict[str, Any], str]:
 
 
 @pytest.mark.slow
-def test_the_report_states_the_time_of_every_step_and_the_total(
+def test_the_report_states_the_results_and_the_time_of_every_step(
     found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
 ) -> None:
     given = {"reading": 0.5, **found.seconds, "geodesic errors": 12.25}
-    written = write_report(tmp_path, found, errors=errors, seconds=given)
+    written = write_report(tmp_path, found, errors=errors, seconds=given, settings={"seed": 3})
     summary, page = read(tmp_path)
+    _check_results(found, errors, summary, page)
     times = summary["seconds"]
     assert list(times) == [*given, "expected error", "pictures", "total"]
     assert {name: times[name] for name in given} == given
@@ -70,12 +71,10 @@ def test_the_report_states_the_times_of_match_by_default(found: Correspondence, 
     assert re.search(r'<p data-for="error-0">An estimate of the distance .* not use the true points', page)
 
 
-@pytest.mark.slow
-def test_the_summary_states_the_results_of_the_match(
-    found: Correspondence, errors: dict[str, GeodesicError], tmp_path: Path
+def _check_results(
+    found: Correspondence, errors: dict[str, GeodesicError], summary: dict[str, Any], page: str
 ) -> None:
-    write_report(tmp_path, found, errors=errors, settings={"seed": 3})
-    summary, page = read(tmp_path)
+    """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
         "settings", "result", "distortion", "suspicious", "errors", "seconds", "provenance",
     ]  # fmt: skip

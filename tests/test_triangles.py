@@ -119,13 +119,13 @@ def test_no_array_of_all_queries_and_triangles_is_stored():
 
 
 def test_candidates_give_the_nearest_point_of_their_triangles(generator):
-    points, queries = generator.normal(size=(20, 5)), generator.normal(size=(40, 5))
+    points, queries = generator.normal(size=(20, 5)), generator.normal(size=(8, 5))
     faces = np.array([generator.choice(20, 3, replace=False) for _ in range(30)])
-    rows = np.repeat(np.arange(40), 7)
+    rows = np.repeat(np.arange(8), 7)
     candidates = generator.integers(30, size=len(rows))
     face, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, candidates)))
     face, weights = np.asarray(face), np.asarray(weights)
-    for query in range(40):
+    for query in range(8):
         own = candidates[rows == query]
         _, _, distance = found(queries[query : query + 1], points, faces[own])
         there = weights[query] @ points[faces[face[query]]]
