@@ -26,6 +26,7 @@ def pair(tmp_path_factory):
     write_landmark_file(
         directory / "x.mrk.json", Landmarks(("a", "b"), mesh.vertices[[3, 400]], coordinates="LPS")
     )
+    write_landmark_file(directory / "x.csv", Landmarks(("a", "b"), mesh.vertices[[3, 400]]))
     return directory
 
 
@@ -129,13 +130,17 @@ def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
         ("--landmarks {p}/x.off --landmarks-output {t}/l.csv", "x.off"),
         ("--landmarks {t}/missing.pp --landmarks-output {t}/l.csv", "missing.pp"),
         ("--landmarks {p}/x.mrk.json --landmarks-output {t}/l.csv --coordinates XYZ", "invalid choice: 'XYZ'"),
+        (
+            "--landmarks {p}/x.csv --landmarks-output {t}/l.mrk.json",
+            "the one of {p}/x.csv is not known: state LPS or RAS (--coordinates)",
+        ),
         ("--registered {t}/r.off --init landmarks:{p}/x.mrk.json,{t}/missing.csv", "missing.csv"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
     given = arguments.format(p=pair, t=tmp_path).split()
     outcome = run("transfer", pair / "x.off", pair / "y.ply", *given, "--quiet")
-    assert_refused(outcome, naming=fault)
+    assert_refused(outcome, naming=fault.format(p=pair))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -167,7 +167,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     """Read the landmarks of the source, convert them to the coordinates of the meshes, and check them."""
-    from jaxsmw.io.landmark_files import read_landmark_file
+    from jaxsmw.io.landmark_files import check_known_system, read_landmark_file
     from jaxsmw.io.landmarks import check_frame
 
     landmarks = read_landmark_file(options.landmarks)
@@ -182,7 +182,9 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
             f"{options.landmarks}: the landmarks are in {landmarks.coordinates} coordinates; the meshes are "
             "assumed to be in the same coordinates."
         )
-    check_frame(landmarks, source.mesh)  # before the long computation
+    # Both checks precede the long computation.
+    check_known_system(options.landmarks_output, landmarks)
+    check_frame(landmarks, source.mesh)
     return landmarks
 
 

@@ -93,11 +93,7 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
     the landmarks is None.
     """
     suffix = check_landmark_suffix(path)
-    if landmarks.coordinates is None and suffix in _WITH_SYSTEM:
-        raise InputError(
-            f"{path}: {suffix} files state a coordinate system, but the one of {landmarks.name} is not "
-            "known: state LPS or RAS, or write a .csv file."
-        )
+    check_known_system(path, landmarks)
     try:
         check_count(len(landmarks))
     except InputError as error:
@@ -114,6 +110,19 @@ def check_landmark_suffix(path: str | os.PathLike[str]) -> str:
     **Raises:** `InputError` if landmarks cannot be written in the format of the suffix.
     """
     return _suffix(path, list(_WRITERS))
+
+
+def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
+    """Check that the coordinate system of landmarks is known, if the format of a file states it.
+
+    **Raises:** `InputError` if the file states a coordinate system, but that of the landmarks is None.
+    """
+    suffix = check_landmark_suffix(path)
+    if landmarks.coordinates is None and suffix in _WITH_SYSTEM:
+        raise InputError(
+            f"{path}: {suffix} files state a coordinate system, but the one of {landmarks.name} is not "
+            "known: state LPS or RAS (--coordinates), or write a .csv file."
+        )
 
 
 def _suffix(path: str | os.PathLike[str], known: list[str]) -> str:
