@@ -194,28 +194,20 @@ def _register(
     """Return the match, or None if a map is given, and the registered mesh."""
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
 
-    correspondence, index_base = None, options.index_base
+    meshes, index_base = (source.mesh, target.mesh), options.index_base
+    stiffness = options.stiffness or DEFAULT_STIFFNESS
     if not options.map:
         correspondence = match_meshes(
-            options, source.mesh, target.mesh, stopwatch, partial=options.partial, index_base=index_base
+            options, *meshes, stopwatch, partial=options.partial, index_base=index_base
         )
+        report_progress("registered mesh ...")
+        with stopwatch.step("registered mesh"):
+            return correspondence, correspondence.registered_mesh(stiffness=stiffness)
     report_progress("registered mesh ...")
     with stopwatch.step("registered mesh"):
-        if correspondence is None:
-            (pointwise_map,) = read_maps(
-                [options.map], source.mesh, target.mesh, index_base=index_base
-            ).values()
-            points = points_of_map(source.mesh, target.mesh, pointwise_map, same_unit=options.partial)
-        else:
-            points = correspondence.surface_points()
-        registered = register_mesh(
-            source.mesh,
-            target.mesh,
-            points,
-            stiffness=options.stiffness or DEFAULT_STIFFNESS,
-            same_unit=options.partial,
-        )
-    return correspondence, registered
+        (pointwise_map,) = read_maps([options.map], *meshes, index_base=index_base).values()
+        points = points_of_map(*meshes, pointwise_map, same_unit=options.partial)
+        return None, register_mesh(*meshes, points, stiffness=stiffness, same_unit=options.partial)
 
 
 def _transfer_landmarks(

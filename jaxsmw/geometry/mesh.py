@@ -432,22 +432,26 @@ def make_mesh(
             f"away), the first of them number {lost.argmax()} (counted from 0): "
             f"{count_of(int(with_lost.sum()), 'face')} dropped."
         )
-    mesh = Mesh(position, triangles[number], name)
+
+    def with_faces(kept: Int64[np.ndarray, " g"]) -> Mesh:
+        return Mesh(position, triangles[kept], name, dropped_faces=np.delete(np.arange(len(triangles)), kept))
+
+    mesh = with_faces(number)
     if mesh.degenerate_faces.all():
         raise InputError(
             f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
             "check the positions and the faces."
         )
     _check_resolution(mesh)
-    small, count = in_small_components(mesh.edges, mesh.faces, mesh.face_areas, len(position))
+    component = connected_components(mesh.edges, len(position))[1][mesh.faces[:, 0]]
+    small, count = in_small_components(component, mesh.face_areas)
     if count:
         notes.append(
             f"{count_of(count, 'small component')} with {mesh.face_areas[small].sum() / mesh.area:.1%} of "
             f"the area ignored ({count_of(int(small.sum()), 'face')}): the vertices receive the match of the "
             "nearest vertex."
         )
-    number = number[~small]
-    mesh = Mesh(position, triangles[number], name, dropped_faces=np.delete(np.arange(len(triangles)), number))
+        mesh = with_faces(number[~small])
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 

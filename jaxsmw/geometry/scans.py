@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array, csgraph
+from jaxtyping import Bool, Float64, Int32, Int64
 
 # Up to this share of the vertices of a mesh may be lost. Meshes with more lost vertices are refused, because
 # they are damaged.
@@ -44,17 +43,14 @@ def between_neighbors(
 
 
 def in_small_components(
-    edges: Int64[np.ndarray, "e 2"],
-    triangles: Int64[np.ndarray, "f 3"],
-    face_areas: Float64[np.ndarray, " f"],
-    n: int,
+    component: Int32[np.ndarray, " f"], face_areas: Float64[np.ndarray, " f"]
 ) -> tuple[Bool[np.ndarray, " f"], int]:
-    """Return a mask of the triangles in small components, and the number of small components."""
-    graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    count, component = csgraph.connected_components(graph, directed=False)
-    component = component[triangles[:, 0]]
-    areas = np.bincount(component, weights=face_areas, minlength=count)
-    has_faces = np.bincount(component, minlength=count) > 0
+    """Return a mask of the triangles in small components, and the number of small components.
+
+    `component` contains the index of each triangle's component.
+    """
+    areas = np.bincount(component, weights=face_areas)
+    has_faces = np.bincount(component) > 0
     small = (areas < _SMALL * areas.sum()) & has_faces
     if areas.max() < _LARGEST * areas.sum():
         small[:] = False

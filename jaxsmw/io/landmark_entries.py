@@ -20,6 +20,9 @@ MOST_LANDMARKS = 2**20
 
 _NOT_IN_NUMBERS = re.compile(r"[^0-9+\-.eE\n]")
 
+SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
+"""The names of coordinate systems in files of 3D Slicer, which used numbers before version 4.11."""
+
 
 class Entries(NamedTuple):
     """The landmarks of a file, in the order of the file.

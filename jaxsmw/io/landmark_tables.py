@@ -12,10 +12,9 @@ import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
+from jaxsmw.io.landmark_entries import SYSTEMS, Entries, check_count, left_out, parse_positions
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
 
@@ -23,7 +22,6 @@ _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
 _LONGEST_LINE = 2**16
 _FCSV_COLUMNS = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc"]
 _FCSV_COLUMNS += ["associatedNodeID"]
-_SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
 
 
 class _Columns(NamedTuple):
@@ -175,7 +173,7 @@ def parse_fcsv(text: str) -> Entries:
     notes = left_out(undefined, len(undefined) + len(names), "Slicer has no defined position for them")
     coordinates = None
     if "coordinatesystem" in stated:
-        coordinates = _SYSTEMS.get(stated["coordinatesystem"])
+        coordinates = SYSTEMS.get(stated["coordinatesystem"])
         if coordinates is None:
             raise InputError(
                 f"the coordinate system {stated['coordinatesystem'][:40]!a} is neither LPS (1) nor RAS (0): "

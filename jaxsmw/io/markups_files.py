@@ -14,15 +14,13 @@ import numpy as np
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of
-from jaxsmw.io.landmark_entries import Entries, left_out
+from jaxsmw.io.landmark_entries import SYSTEMS, Entries, left_out
 from jaxsmw.io.landmarks import Landmarks
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )
-# Versions of Slicer before 4.11 used numbers as names.
-_SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
 _NOT_DEFINED = ("undefined", "preview", "missing")
 
 
@@ -102,12 +100,12 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
     if "coordinateSystem" not in markup:
         return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
     stated = markup["coordinateSystem"]
-    if not isinstance(stated, str) or stated not in _SYSTEMS:
+    if not isinstance(stated, str) or stated not in SYSTEMS:
         raise InputError(
             f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0): export the markups "
             "again."
         )
-    return _SYSTEMS[stated], ()
+    return SYSTEMS[stated], ()
 
 
 def _is_defined(point: dict[str, Any], number: int) -> bool:
