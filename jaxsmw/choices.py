@@ -16,7 +16,7 @@ DEFAULT_INITIAL_MAP: InitialMap = "shot"
 
 Mirror = Literal["auto", "no", "yes"]
 """Whether the mirror image of the source is matched instead of the source; see `jaxsmw.match`."""
-DEFAULT_MIRROR: Mirror = "no"
+DEFAULT_MIRROR: Mirror = "auto"
 
 Laplacian = Literal["auto", "cotangent", "robust"]
 """The discretizations of the Laplacian; see `jaxsmw.compute_spectrum`."""

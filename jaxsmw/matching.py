@@ -31,7 +31,7 @@ from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
-from jaxsmw.repair.chirality import Decision, Hands, decide
+from jaxsmw.repair.chirality import Decision, Hands
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
@@ -71,13 +71,13 @@ class Correspondence:
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
     - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down, or if both
-      hands are about equally likely (`mirror_evidence` between 0.05 and 0.15). Without repair in the preset,
-      only the hands are judged.
+      hands are about equally likely (`mirror_evidence` between 0 and 0.1). Without repair in the preset, only
+      the hands are judged.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. The map belongs to the vertices of X in both cases.
     - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm; None if `match` did not
       compare the hands. A coarse map of X itself changes distances by at least `exp(mirror_evidence)` times
-      as much as a coarse map of its mirror image. Values from 0.1 lead to `mirrored`; most correct decisions
+      as much as a coarse map of its mirror image. Values from 0.05 lead to `mirrored`; most correct decisions
       for `mirrored` have values above 0.3.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
       meshes of a given size includes the time of compilation.
@@ -348,13 +348,12 @@ def match(
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. The mirror image of X
       is then matched instead of X, and the map belongs to the same vertices of X.
 
-        - `"no"` (the default): match X itself.
+        - `"auto"` (the default): compare both hands (`jaxsmw.repair.chirality.Hands`) if both shapes differ
+          from their own mirror images, as teeth do. Match the mirror image if its coarse maps preserve
+          distances better. People and animals are nearly their own mirror images, so X itself is matched. The
+          hands of a partial pair are not compared.
+        - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
-        - `"auto"`: compare both hands (`jaxsmw.repair.chirality.Hands`), and match the mirror image if its
-          coarse maps preserve distances clearly better. Use this setting for shapes that are not their own
-          mirror image, such as teeth. Most bodies are their own mirror image, which gives no evidence, and
-          they are then matched as they are; some pairs of animals in different poses are mirrored wrongly
-          (docs/research_log.md). The hands of a partial pair are not compared.
 
     - `history`: whether to record a `History` of the last stage, as `refinement.history` of the result.
 
@@ -391,7 +390,7 @@ def match(
     decision = Decision(mirror == "yes")
     if mirror == "auto" and not partial:
         with timed("comparison of hands", seconds):
-            decision = decide(Hands(pair, prepared.spectrum_x, prepared.spectrum_y).evidence())
+            decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide()
         if decision.mirrored:
             logger.info("%s: the mirror image of the source is matched", pair.name)
             prepared = prepare_hand(pair.mirrored())

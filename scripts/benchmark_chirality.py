@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsmw import Pair, paired_spectra, read_mesh
-from jaxsmw.repair.chirality import Hands, decide
+from jaxsmw.repair.chirality import Hands
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
         pair = Pair.make(read_mesh(x), read_mesh(y))
         spectra = paired_spectra(pair, 20)
         start = time.perf_counter()
-        decision = decide(Hands(pair, *spectra).evidence())
+        decision = Hands(pair, *spectra).decide()
         seconds = time.perf_counter() - start
         right += decision.mirrored == opposite
         doubtful += decision.doubtful

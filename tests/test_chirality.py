@@ -71,7 +71,7 @@ def test_auto_finds_the_hand_of_a_lump(lump, opposite):
 def test_the_given_hand_is_used(lump):
     target = turned(lump)
     given = match(lump, target, preset="fast", mirror="yes")
-    alone = match(lump.mirrored(), target, preset="fast")
+    alone = match(lump.mirrored(), target, preset="fast", mirror="no")
     assert (given.mirrored, alone.mirrored, given.mirror_evidence) == (True, False, None)
     assert ", mirrored" in repr(given)
     np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
@@ -117,14 +117,39 @@ def test_the_hands_of_a_partial_pair_are_not_compared(lump):
 
 def test_decisions():
     settings = ChiralitySettings()
-    assert decide(None) == (False, None, False)
-    assert decide(settings.mirrored_from + 1) == (True, settings.mirrored_from + 1, False)
-    assert not decide(settings.mirrored_from - 1).mirrored
-    assert decide(settings.mirrored_from - settings.doubt / 2).doubtful
-    assert decide(settings.mirrored_from + settings.doubt / 2)[::2] == (True, True)
+    clear, near = settings.mirrored_from + 1, settings.mirrored_from + settings.doubt / 2
+    assert decide(clear, 1.0) == (True, clear, False)
+    assert decide(-clear, 1.0) == (False, -clear, False)
+    assert decide(near, 1.0) == (True, near, True)
+    assert decide(near - settings.doubt, 1.0) == (False, near - settings.doubt, True)
+    nearly_symmetric = settings.asymmetric_from - settings.asymmetry_doubt / 2
+    assert decide(clear, nearly_symmetric) == (False, clear, True)
+    assert decide(-clear, nearly_symmetric) == (False, -clear, False)
 
 
-@pytest.mark.parametrize(("evidence", "mirrored"), [(0.07, False), (0.13, True)])
+def test_a_shape_that_is_its_own_mirror_image_has_no_asymmetry(lump):
+    creature = creature_pair(vertices=1500)
+    for mesh_x, mesh_y, low, high in (
+        (creature.source, creature.target, 0.0, 0.5),
+        (lump, turned(lump), 0.65, 1.1),
+    ):
+        pair = Pair.make(mesh_x, mesh_y)
+        asymmetry = Hands(pair, *paired_spectra(pair, 20)).asymmetry()
+        assert low < asymmetry < high
+        mirrored = pair.mirrored()
+        assert Hands(mirrored, *paired_spectra(mirrored, 20)).asymmetry() == pytest.approx(
+            asymmetry, abs=0.02
+        )
+
+
+def test_symmetric_shapes_are_not_compared(lump, monkeypatch):
+    monkeypatch.setattr(Hands, "asymmetry", lambda self: 0.4)
+    monkeypatch.setattr(Hands, "evidence", lambda self: pytest.fail("compared"))
+    pair = Pair.make(lump, turned(lump))
+    assert Hands(pair, *paired_spectra(pair, 20)).decide() == (False, None, False)
+
+
+@pytest.mark.parametrize(("evidence", "mirrored"), [(0.03, False), (0.07, True)])
 def test_a_doubtful_hand_is_flagged(lump, monkeypatch, evidence, mirrored):
     monkeypatch.setattr(Hands, "evidence", lambda self: evidence)
     with pytest.warns(UserWarning, match="match the target about equally well"):
@@ -145,5 +170,5 @@ def test_evidence_has_opposite_signs_for_opposite_hands(lump):
 def test_hands_of_teeth(shared, names, opposite):
     directory = shared / "data" / "primate_molars"
     pair = Pair.make(*(jaxsmw.read_mesh(directory / f"{name}_sas.off") for name in names))
-    decision = decide(Hands(pair, *paired_spectra(pair, 20)).evidence())
+    decision = Hands(pair, *paired_spectra(pair, 20)).decide()
     assert decision.mirrored is opposite and not decision.doubtful

@@ -78,8 +78,9 @@ def test_the_help_states_the_defaults_of_the_library(run):
     assert f"(default: {defaults['preset']}, or paper if" in words["match"]
     assert f"map:FILE (default: {defaults['init']})" in words["match"]
     assert f"X_Y.map (default: {Settings().init})" in words["benchmark"]
-    assert words["match"].count("(default: auto)") == 3
-    assert (defaults["laplacian"], defaults["eigensolver"], WaveletPreservation().search) == ("auto",) * 3
+    assert words["match"].count("(default: auto)") == 4
+    automatic = [defaults[name] for name in ("laplacian", "eigensolver", "mirror")]
+    assert [*automatic, WaveletPreservation().search] == ["auto"] * 4
     eigenvectors = inspect.signature(compute_spectrum).parameters["number_of_eigenvectors"].default
     assert f"number of eigenvectors (default: {eigenvectors})" in words["spectrum"]
     assert f"eigenvectors per shape (default: {Stage().number_of_eigenvectors})" in words["match"]
@@ -199,7 +200,7 @@ def calls(monkeypatch):
         ("--solution regularized", lambda: {"solution": RegularizedLeastSquares()}),
         ("--laplacian robust", lambda: {"laplacian": "robust"}),
         ("--mirror yes", lambda: {"mirror": "yes"}),
-        ("--mirror auto", lambda: {"mirror": "auto"}),
+        ("--mirror no", lambda: {"mirror": "no"}),
         ("--precision float64", lambda: {"float type": np.float64}),
         ("--stop-when-unchanged", lambda: {"stop_when_unchanged": True}),
     ],
@@ -388,6 +389,7 @@ def test_seams_are_reported_and_welded(run, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_demo_writes_a_pair_and_a_better_map(run, tmp_path):
     small = ["--vertices", "1000", "--preset", "paper", "--eigenvectors", "40"]
     outcome = run("demo", "--output", tmp_path / "demo", *small)

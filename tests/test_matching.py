@@ -40,7 +40,7 @@ from jaxsmw.runtime import threads as threads_module
 from jaxsmw.stage import Stage
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
-OPTIONS = {"preset": STAGE}
+OPTIONS = {"preset": STAGE, "mirror": "no"}
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_results_are_reproducible_bit_for_bit(pair):
 def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
     jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        match(*pair[:2], preset=replace(STAGE, number_of_samples=samples))
+        match(*pair[:2], preset=replace(STAGE, number_of_samples=samples), mirror="no")
     # jax.log_compiles applies to this thread only, so compilation in another thread is not logged.
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
@@ -314,7 +314,8 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    assert caplog.messages == ["eigenbases ...", "initial map ...", "samples ...", "refinement ..."]
+    steps = ["eigenbases", "initial map", "samples", "comparison of hands", "refinement"]
+    assert caplog.messages == [f"{step} ..." for step in steps]
 
 
 @pytest.mark.parametrize(
@@ -451,7 +452,8 @@ def test_presets_match_a_copy_accurately(pair):
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (accurate, paper)]
     assert max(errors) < 0.002
     assert accurate.iterations == 3 + 4 + 4 and accurate.functional_map.shape == (200, 200)
-    assert list(accurate.seconds) == ["eigenbases", "initial map", "descriptors", "samples", "refinement"]
+    steps = ["eigenbases", "initial map", "descriptors", "samples", "comparison of hands", "refinement"]
+    assert list(accurate.seconds) == steps
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
@@ -556,7 +558,7 @@ def test_a_partial_shape_in_another_unit_is_refused(part):
 def test_a_partial_shape_is_matched_to_the_full_shape(part):
     mesh_x, mesh_y, truth = part
     found = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), partial=True)
-    as_wholes = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40))
+    as_wholes = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), mirror="no")
     k_x, k_y = found.functional_map.shape
     assert k_x < k_y == 40
     assert mean_error(mesh_y, found.initial_map, truth) < mean_error(mesh_y, as_wholes.initial_map, truth)

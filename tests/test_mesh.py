@@ -576,7 +576,7 @@ HOSTILE = {
     "nuls.obj": (bytes(1000), "no line that begins with v"),
     "nuls.ply": (bytes(1000), "ply"),
     "nuls.stl": (bytes(1000), "fit"),
-    "unknown.xyz": (T, "known mesh format"),
+    "unknown.abc": (T, "known mesh format"),
     "suffixless": (T, "known mesh format"),
     "compressed.off.gz": (b"\x1f\x8b", "known mesh format"),
     "really stl.off": (binary_stl(TRIANGLE), "OFF"),

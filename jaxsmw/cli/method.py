@@ -85,7 +85,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MIRROR,
         help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
         "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both "
-        "hands, for shapes that are not their own mirror image (default: %(default)s)",
+        "hands, unless the meshes are nearly their own mirror images, like people (default: %(default)s)",
     )
     group.add_argument(
         "--precision",
@@ -219,7 +219,7 @@ def match_meshes(
             mirror=options.mirror,
         )
     stopwatch.add(correspondence.seconds)
-    if options.mirror != "no":
+    if correspondence.mirrored or correspondence.mirror_evidence is not None:
         _say_hand(correspondence)
     return correspondence
 

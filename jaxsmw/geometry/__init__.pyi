@@ -3,6 +3,7 @@ from .creature import CreaturePair, creature_pair
 from .eigenbasis import compute_spectrum
 from .geodesics import SurfacePoints, geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
+from .point_cloud import triangulate_points
 from .sampling import farthest_point_samples
 from .shot import shot_descriptors
 from .surface_distance import distances_to_surface, nearest_surface_points
@@ -21,4 +22,5 @@ __all__ = [
     "nearest_surface_points",
     "one_to_one_map",
     "shot_descriptors",
+    "triangulate_points",
 ]

@@ -403,10 +403,10 @@ def make_mesh(
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
-    position = _numeric(vertices, "vertices", name)
+    position = numeric_rows(vertices, "vertices", name)
     with np.errstate(over="ignore"):  # wider float types can overflow; `_check_extent` reports infinities
         position = np.array(position, dtype=np.float64, order="C")
-    triangles = _indices(_numeric(faces, "faces", name), len(position), name)
+    triangles = _indices(numeric_rows(faces, "faces", name), len(position), name)
     notes = list(notes)
     lost = lost_vertices(position)
     if lost.any():
@@ -557,7 +557,7 @@ def to_host(values: Any) -> Any:
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 
-def _numeric(values: ArrayLike, what: str, name: str) -> np.ndarray:
+def numeric_rows(values: ArrayLike, what: str, name: str) -> np.ndarray:
     """Return the values as a non-empty array (number of values, 3) of integers or floats."""
     expected = f"{name}: {what} must be a numeric array of shape (number of {what}, 3)"
     try:

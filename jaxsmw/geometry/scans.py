@@ -16,18 +16,20 @@ _FAR = 100.0
 _SMALL, _LARGEST = 0.01, 0.5
 
 
-def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the vertices without a usable position, or an empty mask if there are too many.
-
-    A position is not usable if a coordinate is not finite, or if the vertex is very far from all others.
-    """
-    most = int(_MOST_LOST * len(position))
-    lost = ~np.isfinite(position).all(axis=1)
-    if 0 < most >= lost.sum():
+def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the positions that are finite and not very far from all others."""
+    usable = np.isfinite(position).all(axis=1)
+    if usable.any():
         with np.errstate(over="ignore", invalid="ignore"):
-            distances = np.abs(position - np.median(position[~lost], axis=0)).max(axis=1)
-            lost |= distances > _FAR * np.quantile(distances[~lost], 0.9)
-    return lost if lost.sum() <= most else np.zeros(len(position), dtype=bool)
+            distances = np.abs(position - np.median(position[usable], axis=0)).max(axis=1)
+            usable &= distances <= _FAR * np.quantile(distances[usable], 0.9)
+    return usable
+
+
+def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the vertices without a usable position, or an empty mask if there are too many."""
+    lost = ~usable_positions(position)
+    return lost if lost.sum() <= _MOST_LOST * len(position) else np.zeros_like(lost)
 
 
 def between_neighbors(

@@ -19,17 +19,20 @@ from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import count_of, make_mesh
-from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Texture, Written
+from jaxsmw.geometry.point_cloud import triangulate_points
+from jaxsmw.io.formats.data import NORMALS, MeshData, Polygons, Skin, Texture, Written
 from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
 from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
 from jaxsmw.io.formats.mat import format_mat, parse_mat
 from jaxsmw.io.formats.npz import format_npz, parse_npz
 from jaxsmw.io.formats.obj import format_obj, parse_obj
 from jaxsmw.io.formats.off import format_off, parse_off
+from jaxsmw.io.formats.pcd import parse_pcd
 from jaxsmw.io.formats.ply import format_ply, parse_ply
 from jaxsmw.io.formats.stl import format_stl, parse_stl
 from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
 from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
+from jaxsmw.io.formats.xyz import parse_npy, parse_xyz
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
 __all__ = ["MESH_SUFFIXES", "MeshData", "Skin", "Texture", "read_mesh_data", "write_mesh_data"]
@@ -44,6 +47,9 @@ _PARSERS: dict[str, Callable[[bytes], Polygons]] = {
     ".vtp": parse_vtp,
     ".glb": parse_glb,
     ".npz": parse_npz,
+    ".xyz": parse_xyz,
+    ".pcd": parse_pcd,
+    ".npy": parse_npy,
 }
 _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
     ".off": format_off,
@@ -59,6 +65,8 @@ _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
 }
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
 """The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
+POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
+"""The suffixes of files that contain only points."""
 
 
 def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
@@ -106,10 +114,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     path = Path(path)
     data = read_bytes(path)
     suffix = path.suffix.lower()
-    if suffix not in _FORMATTERS:
+    if suffix != ".gltf" and suffix not in _PARSERS:
         raise InputError(
             f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
-            f"mesh to one of {', '.join(_FORMATTERS)}."
+            f"mesh to one of {', '.join([*_FORMATTERS, *POINT_CLOUD_SUFFIXES])}."
         )
     try:
         polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
@@ -121,7 +129,12 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     large = int((polygons.sizes > 3).sum())
     if large:
         notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
-    mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+    if len(faces) or not len(polygons.vertices):
+        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+    else:
+        normals = polygons.vertex_data.get(NORMALS)
+        mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
+        faces = mesh.faces
     return MeshData(
         mesh,
         faces.astype(np.int64),

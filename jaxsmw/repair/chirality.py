@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
-from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -28,7 +28,6 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-_Map = Int64[np.ndarray, " s"]
 _Distances = Float[np.ndarray, "s s"]
 
 
@@ -38,10 +37,13 @@ class Hands:
     Both hands have the same distances along the surface, and the same spectrum. Only descriptors that
     distinguish left from right differ, such as SHOT. If the mirror image of X corresponds to Y, descriptors
     of X itself agree with Y only in scattered places, and lead to a map that does not preserve distances. The
-    evidence compares how well maps of both hands preserve distances. Most bodies are their own mirror image,
-    up to pose; for these bodies, maps of both hands preserve distances equally well.
+    evidence compares how well maps of both hands preserve distances.
 
-    All evidence is the logarithm of a ratio: the distance error of the map of X itself, divided by the
+    Most bodies are their own mirror image, up to pose. For these bodies, maps of both hands preserve
+    distances equally well, but one of two coarse maps can be wrong by chance. The asymmetry of a shape
+    compares the shape with its own mirror image, and distinguishes such bodies from teeth.
+
+    The evidence is the logarithm of a ratio: the distance error of the map of X itself, divided by the
     distance error of the map of its mirror image. Positive evidence supports the mirror image. The distance
     error of a map is the mean absolute difference between the distance of two points of X and the distance of
     their matches.
@@ -64,9 +66,51 @@ class Hands:
         self.stage = Stage(
             FeatureRegression(levels=settings.levels), number_of_descriptors=settings.descriptors
         )
+        self._hands = functools.cache(self._describe)
         self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
-    def evidence(self) -> float | None:
+    def decide(self) -> Decision:
+        """Decide between the hands.
+
+        The mirror image is taken if both shapes are asymmetric, and if the evidence supports the mirror
+        image.
+
+        **Returns:** The decision. The hands of shapes with too few samples are not compared.
+        """
+        settings = self.settings
+        if min(len(shape.areas) for shape in (self.x, self.y)) < settings.fewest_samples:
+            return Decision(False)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # sparse samples only weaken the evidence
+                asymmetry = self.asymmetry()
+                if asymmetry < settings.asymmetric_from - settings.asymmetry_doubt:
+                    return Decision(False)
+                return decide(self.evidence(), asymmetry, settings)
+        except InputError:  # the samples are too sparse for SHOT
+            return Decision(False)
+
+    def asymmetry(self) -> float:
+        """Return the mean asymmetry of X and Y.
+
+        The asymmetry of a shape is the distance error of the map from the shape to its own mirror image,
+        divided by the distance error of a random map (seed 0). Each sample is mapped to the sample of the
+        mirror image with the nearest SHOT descriptor. The asymmetry is near 0 for a shape that is its own
+        mirror image, and near 1 for a shape without any similarity to its mirror image.
+
+        **Raises:** `InputError` if the samples are too sparse for SHOT.
+        """
+        return float(np.mean(side_by_side(self._asymmetry, self.x, self.y)))
+
+    def _asymmetry(self, shape: _Shape) -> float:
+        shot = self._shot(shape, self.settings.asymmetry_radii)
+        # All descriptors have the same length, so the nearest descriptor has the largest inner product.
+        mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
+        found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
+        random = np.random.default_rng(0).permutation(len(found))
+        return _distance_error(shape, shape, found) / _distance_error(shape, shape, random)
+
+    def evidence(self) -> float:
         """Compare coarse maps of both hands.
 
         The coarse maps come from nearest neighbours of SHOT with large radii, and are refined by a feature
@@ -74,40 +118,42 @@ class Hands:
         of maps. The least evidence counts, because by chance one of two wrong maps can be much better than
         the other. Further sets are not tried once the evidence is too small for the mirror image.
 
-        **Returns:** The evidence for the mirror image, without unit; None if a mesh is too coarse.
+        **Returns:** The evidence for the mirror image, without unit.
+
+        **Raises:** `InputError` if the samples are too sparse for SHOT.
         """
-        if min(len(shape.areas) for shape in (self.x, self.y)) < self.settings.fewest_samples:
-            return None
         least = np.inf
         for radii in self.settings.radii:
-            try:
-                least = min(least, self._evidence_of(radii))
-            except InputError:  # the samples are too sparse for these radii
-                return None
+            x, mirrored_x, y, _ = self._hands(radii)
+            own, mirrored = (self._error(hand, y, *self._map(hand, y)) for hand in (x, mirrored_x))
+            least = min(least, _log_ratio(own, mirrored))
             if least < self.settings.mirrored_from - self.settings.doubt:
                 break
         return float(least)
 
-    def _evidence_of(self, radii: tuple[int, ...]) -> float:
-        """Return the evidence of the maps from SHOT with the given radii."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # sparse samples only weaken the evidence
-            shot_x, shot_y = side_by_side(lambda shape: self._shot(shape, radii), self.x, self.y)
-        mirrored = np.hstack([mirrored_descriptors(one) for one in shot_x])
-        shot = [np.hstack(shot_x), mirrored, np.hstack(shot_y)]
-        areas = [self.x.areas / 2, self.x.areas / 2, self.y.areas]
+    def _describe(self, radii: tuple[int, ...]) -> list[_Hand]:
+        """Describe the samples of X, of its mirror image, of Y, and of its mirror image."""
+        shot_x, shot_y = side_by_side(lambda shape: self._shot(shape, radii), self.x, self.y)
+        shapes = [self.x, self.x, self.y, self.y]
+        shot = [
+            np.hstack(descriptors)
+            for own in (shot_x, shot_y)
+            for descriptors in (own, [mirrored_descriptors(one) for one in own])
+        ]
         components = principal_components(
-            np.concatenate(shot), np.concatenate(areas) / 2, self.stage.number_of_descriptors
+            np.concatenate(shot),
+            np.concatenate([shape.areas for shape in shapes]) / len(shapes),
+            self.stage.number_of_descriptors,
         )
-        *of_x, of_y = np.split(components, np.cumsum([len(rows) for rows in shot])[:-1])
-        errors = []
-        for features, described in zip(shot[:2], of_x, strict=True):
-            first = np.argmin(cdist(features, shot[2]), axis=1)
-            forward, backward = self._refined(first, described, of_y)
-            errors.append(
-                _distance_error(self.x, self.y, forward) + _distance_error(self.y, self.x, backward)
-            )
-        return _log_ratio(*errors)
+        of_hands = np.split(components, np.cumsum([len(rows) for rows in shot])[:-1])
+        return [_Hand(*hand) for hand in zip(shapes, shot, of_hands, strict=True)]
+
+    @staticmethod
+    def _error(
+        x: _Hand, y: _Hand, forward: Int64[np.ndarray, " s"], backward: Int64[np.ndarray, " t"]
+    ) -> float:
+        """Return the sum of the distance errors of a map and of its reverse map."""
+        return _distance_error(x.shape, y.shape, forward) + _distance_error(y.shape, x.shape, backward)
 
     def _shape(self, argument: tuple[Mesh, Spectrum]) -> _Shape:
         mesh, spectrum = argument
@@ -119,18 +165,17 @@ class Hands:
             for multiple in radii
         ]
 
-    def _refined(
-        self, first: _Map, described_x: Float[np.ndarray, "s d"], described_y: Float[np.ndarray, "t d"]
-    ) -> tuple[_Map, Int64[np.ndarray, " t"]]:
-        """Refine a map from X to Y, and return the refined map and its reverse map."""
-        spectra = self.x.described(described_x), self.y.described(described_y)
+    def _map(self, x: _Hand, y: _Hand) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " t"]]:
+        """Refine the map to nearest descriptors, and return the refined map (s,) and its reverse map (t,)."""
+        first = np.argmin(cdist(x.shot, y.shot), axis=1)
+        spectra = [hand.shape.described(hand.components) for hand in (x, y)]
         size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
         views = [spectrum.pad(size) for spectrum in self.stage.view(*spectra)]
         start = jax.device_put(pad_rows(first, size).astype(np.int32))
         found = self.stage.run(views[0], views[1], start)
         reverse = compiled(_reverse_map)(self.stage.refiner, Problem(views[0], views[1]), found.state)
         forward, backward = (np.asarray(T).astype(np.int64) for T in (found.pointwise_map, reverse))
-        return forward[: len(described_x)], backward[: len(described_y)]
+        return forward[: len(x.shot)], backward[: len(y.shot)]
 
 
 class _Shape:
@@ -153,7 +198,7 @@ class _Shape:
             jnp.asarray(descriptors, dtype),
         )
 
-    @cached_property
+    @functools.cached_property
     def distances(self) -> _Distances:
         """Distances between the samples: lengths of shortest paths over samples with adjacent regions.
 
@@ -169,7 +214,15 @@ class _Shape:
         return np.where(np.isfinite(along), along, cdist(places, places))
 
 
-def _distance_error(x: _Shape, y: _Shape, found: _Map) -> float:
+class _Hand(NamedTuple):
+    """A shape or its mirror image, with the descriptors of its samples and their principal components."""
+
+    shape: _Shape
+    shot: Float[np.ndarray, "s r"]
+    components: Float[np.ndarray, "s d"]
+
+
+def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> float:
     """Return the mean absolute difference between distances on X and distances of the matches on Y."""
     return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
 
@@ -189,8 +242,10 @@ class Decision(NamedTuple):
     **Attributes:**
 
     - `mirrored`: whether the mirror image of X corresponds to Y.
-    - `evidence`: the evidence for the mirror image; see `Hands`. None if the hand was given.
-    - `doubtful`: whether the evidence is near the threshold.
+    - `evidence`: the evidence for the mirror image; see `Hands`. None if the hand was given, or if the shapes
+      are their own mirror images.
+    - `doubtful`: whether the evidence is near its threshold, or whether it supports the mirror image although
+      the asymmetry is somewhat too small.
     """
 
     mirrored: bool
@@ -198,16 +253,20 @@ class Decision(NamedTuple):
     doubtful: bool = False
 
 
-def decide(evidence: float | None, settings: ChiralitySettings = ChiralitySettings()) -> Decision:  # noqa: B008
+def decide(
+    evidence: float,
+    asymmetry: float,
+    settings: ChiralitySettings = ChiralitySettings(),  # noqa: B008
+) -> Decision:
     """Decide between the hands of a pair.
 
     **Arguments:**
 
-    - `evidence`: the evidence for the mirror image, or None if there is none.
+    - `evidence`: the evidence for the mirror image; see `Hands`.
+    - `asymmetry`: the mean asymmetry of both shapes, from 0 to about 1; see `Hands.asymmetry`.
     - `settings`: the thresholds.
     """
-    if evidence is None:
-        return Decision(False)
-    return Decision(
-        evidence >= settings.mirrored_from, evidence, abs(evidence - settings.mirrored_from) < settings.doubt
-    )
+    supported = evidence >= settings.mirrored_from
+    asymmetric = asymmetry >= settings.asymmetric_from
+    near = abs(evidence - settings.mirrored_from) < settings.doubt
+    return Decision(supported and asymmetric, evidence, near if asymmetric else supported)

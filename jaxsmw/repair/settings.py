@@ -179,6 +179,11 @@ class ChiralitySettings:
       from its mirror image.
     - `descriptors`, `levels` (entry R14): the number of descriptors and the levels of the feature regression
       that refines coarse maps.
+    - `asymmetry_radii` (entry R23): the radii of SHOT for the asymmetry, in the same unit.
+    - `asymmetric_from` (entry R23): shapes with a smaller mean asymmetry count as their own mirror image, so
+      X itself is matched.
+    - `asymmetry_doubt` (entry R23): evidence is computed for asymmetries down to this much below the
+      threshold, and leads to a doubtful decision there if the evidence supports the mirror image.
     - `mirrored_from` (entry R21): if the least evidence of all sets is at least this value, the mirror image
       of X is matched.
     - `doubt` (entry R21): a decision is doubtful if the evidence is nearer to `mirrored_from` than this.
@@ -189,5 +194,8 @@ class ChiralitySettings:
     radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8))
     descriptors: int = 30
     levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
-    mirrored_from: float = 0.1
+    asymmetry_radii: tuple[int, ...] = (3, 6)
+    asymmetric_from: float = 0.61
+    asymmetry_doubt: float = 0.04
+    mirrored_from: float = 0.05
     doubt: float = 0.05

@@ -82,13 +82,13 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
         arrays = {}
         for member in members:
             with file.open(member) as stream:
-                _check_header(stream, member.file_size)
+                check_header(stream, member.file_size)
             with file.open(member) as stream:
                 arrays[member.filename.removesuffix(".npy")] = np.lib.format.read_array(stream)
     return arrays
 
 
-def _check_header(stream: Any, size: int) -> None:
+def check_header(stream: Any, size: int) -> None:
     """Refuse an array that declares more numbers than its member of the archive contains.
 
     **Raises:** `ValueError` for such an array.

@@ -101,7 +101,9 @@ def parse_ply(data: bytes) -> Polygons:
         raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
     corners = face.get("vertex_indices", face.get("vertex_index"))
     if corners is None:
-        raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
+        if elements.get("face", (0, {}))[0]:
+            raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
+        corners = _Column(np.empty(0), np.empty(0, np.int64))  # a point cloud
     vertices = np.stack(position, axis=1, dtype=np.float64)
     vertex_data, face_data = (
         _numbers_of(tables.get(name, {}), elements.get(name, (0, {}))[1]) for name in ("vertex", "face")

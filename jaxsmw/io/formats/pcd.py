@@ -1,0 +1,163 @@
+"""Point clouds in the PCD format of the Point Cloud Library (https://pointclouds.org/documentation/)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.data import NORMALS, Polygons
+from jaxsmw.io.formats.lines import excerpt, numbers, text
+from jaxsmw.runtime.files import largest_contents
+
+_KINDS = {"F": "f", "I": "i", "U": "u"}
+_NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
+# The names of fields with padding, which contain nothing.
+_PADDING = "_"
+
+
+class _Header(NamedTuple):
+    """The fields of each point: a record type, the number of points, and the encoding of the points."""
+
+    record: np.dtype
+    points: int
+    encoding: str
+
+
+def parse_pcd(data: bytes) -> Polygons:
+    """Parse a text file, a binary file, or a file in the format `binary_compressed`."""
+    header, body = _header(data)
+    if header.encoding == "ascii":
+        table = _from_text(body, header)
+    else:
+        if header.encoding == "binary_compressed":
+            body = _decompress(body, header)
+        size = header.points * header.record.itemsize
+        if len(body) < size:
+            raise InputError(
+                f"the header declares {header.points} points, but the file ends earlier, so the file is "
+                "truncated: export the points again."
+            )
+        table = np.frombuffer(body[:size], header.record)
+    missing = [axis for axis in "xyz" if axis not in (header.record.names or ())]
+    if missing:
+        raise InputError(f"has no field {missing[0]}: export the points again, with x, y and z.")
+    columns = {name: table[name] for name in table.dtype.names or () if not name.startswith(_PADDING)}
+    vertices = np.stack([columns.pop(axis).reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
+    if all(name in columns for name in _NORMAL_FIELDS):
+        columns[NORMALS] = np.stack([columns.pop(name).reshape(-1) for name in _NORMAL_FIELDS], axis=1)
+    return Polygons(vertices, np.empty(0), np.empty(0, np.int64), vertex_data=columns)
+
+
+def _header(data: bytes) -> tuple[_Header, bytes]:
+    """Parse the header, and return it with the rest of the file."""
+    entries: dict[str, list[str]] = {}
+    offset = 0
+    while "DATA" not in entries:
+        end = data.find(b"\n", offset)
+        if end < 0 or end > 2**16:
+            raise InputError(
+                "has no line DATA at the end of its header, so the file is damaged: export the points again."
+            )
+        words = data[offset:end].decode("latin-1").split()
+        offset = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    names = entries.get("FIELDS", entries.get("COLUMNS", []))
+    counts = entries.get("COUNT", ["1"] * len(names))
+    described = list(zip(names, entries.get("SIZE", []), entries.get("TYPE", []), counts, strict=False))
+    # A field without data would be named twice otherwise, for example the padding `_`.
+    fields = [
+        (name if name != _PADDING else f"{_PADDING}{at}", *rest) for at, (name, *rest) in enumerate(described)
+    ]
+    encoding = "".join(entries["DATA"])
+    try:
+        if len(described) != len(names) or len(counts) != len(names) or not names:
+            raise ValueError
+        kinds = [(name, f"<{_KINDS[kind]}{int(size)}", (int(count),)) for name, size, kind, count in fields]
+        record = np.dtype(kinds)
+        width, height = (int(*entries.get(key, ["1"])) for key in ("WIDTH", "HEIGHT"))
+        points = int(*entries.get("POINTS", [str(width * height)]))
+        if min(width, height) < 0 or points != width * height or encoding not in _ENCODINGS:
+            raise ValueError
+    except (KeyError, TypeError, ValueError):
+        raise InputError(
+            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)}): export "
+            "the points again."
+        ) from None
+    return _Header(record, points, encoding), data[offset:]
+
+
+_ENCODINGS = "ascii", "binary", "binary_compressed"
+
+
+def _from_text(body: bytes, header: _Header) -> np.ndarray:
+    """Return the points of a text file, as an array of records."""
+    lines = [line for line in text(body).split("\n") if line and not line.isspace()]
+    if len(lines) != header.points:
+        raise InputError(
+            f"the header declares {header.points} points, but is followed by {len(lines)} lines, so the file "
+            "is truncated or its header is wrong: export the points again."
+        )
+    names = header.record.names or ()
+    widths = [math.prod(header.record[name].shape) for name in names]
+    values = np.split(numbers(lines, sum(widths)), np.cumsum(widths)[:-1], axis=1)
+    table = np.empty(len(lines), [(name, "f8", (width,)) for name, width in zip(names, widths, strict=True)])
+    for name, columns in zip(names, values, strict=True):
+        table[name] = columns
+    return table
+
+
+def _decompress(body: bytes, header: _Header) -> bytes:
+    """Return the records of a compressed file, which stores all values of a field one after another."""
+    packed, size = (int(n) for n in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
+    expected = header.points * header.record.itemsize
+    if size != expected or len(body) < 8 + packed or size > largest_contents(len(body)):
+        raise InputError(
+            f"declares {size} bytes of points where {expected} belong, or ends early, so the file is "
+            "damaged: export the points again."
+        )
+    fields = lzf_decompressed(body[8 : 8 + packed], size)
+    table, offset = np.empty(header.points, header.record), 0
+    for name in header.record.names or ():
+        kind = header.record[name]
+        table[name] = np.frombuffer(fields, kind, header.points, offset)
+        offset += header.points * kind.itemsize
+    return table.tobytes()
+
+
+def lzf_decompressed(packed: bytes, size: int) -> bytes:
+    """Decompress data in the LZF format of Marc Lehmann's LibLZF.
+
+    A control byte below 32 precedes that number plus one of literal bytes. Any other control byte begins a
+    copy of earlier output: its upper three bits give the length, and its lower five bits and the next byte
+    give the distance.
+
+    **Raises:** `InputError` if the data is damaged, or has another size.
+    """
+    out, at = bytearray(), 0
+    try:
+        while at < len(packed):
+            control = packed[at]
+            at += 1
+            if control < 32:
+                out += packed[at : at + control + 1]
+                at += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += packed[at]
+                at += 1
+            start = len(out) - ((control & 31) << 8) - packed[at] - 1
+            at += 1
+            if start < 0 or len(out) > size:
+                raise IndexError
+            for step in range(length + 2):  # a copy may overlap its own end
+                out.append(out[start + step])
+    except IndexError:
+        out = bytearray()
+    if len(out) != size or at != len(packed):
+        raise InputError("contains damaged compressed points: export the points again.")
+    return bytes(out)

@@ -1,0 +1,71 @@
+"""Point clouds in text files with one point per line, and in NumPy's `.npy` files."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from jaxtyping import Float64, Shaped
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.data import NORMALS, Polygons
+from jaxsmw.io.formats.lines import numbers, text
+from jaxsmw.io.formats.npz import check_header
+from jaxsmw.io.text import is_number
+
+# Columns 4 to 6 are normals if the lengths of all rows are within this distance of 1. Otherwise the columns
+# contain something else, such as colours.
+_UNIT = 0.01
+
+
+def parse_xyz(data: bytes) -> Polygons:
+    """Parse a text file whose lines begin with x, y and z, separated by spaces, tabs, commas or semicolons.
+
+    A first line without three numbers is a header or the number of points, and is skipped.
+    """
+    lines = text(data).translate(str.maketrans(",;\t", "   ")).split("\n")
+    lines = [line for line in lines if line and not line.isspace()]
+    if lines and not _is_point(lines[0]):
+        lines = lines[1:]
+    if not lines:
+        raise InputError("contains no points: export the points again, one per line.")
+    columns = {len(line.split()) for line in lines}
+    return points_of_table(numbers(lines, min(columns) if min(columns) >= 3 else 3))
+
+
+def _is_point(line: str) -> bool:
+    words = line.split()
+    return len(words) >= 3 and all(is_number(word, finite=False) for word in words[:3])
+
+
+def parse_npy(data: bytes) -> Polygons:
+    """Parse an array with one row per point, whose columns are x, y, z, and perhaps the normal."""
+    try:
+        check_header(io.BytesIO(data), len(data))
+        table = np.lib.format.read_array(io.BytesIO(data))
+    except Exception:  # NumPy can raise any exception for damaged files
+        raise InputError("is damaged or not a .npy file of numbers: write the file again.") from None
+    if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "iuf":
+        raise InputError(
+            f"contains an array of {table.dtype.name} of shape {table.shape}: save numbers of shape (number "
+            "of points, 3)."
+        )
+    return points_of_table(table)
+
+
+def points_of_table(table: Shaped[np.ndarray, "n columns"]) -> Polygons:
+    """Return points without faces from their coordinates, with normals if columns 4 to 6 are unit vectors."""
+    with np.errstate(over="ignore"):  # `triangulate_points` reports coordinates that are not finite
+        table = table.astype(np.float64)
+    found = {NORMALS: table[:, 3:6]} if table.shape[1] >= 6 and _are_unit(table[:, 3:6]) else {}
+    used = 6 if found else 3
+    notes: tuple[str, ...] = ()
+    if table.shape[1] > used:
+        rest = f"{used + 1} to {table.shape[1]}" if table.shape[1] > used + 1 else str(used + 1)
+        notes = (f"Columns ignored: {rest}, which are not unit normals.",)
+    return Polygons(table[:, :3], np.empty(0), np.empty(0, np.int64), notes=notes, vertex_data=found)
+
+
+def _are_unit(vectors: Float64[np.ndarray, "n 3"]) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool((np.abs(np.linalg.norm(vectors, axis=1) - 1) < _UNIT).all())

@@ -1,0 +1,73 @@
+"""Compares the maps of point clouds with the maps of the meshes from which the points were taken.
+
+    python scripts/benchmark_point_clouds.py DATA_DIRECTORY/faust_r --pairs 20
+
+Pairs are drawn with seed 0. The points are all vertices of a mesh, displaced by normally distributed noise
+(seed 0). Each pair is matched as two meshes, as two point clouds, and as a point cloud and a mesh. Errors are
+geodesic errors on the mesh of the target, in thousandths of the square root of its area.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw.geometry import triangulate_points
+from jaxsmw.runtime.provenance import made_with
+
+
+def main() -> None:
+    """Match the pairs, and print the errors of each pair and their means."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument("--pairs", type=int, default=20, help="number of pairs (default: 20)")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.0,
+        help="standard deviation of the noise, in units of the median edge length (default: 0)",
+    )
+    options = parser.parse_args()
+    listed = (options.directory / "test_pairs.txt").read_text("utf-8").splitlines()
+    pairs = [tuple(Path(name).stem for name in line.split()[:2]) for line in listed]
+    rows = []
+    for row in np.random.default_rng(0).permutation(len(pairs))[: options.pairs]:
+        names = pairs[row]
+        meshes = [read_mesh(options.directory / "off" / f"{name}.off") for name in names]
+        truth_files = [options.directory / "corres" / f"{name}.vts" for name in names]
+        truth = read_ground_truth(truth_files, *meshes)
+        clouds = [_cloud(mesh, options.noise) for mesh in meshes]
+        kinds = meshes, clouds, (clouds[0], meshes[1])
+        errors = []
+        for source, target in kinds:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # suspicious maps are part of the measurement
+                found = match(source, target)
+            errors.append(1e3 * geodesic_error(meshes[1], found.pointwise_map, truth).mean)
+        rows.append(errors)
+        print(*names, *(f"{error:.1f}" for error in errors), flush=True)
+    for kind, values in zip(
+        ("meshes", "point clouds", "point cloud to mesh"), np.transpose(rows), strict=True
+    ):
+        ratio = values.mean() / np.mean(rows, axis=0)[0]
+        print(
+            f"{kind}: mean {values.mean():.1f}, median {np.median(values):.1f}, {ratio:.2f} times the meshes'"
+        )
+    print(made_with())
+
+
+def _cloud(mesh: Mesh, noise: float) -> Mesh:
+    """Return the surface of the vertices of a mesh, displaced by noise."""
+    edge = np.median(np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1))
+    displacements = np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    return triangulate_points(mesh.vertices + noise * edge * displacements, name=mesh.name)
+
+
+if __name__ == "__main__":
+    main()
