@@ -86,8 +86,8 @@ def triangulate_points(
     distinct = np.flatnonzero((first_equal_rows(position) == np.arange(len(position))) & usable)
     if len(distinct) < FEWEST_POINTS:
         raise InputError(
-            f"{name}: there are no faces, and {count_of(len(distinct), 'different point')} cannot represent a "
-            f"surface: give the faces, or at least {FEWEST_POINTS} points."
+            f"{name}: there are no faces, and {count_of(len(distinct), 'different point')} cannot represent "
+            f"a surface: give the faces, or at least {FEWEST_POINTS} points."
         )
     faces = _surface(position[distinct], None if direction is None else direction[distinct])
     if not len(faces):

@@ -88,6 +88,13 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
       Further attributes, morph targets and skins are read as well.
     - `.npz`: arrays with the names of the attributes of a `MeshData`.
+    - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
+      Further columns are ignored.
+    - `.pcd`: a file of the Point Cloud Library, text, binary or compressed: all fields. The fields
+      `normal_x`, `normal_y` and `normal_z` become `normals`.
+    - `.npy`: an array with one row per point, like the columns of an `.xyz` file.
+
+    If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
 
     A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
     vertices at exactly the same position are welded, as if `weld` were True. All meshes of the scene are

@@ -16,7 +16,7 @@ __all__ = ["MESH_SUFFIXES", "read_mesh", "write_mesh"]
 
 
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
-    """Read a triangle mesh from an OFF, OBJ, PLY, STL, MAT, VTK, VTP, glTF or NPZ file.
+    """Read a triangle mesh from an OFF, OBJ, PLY, STL, MAT, VTK, VTP, glTF or NPZ file, or a point cloud.
 
     Vertices keep the order of the file. An STL file contains only the corners of triangles, so corners at
     exactly the same position become one vertex. The vertices of an STL file are numbered in the order in
@@ -37,6 +37,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.gltf`, `.glb`: a glTF 2.0 file. Such a file duplicates vertices along texture seams, so vertices
           at exactly the same position are always welded.
         - `.npz`: a file with the arrays `vertices` and `faces`.
+        - `.xyz`, `.pcd`, `.npy`: a point cloud. A file in another format without faces is a point cloud, too.
+          `jaxsmw.geometry.triangulate_points` makes a mesh whose vertices are the points.
     - `weld`: if True, vertices at exactly the same position are merged. Faces then use only the
         lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
         renumbered. Welding has no effect on an STL file, whose corners are always merged.
