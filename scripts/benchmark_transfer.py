@@ -4,12 +4,14 @@
     python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
     python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars mouse_mandibles mouse_skulls --pairs 40
 
-Pairs are drawn with seed 0; a pair is used in the other direction after all pairs were used in one. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same
-command continues where it was interrupted. Distances of landmarks are in thousandths of the diagonal of the
-target's bounding box. Landmarks are carried by four methods: the registered mesh, the map alone, rigid
-alignment and the nearest point, and non-rigid coherent point drift (pycpd) after this alignment, with three
-settings (alpha and beta), which were the best of twelve on six pairs each of molars and of mandibles. Molars of opposite sides are matched with `mirror="yes"`, and all methods then use the mirror image
-of the source.
+Pairs are drawn with seed 0; a pair is used in the other direction after all pairs were used in one. Each
+result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same command continues where it was
+interrupted. Distances of landmarks are in thousandths of the diagonal of the target's bounding box.
+
+Landmarks are carried by four methods: the registered mesh, the map alone, rigid alignment and the nearest
+point, and non-rigid coherent point drift (pycpd) after this alignment, with three settings (alpha and beta),
+which were the best of twelve on six pairs each of molars and of mandibles. Molars of opposite sides are
+matched with `mirror="yes"`, and all methods then use the mirror image of the source.
 """
 
 from __future__ import annotations
