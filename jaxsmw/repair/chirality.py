@@ -66,7 +66,6 @@ class Hands:
         self.stage = Stage(
             FeatureRegression(levels=settings.levels), number_of_descriptors=settings.descriptors
         )
-        self._hands = functools.cache(self._describe)
         self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
     def decide(self) -> Decision:
@@ -124,7 +123,7 @@ class Hands:
         """
         least = np.inf
         for radii in self.settings.radii:
-            x, mirrored_x, y, _ = self._hands(radii)
+            x, mirrored_x, y, _ = self._describe(radii)
             own, mirrored = (self._error(hand, y, *self._map(hand, y)) for hand in (x, mirrored_x))
             least = min(least, _log_ratio(own, mirrored))
             if least < self.settings.mirrored_from - self.settings.doubt:
