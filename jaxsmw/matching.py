@@ -389,7 +389,7 @@ def match(
     seconds = dict(prepared.seconds)
     decision = Decision(mirror == "yes")
     if mirror == "auto" and not partial:
-        with timed("comparison of hands", seconds):
+        with timed("mirror test", seconds):
             decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide()
         if decision.mirrored:
             logger.info("%s: the mirror image of the source is matched", pair.name)

@@ -314,7 +314,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    steps = ["eigenbases", "initial map", "samples", "comparison of hands", "refinement"]
+    steps = ["eigenbases", "initial map", "samples", "mirror test", "refinement"]
     assert caplog.messages == [f"{step} ..." for step in steps]
 
 
@@ -452,7 +452,7 @@ def test_presets_match_a_copy_accurately(pair):
     errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (accurate, paper)]
     assert max(errors) < 0.002
     assert accurate.iterations == 3 + 4 + 4 and accurate.functional_map.shape == (200, 200)
-    steps = ["eigenbases", "initial map", "descriptors", "samples", "comparison of hands", "refinement"]
+    steps = ["eigenbases", "initial map", "descriptors", "samples", "mirror test", "refinement"]
     assert list(accurate.seconds) == steps
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()

@@ -17,6 +17,10 @@ BUMPY = bumpy_mesh(4)
 POINTS = np.round(BUMPY.vertices, 5)
 
 
+_steps = np.linspace(0, 1, 3000)[:, None]
+SKEW_LINES = np.concatenate([_steps * [1, 0, 0], [0, 0, 1] + _steps * [0, 1, 0]])
+
+
 def triangles(mesh):
     return set(map(tuple, np.sort(mesh.faces, axis=1).tolist()))
 
@@ -87,6 +91,16 @@ def test_normals_of_either_sign_give_the_same_surface(sign):
     assert len(triangles(plain) ^ triangles(guided)) < 0.02 * len(plain.faces)
 
 
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_normals_without_a_direction_are_ignored(value):
+    normals = np.full_like(BUMPY.vertices, value)
+    cloud = triangulate_points(BUMPY.vertices, normals)
+    assert triangles(cloud) == triangles(triangulate_points(BUMPY.vertices))
+    assert cloud.notes[0] == "Normals ignored: 2562 normals without a direction."
+    normals[:2000] = BUMPY.vertex_normals[:2000]
+    assert triangulate_points(BUMPY.vertices, normals).area == pytest.approx(cloud.area, rel=0.05)
+
+
 def test_points_without_a_position_and_repeated_points_keep_their_numbers():
     n = len(BUMPY.vertices)
     points = np.concatenate([BUMPY.vertices, BUMPY.vertices[:50], np.full((40, 3), np.nan), [[1e30, 0, 0]]])
@@ -103,12 +117,15 @@ def test_points_without_a_position_and_repeated_points_keep_their_numbers():
         (np.zeros((100, 3)), None, "1 different point cannot represent a surface"),
         (BUMPY.vertices[:19], None, "19 different points cannot represent a surface"),
         (np.full((100, 3), np.nan), None, "cannot represent a surface"),
-        (np.random.default_rng(0).normal(size=(100, 3)) * [1, 1, 0], None, "do not enclose a body"),
-        (np.arange(300.0).reshape(100, 3), None, "do not enclose a body"),
+        (np.random.default_rng(0).normal(size=(100, 3)) * [1, 1, 0], None, "only 0% of the points lie on"),
+        (np.arange(300.0).reshape(100, 3), None, "only 0% of the points lie on"),
+        (np.stack(np.mgrid[:9, :9, :9], axis=-1).reshape(-1, 3), None, "may fill a volume"),
+        (SKEW_LINES, None, "on a line"),
+        (1e308 * BUMPY.vertices, None, "choose another unit"),
         (BUMPY.vertices[:, :2], None, "must be a numeric array of shape"),
         (BUMPY.vertices, BUMPY.vertex_normals[1:], "give one normal for each point"),
     ],
-    ids=["equal", "few", "not finite", "plane", "line", "columns", "normals"],
+    ids=["equal", "few", "not finite", "plane", "line", "volume", "two lines", "huge", "columns", "normals"],
 )
 def test_clouds_without_a_surface_are_refused(points, normals, fault, unchecked):
     with pytest.raises(InputError, match=fault) as refused:
@@ -166,6 +183,8 @@ FILES = {
     "spaces.xyz": lines(POINTS).encode(),
     "commas.xyz": ("x, y, z\n" + lines(POINTS, ", ")).encode(),
     "tabs and count.xyz": (f"{len(POINTS)}\r\n" + lines(POINTS, "\t").replace("\n", "\r\n")).encode(),
+    "decimal commas.xyz": (lines(POINTS, ";").replace(".", ",")).encode(),
+    "decimal commas and tabs.xyz": (lines(POINTS, "\t").replace(".", ",")).encode(),
     "comments.xyz": ("# scanned\n" + lines(POINTS) + "\n\n").encode(),
     "colours.xyz": lines(np.hstack([POINTS, np.full((len(POINTS), 3), 128)])).encode(),
     "text.pcd": pcd("ascii", lines(POINTS).encode()),
@@ -229,6 +248,14 @@ def test_mesh_files_without_faces_are_point_clouds(tmp_path, suffix):
     np.testing.assert_array_equal(data.faces, data.mesh.faces)
 
 
+def test_data_of_no_faces_are_dropped(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 2562\n" + "".join(f"property double {a}\n" for a in "xyzst")
+    head += "element face 0\nproperty list uchar int vertex_indices\nproperty uchar red\nend_header\n"
+    (tmp_path / "c.ply").write_text(head + lines(np.hstack([POINTS, POINTS[:, :2]])))
+    data = read_mesh_data(tmp_path / "c.ply")
+    assert data.texture is None and not data.face_data and len(data.faces) > 5000
+
+
 def test_normals_and_fields_are_kept(tmp_path):
     rows = np.hstack([POINTS, BUMPY.vertex_normals])
     (tmp_path / "n.xyz").write_text(lines(rows))
@@ -252,10 +279,13 @@ HOSTILE = {
     "empty.xyz": (b"", "contains no points"),
     "header only.xyz": (b"x y z\n", "contains no points"),
     "two columns.xyz": (b"1 2 3\n" * 30 + b"1 2\n", "is written where 3 numbers should be"),
+    "damaged first.xyz": (b"1O 2 3\n" + b"1 2 3\n" * 30, "'1O 2 3' is written where"),
+    "wrong count.xyz": (b"900\n" + b"1 2 3\n" * 30, "declares 900 points, but 30 lines follow"),
+    "utf-16.xyz": (lines(POINTS).encode("utf-16"), "not a text file in ASCII or UTF-8"),
     "words.xyz": (b"1 2 3\n" * 30 + b"a b c\n", "'a b c' is written where"),
     "few.xyz": (b"1 2 3\n0 0 1\n", "2 different points cannot represent a surface"),
     "nan.xyz": (b"nan nan nan\n" * 30, "cannot represent a surface"),
-    "binary.xyz": (bytes(range(256)) * 4, "is written where"),
+    "binary.xyz": (bytes(range(256)) * 4, "not a text file"),
     "empty.npy": (b"", "not a .npy file"),
     "text.npy": (b"1 2 3\n" * 30, "not a .npy file"),
     "no data.pcd": (b"FIELDS x y z\n", "no line DATA"),
@@ -270,6 +300,17 @@ HOSTILE = {
     "unknown size.pcd": (pcd("binary", COLUMNS.tobytes(), sizes="4 4 3"), "the header is damaged"),
     "huge size.pcd": (pcd("binary", COLUMNS.tobytes(), sizes=f"4 4 {2**70}"), "the header is damaged"),
     "huge count.pcd": (pcd("binary", COLUMNS.tobytes(), extra=f"COUNT 1 1 {2**40}\n"), "the header is damaged"),
+    "huge text count.pcd": (
+        pcd("ascii", b"1 2 3\n", points=1, extra="COUNT 1 1 300000000\n"), "the first point has 3 numbers"
+    ),
+    "no count.pcd": (pcd("binary", COLUMNS.tobytes(), extra="COUNT 0 0 0\n"), "the header is damaged"),
+    "two x.pcd": (
+        pcd("binary", np.repeat(COLUMNS, 2, axis=1).tobytes(), extra="COUNT 2 2 2\n"), "has no field x with one"
+    ),
+    "packed cut.pcd": (pcd("binary_compressed", lzf(bytes(12))[:-1], points=1), "ends within the compressed"),
+    "packed large.pcd": (
+        pcd("binary_compressed", struct.pack("<II", 1, 12 * 2**25) + b"a", points=2**25), "384 MiB of compressed"
+    ),
     "negative.pcd": (pcd("binary", b"", points=-4), "the header is damaged"),
     "2^60 points.pcd": (pcd("binary", COLUMNS.tobytes(), points=2**60), "the file ends earlier"),
     "2^60 packed.pcd": (pcd("binary_compressed", lzf(bytes(12)), points=2**60), "the file is damaged"),
@@ -305,5 +346,5 @@ def test_other_arrays_are_refused(tmp_path, array):
 
 def test_arrays_of_objects_are_not_loaded(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match=r"not a \.npy file of numbers"):
+    with pytest.raises(InputError, match="pickled objects"):
         read_mesh(tmp_path / "a.npy")

@@ -126,6 +126,7 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
 
     **Returns:** For each name in both files, the nearest vertex of X and of Y, an array (l, 2).
     """
+    from jaxsmw.geometry.mesh import count_of
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.landmarks import match_landmarks
     from jaxsmw.transfer.landmarks import nearest_vertices
@@ -136,7 +137,8 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
         for note in landmarks.notes:
             report_progress(f"{landmarks.name}: {note}")
         if alone:
-            say(f"note: {landmarks.name}: {len(alone)} landmarks without a partner, such as {alone[0]!a}.")
+            number = count_of(len(alone), "landmark")
+            say(f"note: {landmarks.name}: {number} without a partner, such as {alone[0]!a}.")
     return nearest_vertices(both[0].select(matched.names), both[1].select(matched.names), *meshes)
 
 

@@ -167,7 +167,8 @@ def given_method(options: argparse.Namespace) -> list[str]:
     """Return the names of the given options that have no effect without a match, such as `--preset`."""
     given = _changes(options)
     given += ["--preset"] if options.preset else []
-    return given + (["--init"] if options.init != DEFAULT_INITIAL_MAP else [])
+    defaults = {"init": DEFAULT_INITIAL_MAP, "mirror": DEFAULT_MIRROR}
+    return given + [f"--{name}" for name, default in defaults.items() if getattr(options, name) != default]
 
 
 def _changes(options: argparse.Namespace) -> list[str]:

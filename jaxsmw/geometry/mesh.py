@@ -411,7 +411,7 @@ def make_mesh(
     lost = lost_vertices(position)
     if lost.any():
         position = between_neighbors(position, triangles, lost)
-    _check_extent(position, name)
+    check_extent(position, name)
 
     if weld:
         lowest = first_equal_rows(position)
@@ -494,7 +494,7 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
     return notes
 
 
-def _check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
+def check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
     """Refuse coordinates that are not finite, and a mesh that is too large or too small for float64."""
     lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if len(lost):

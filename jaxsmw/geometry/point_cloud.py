@@ -19,7 +19,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, count_of, first_equal_rows, make_mesh, numeric_rows
+from jaxsmw.geometry.mesh import Mesh, check_extent, count_of, first_equal_rows, make_mesh, numeric_rows
 from jaxsmw.geometry.scans import usable_positions
 
 FEWEST_POINTS = 20
@@ -37,6 +37,13 @@ _TOLERANCE, _ITERATIONS = 1e-6, 5000
 # A triangle closes a hole if an edge is longer than this multiple of the distances from both ends to their
 # 12th neighbours. Such triangles are dropped.
 _GAP, _NEIGHBORS = 1.5, 12
+# At least this share of the points must be on the surface.
+_ON_SURFACE = 0.5
+# Normals are ignored if fewer than this share of the points has a normal with a direction.
+_KNOWN_NORMALS = 0.5
+# Points on a surface have about 7 tetrahedra per point. Qhull needs very much time for points with far more,
+# for example on two lines, so this number of points is tried first.
+_MOST_TETRAHEDRA, _TRIED = 50, 1000
 
 
 def triangulate_points(
@@ -72,7 +79,8 @@ def triangulate_points(
     triangles join the points.
 
     **Raises:** `InputError` if an array has a wrong shape or type, if there are fewer than 20 different
-    points, if all points lie in a plane, or if the points do not enclose a body.
+    points, if the coordinates are too large for float64, or if fewer than half of the points lie on the
+    surface of a body.
     """
     position = numeric_rows(points, "points", name).astype(np.float64)
     direction = None if normals is None else numeric_rows(normals, "normals", name).astype(np.float64)
@@ -81,21 +89,34 @@ def triangulate_points(
             f"{name}: {len(direction)} normals belong to {len(position)} points: give one normal for each "
             "point."
         )
+    notes = list(notes)
+    if direction is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            known = (lengths := np.linalg.norm(direction, axis=1)) > 0
+            known &= np.isfinite(lengths)
+        if known.mean() < _KNOWN_NORMALS:
+            notes.append(f"Normals ignored: {count_of(int((~known).sum()), 'normal')} without a direction.")
+            direction = None
+        else:
+            direction[~known] = 0
     usable = usable_positions(position)
-    position[~usable] = position[usable].mean(axis=0) if usable.any() else np.nan
+    position[~usable] = np.median(position[usable], axis=0) if usable.any() else np.nan
     distinct = np.flatnonzero((first_equal_rows(position) == np.arange(len(position))) & usable)
     if len(distinct) < FEWEST_POINTS:
         raise InputError(
             f"{name}: there are no faces, and {count_of(len(distinct), 'different point')} cannot represent "
             f"a surface: give the faces, or at least {FEWEST_POINTS} points."
         )
+    check_extent(position, name)
     faces = _surface(position[distinct], None if direction is None else direction[distinct])
-    if not len(faces):
+    used = len(np.unique(faces)) / len(distinct)
+    if used < _ON_SURFACE:
         raise InputError(
-            f"{name}: the points do not enclose a body, so no surface was found: triangulate them with "
-            "another program, and give the mesh."
+            f"{name}: only {used:.0%} of the points lie on the surface of a body. The points may fill a "
+            "volume, or lie in a plane or on a line: triangulate them with another program, and give the "
+            "mesh."
         )
-    notes = [*notes, f"A point cloud without faces: {count_of(len(faces), 'triangle')} join the points."]
+    notes.append(f"A point cloud without faces: {count_of(len(faces), 'triangle')} join the points.")
     if not usable.all():
         notes.append(f"{count_of(int((~usable).sum()), 'point')} without a usable position.")
     return make_mesh(position, distinct[faces], name=name, notes=notes)
@@ -139,7 +160,7 @@ class _Tetrahedra(NamedTuple):
 
 
 def _tetrahedra(points: Float64[np.ndarray, "n 3"]) -> _Tetrahedra | None:
-    """Return the tetrahedra, or None if all points lie in a plane."""
+    """Return the tetrahedra, or None if all points lie in a plane or on few lines."""
     scaled = (points - points.mean(axis=0)) / np.ptp(points, axis=0).max()
     if np.linalg.svd(scaled, compute_uv=False)[2] < 1e-9 * len(points) ** 0.5:
         return None
@@ -149,7 +170,10 @@ def _tetrahedra(points: Float64[np.ndarray, "n 3"]) -> _Tetrahedra | None:
     around = np.stack([np.cos(azimuth), np.sin(azimuth), height / np.sqrt(1 - height**2)], axis=1)
     around *= _DISTANCE_AROUND * np.sqrt(1 - height**2)[:, None]
     scaled = np.concatenate([scaled, around])
+    tried = np.random.default_rng(0).permutation(len(points))[:_TRIED]
     try:
+        if len(Delaunay(scaled[tried]).simplices) > _MOST_TETRAHEDRA * len(tried):
+            return None
         triangulation = Delaunay(scaled)
     except QhullError:
         return None
@@ -192,7 +216,7 @@ def _poles(
     def farthest(on_side: Bool[np.ndarray, " q"]) -> Int64[np.ndarray, " n"]:
         order = np.lexsort([distances[on_side], point[on_side]])
         points, numbers = point[on_side][order], tetrahedron[on_side][order]
-        last = np.append(points[1:] != points[:-1], True)
+        last = np.append(points[1:] != points[:-1], np.ones(min(len(points), 1), dtype=bool))
         found = np.full(n, -1)
         found[points[last]] = numbers[last]
         return found

@@ -246,7 +246,7 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
             raise InputError(_flip_message(landmarks, mesh, as_read, flipped))
     return tuple(
         f"{landmarks.name}: the landmark {landmarks.names[i]!a} is {distances[i]:.3g} from the surface of "
-        f"{mesh.name}, which is {distances[i] / diagonal:.0%} of the diagonal of the mesh."
+        f"{mesh.name}, which is {100 * distances[i] / diagonal:.3g} % of the diagonal of the mesh."
         for i in np.flatnonzero(distances > NEAR * diagonal).tolist()
     )
 

@@ -142,6 +142,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         normals = polygons.vertex_data.get(NORMALS)
         mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
         faces = mesh.faces
+        polygons = polygons._replace(face_data={}, texture=None)  # data of no faces
     return MeshData(
         mesh,
         faces.astype(np.int64),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,11 +90,24 @@ def nearest_vertices(
     **Returns:** For each landmark the corner of the nearest face that is nearest to it, as a 0-based
     vertex of X and of Y (l, 2).
 
-    **Raises:** `InputError` if landmarks lie off their surface, but on it in the other coordinate system.
+    The function issues a `UserWarning` for each landmark that is far from its surface.
+
+    **Raises:** `InputError` if landmarks lie off their surface, but on it in the other coordinate system, or
+    if two landmarks have the same vertex of X, but different vertices of Y.
     """
     pairs = []
     for landmarks, mesh in ((landmarks_x, mesh_x), (landmarks_y, mesh_y)):
-        check_frame(landmarks, mesh)
+        for far in check_frame(landmarks, mesh):
+            warnings.warn(far, stacklevel=2)
         points, _ = nearest_surface_points(landmarks.positions, mesh)
         pairs.append(points.nearest_corners(mesh))
+    _, first, counts = np.unique(pairs[0], return_index=True, return_counts=True)
+    if (counts > 1).any():
+        shared = np.flatnonzero(pairs[0] == pairs[0][first[counts > 1][0]])
+        if len(np.unique(pairs[1][shared])) > 1:
+            one, other = (landmarks_x.names[i] for i in shared[:2])
+            raise InputError(
+                f"{landmarks_x.name}: the landmarks {one!a} and {other!a} have the same nearest vertex of "
+                f"{mesh_x.name}: remove one of them."
+            )
     return np.stack(pairs, axis=1)

@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import NORMALS, Polygons
 from jaxsmw.io.formats.lines import excerpt, numbers, text
-from jaxsmw.runtime.files import largest_contents
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
+# Compressed points may take this number of bytes, or four times the size of the file.
+_LARGEST = 2**28
 # The names of fields with padding, which contain nothing.
 _PADDING = "_"
 
@@ -41,12 +43,15 @@ def parse_pcd(data: bytes) -> Polygons:
                 "truncated: export the points again."
             )
         table = np.frombuffer(body[:size], header.record)
-    missing = [axis for axis in "xyz" if axis not in (header.record.names or ())]
-    if missing:
-        raise InputError(f"has no field {missing[0]}: export the points again, with x, y and z.")
+    for axis in "xyz":
+        if axis not in (header.record.names or ()) or header.record[axis].shape != (1,):
+            raise InputError(
+                f"has no field {axis} with one number for each point: export the points again, with x, y "
+                "and z."
+            )
     columns = {name: table[name] for name in table.dtype.names or () if not name.startswith(_PADDING)}
     vertices = np.stack([columns.pop(axis).reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
-    if all(name in columns for name in _NORMAL_FIELDS):
+    if all(name in columns and columns[name].shape[1:] == (1,) for name in _NORMAL_FIELDS):
         columns[NORMALS] = np.stack([columns.pop(name).reshape(-1) for name in _NORMAL_FIELDS], axis=1)
     return Polygons(vertices, np.empty(0), np.empty(0, np.int64), vertex_data=columns)
 
@@ -80,7 +85,12 @@ def _header(data: bytes) -> tuple[_Header, bytes]:
         record = np.dtype(kinds)
         width, height = (int(*entries.get(key, ["1"])) for key in ("WIDTH", "HEIGHT"))
         points = int(*entries.get("POINTS", [str(width * height)]))
-        if min(width, height) < 0 or points != width * height or encoding not in _ENCODINGS:
+        if (
+            min(count for *_, (count,) in kinds) < 1
+            or min(width, height) < 0
+            or points != width * height
+            or encoding not in _ENCODINGS
+        ):
             raise ValueError
     except (KeyError, TypeError, ValueError):
         raise InputError(
@@ -102,6 +112,12 @@ def _from_text(body: bytes, header: _Header) -> np.ndarray:
             "is truncated or its header is wrong: export the points again."
         )
     names = header.record.names or ()
+    declared, written = header.record.itemsize, len(lines[0].split()) if lines else 0
+    if written * 8 < declared:  # no number takes more than 8 bytes
+        raise InputError(
+            f"the header declares {declared} bytes for each point, but the first point has "
+            f"{count_of(written, 'number')}: export the points again."
+        )
     widths = [math.prod(header.record[name].shape) for name in names]
     values = np.split(numbers(lines, sum(widths)), np.cumsum(widths)[:-1], axis=1)
     table = np.empty(len(lines), [(name, "f8", (width,)) for name, width in zip(names, widths, strict=True)])
@@ -114,10 +130,16 @@ def _decompress(body: bytes, header: _Header) -> bytes:
     """Return the records of a compressed file, which stores all values of a field one after another."""
     packed, size = (int(n) for n in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     expected = header.points * header.record.itemsize
-    if size != expected or len(body) < 8 + packed or size > largest_contents(len(body)):
+    if len(body) < 8 + packed:
+        raise InputError("ends within the compressed points, so it is truncated: export the points again.")
+    if size != expected:
         raise InputError(
-            f"declares {size} bytes of points where {expected} belong, or ends early, so the file is "
-            "damaged: export the points again."
+            f"declares {size} bytes of compressed points where the header requires {expected}, so the file "
+            "is damaged: export the points again."
+        )
+    if size > max(_LARGEST, 4 * len(body)):
+        raise InputError(
+            f"contains {size >> 20} MiB of compressed points: export the points again without compression."
         )
     fields = lzf_decompressed(body[8 : 8 + packed], size)
     table, offset = np.empty(header.points, header.record), 0
@@ -154,8 +176,9 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
             at += 1
             if start < 0 or len(out) > size:
                 raise IndexError
-            for step in range(length + 2):  # a copy may overlap its own end
-                out.append(out[start + step])
+            # A copy may overlap its own end, so it repeats the bytes from `start`.
+            repeated = out[start : start + length + 2]
+            out += (repeated * (length + 2))[: length + 2] if len(repeated) < length + 2 else repeated
     except IndexError:
         out = bytearray()
     if len(out) != size or at != len(packed):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 from jaxtyping import Float64, Shaped
@@ -21,21 +22,35 @@ _UNIT = 0.01
 def parse_xyz(data: bytes) -> Polygons:
     """Parse a text file whose lines begin with x, y and z, separated by spaces, tabs, commas or semicolons.
 
-    A first line without three numbers is a header or the number of points, and is skipped.
+    A comma between the digits of each number is a decimal comma. A first line without any number is a header.
+    A first line with one whole number is the number of points.
     """
-    lines = text(data).translate(str.maketrans(",;\t", "   ")).split("\n")
-    lines = [line for line in lines if line and not line.isspace()]
-    if lines and not _is_point(lines[0]):
+    if b"\0" in data[:4096]:
+        raise InputError("is not a text file in ASCII or UTF-8: save the points as text.")
+    content = text(data)
+    lines = [line for line in content.split("\n") if line and not line.isspace()]
+    if lines and not any(map(is_number, _words(lines[0]))):
+        lines = lines[1:]
+    if lines and re.fullmatch(r"\s*\d{1,18}\s*", lines[0]):
+        if int(lines[0]) != len(lines) - 1:
+            raise InputError(
+                f"the first line declares {int(lines[0])} points, but {len(lines) - 1} lines follow, so the "
+                "file is truncated or its first line is wrong: export the points again."
+            )
         lines = lines[1:]
     if not lines:
         raise InputError("contains no points: export the points again, one per line.")
-    columns = {len(line.split()) for line in lines}
-    return points_of_table(numbers(lines, min(columns) if min(columns) >= 3 else 3))
+    rows = [" ".join(_words(line)) for line in lines]
+    columns = min(len(row.split()) for row in rows)
+    return points_of_table(numbers(rows, max(columns, 3)))
 
 
-def _is_point(line: str) -> bool:
-    words = line.split()
-    return len(words) >= 3 and all(is_number(word, finite=False) for word in words[:3])
+def _words(line: str) -> list[str]:
+    """Return the words of a line, with points instead of decimal commas."""
+    words = line.replace(";", " ").split()
+    if len(words) >= 3 and all(re.fullmatch(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", word, re.I) for word in words):
+        return [word.replace(",", ".") for word in words]
+    return line.replace(";", " ").replace(",", " ").split()
 
 
 def parse_npy(data: bytes) -> Polygons:
@@ -44,7 +59,9 @@ def parse_npy(data: bytes) -> Polygons:
         check_header(io.BytesIO(data), len(data))
         table = np.lib.format.read_array(io.BytesIO(data))
     except Exception:  # NumPy can raise any exception for damaged files
-        raise InputError("is damaged or not a .npy file of numbers: write the file again.") from None
+        raise InputError(
+            "is damaged, or not a .npy file of numbers without pickled objects: write the file again."
+        ) from None
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "iuf":
         raise InputError(
             f"contains an array of {table.dtype.name} of shape {table.shape}: save numbers of shape (number "
