@@ -10,7 +10,7 @@ PresetName = Literal["fast", "paper", "accurate"]
 """The names of the presets; see `jaxsmw.PRESETS`."""
 DEFAULT_PRESET: PresetName = "accurate"
 
-InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional"]
+InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional", "aligned"]
 """The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
 

@@ -331,6 +331,9 @@ def match(
           with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
           `"shot"` and has smaller errors. However, the refined map often has larger errors than with `"shot"`
           (docs/results.md).
+        - `"aligned"`: the initial map sends each vertex of X to the nearest vertex of Y in space, after X was
+          scaled to the area of Y and aligned rigidly. Use this map for shapes that differ little in pose,
+          such as teeth and bones.
         - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
           0-based. The initial map then sends each vertex of X to the vertex of Y with the most similar

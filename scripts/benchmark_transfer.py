@@ -2,7 +2,7 @@
 
     pip install -e ".[benchmark,peers]"
     python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
-    python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars mouse_mandibles mouse_skulls --pairs 40
+    python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars --pairs 40 --init aligned
 
 Pairs are drawn with seed 0; a pair is used in the other direction after all pairs were used in one. Each
 result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same command continues where it was
@@ -18,20 +18,21 @@ from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import itertools
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw.choices import InitialMap
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.journal import Journal
 from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
+from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
 from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.matching import Correspondence
@@ -52,11 +53,14 @@ def main() -> None:
     parser.add_argument(
         "--pairs", type=int, default=20, help="number of pairs of each data set (default: 20)"
     )
+    parser.add_argument(
+        "--init", choices=get_args(InitialMap), default="shot", help="initial map of scans (default: shot)"
+    )
     parser.add_argument("--output", type=Path, default=Path("transfer"), help="directory of the results")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.sets:
-        measure = _measure_body if name in _BODIES else _measure_scan
+        measure = _measure_body if name in _BODIES else functools.partial(_measure_scan, init=options.init)
         journal = Journal(options.output / f"{name}.csv", ("source", "target"))
         for source, target in _draw(options.directory / name, options.pairs):
             if (source.stem, target.stem) not in journal:
@@ -102,25 +106,25 @@ def _measure_body(source: Path, target: Path) -> dict[str, Any]:
 
 
 def _register(
-    mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool
+    mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool, init: InitialMap = "shot"
 ) -> tuple[Correspondence, RegisteredMesh, dict[str, float]]:
     """Match and register a pair, and measure both times."""
     start = time.perf_counter()
-    found = match(mesh_x, mesh_y, mirror="yes" if mirrored else "no")
+    found = match(mesh_x, mesh_y, init=init, mirror="yes" if mirrored else "no")
     matched = time.perf_counter()
     registered = found.registered_mesh()
     times = {"match_seconds": matched - start, "transfer_seconds": time.perf_counter() - matched}
     return found, registered, times
 
 
-def _measure_scan(source: Path, target: Path) -> dict[str, Any]:
+def _measure_scan(source: Path, target: Path, init: InitialMap) -> dict[str, Any]:
     """Measure the distances of carried landmarks to manual landmarks, by several methods."""
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
     marks_x, marks_y = _landmarks(source), _landmarks(target)
     names = [name for name in marks_x.names if name in set(marks_y.names)]
     marks_x, marks_y = marks_x.select(names), marks_y.select(names)
     mirrored = _side(source) != _side(target)
-    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored)
+    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored, init=init)
     on_source, off_source = nearest_surface_points(marks_x.positions, mesh_x)
     _, off_target = nearest_surface_points(marks_y.positions, mesh_y)
     hand = np.array([-1.0 if mirrored else 1.0, 1, 1])
@@ -170,9 +174,9 @@ def _aligned(
     samples_y = mesh_y.vertices[farthest_point_samples(mesh_y, _POINTS)]
     (middle_x, size_x), (middle_y, size_y) = map(_placement, (samples_x, samples_y))
     x, y = (samples_x - middle_x) / size_x, (samples_y - middle_y) / size_y
-    rotation = _best_rotation(x, y)
-    landmarks = (marks * hand - middle_x) / size_x @ rotation.T
-    moved = {"rigid": landmarks, **_drifted(x @ rotation.T, y, landmarks)}
+    motion = align_rigidly(x, y)
+    landmarks = motion.apply((marks * hand - middle_x) / size_x)
+    moved = {"rigid": landmarks, **_drifted(motion.apply(x), y, landmarks)}
     placed = {name: positions * size_y + middle_y for name, positions in moved.items()}
     return {name: nearest_surface_points(p, mesh_y)[0].positions(mesh_y) for name, p in placed.items()}
 
@@ -180,31 +184,6 @@ def _aligned(
 def _placement(points: Float64[np.ndarray, "p 3"]) -> tuple[Float64[np.ndarray, " 3"], float]:
     middle = points.mean(axis=0)
     return middle, float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean()))
-
-
-def _best_rotation(
-    x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"]
-) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation of the best of many runs of iterative closest points, from rotations of a grid."""
-    tree = KDTree(y)
-    best, least = np.eye(3), np.inf
-    for start in [np.eye(3), *Rotation.create_group("O").as_matrix() @ _principal(x, y)]:
-        rotation = start
-        for _ in range(30):
-            _, nearest = tree.query(x @ rotation.T)
-            left, _, right = np.linalg.svd(y[nearest].T @ x)
-            rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-        distance = tree.query(x @ rotation.T)[0].mean() + KDTree(x @ rotation.T).query(y)[0].mean()
-        if distance < least:
-            best, least = rotation, distance
-    return best
-
-
-def _principal(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return a rotation between the principal axes of two point sets."""
-    axes = [np.linalg.svd(points.T @ points)[0] for points in (x, y)]
-    axes = [frame * np.linalg.det(frame) for frame in axes]
-    return axes[1] @ axes[0].T
 
 
 def _drifted(

@@ -105,8 +105,8 @@ class Settings:
     **Attributes:**
 
     - `init`: the initial map from which all methods start. It is the name of an initial map, `"shot"`
-      (default), `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see `jaxsmw.match`), or a directory with
-      initial maps in files named `X_Y.map`.
+      (default), `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or `"aligned"` (see `jaxsmw.match`), or a
+      directory with initial maps in files named `X_Y.map`.
     - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
       the errors with the smaller mean are stored. Use this setting for methods and initial maps that do not
       distinguish left from right.

@@ -37,8 +37,8 @@ def prepare_pair(
 
     - `data`: the `DataPair`. The function uses only the names of the shapes and the attribute `partial`.
     - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
-    - `init`: the name of an initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"` or `"functional"` (see
-      `jaxsmw.match`); or a directory that contains initial maps in files named `X_Y.map`.
+    - `init`: the name of an initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or
+      `"aligned"` (see `jaxsmw.match`); or a directory that contains initial maps in files named `X_Y.map`.
     - `number_of_eigenvectors`: the number of eigenvectors that are computed for each shape.
     - `number_of_descriptors`: the number of principal components of the SHOT descriptors; 0 for no
       descriptors.

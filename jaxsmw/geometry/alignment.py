@@ -1,0 +1,86 @@
+"""Rigid alignment of two sets of points, by iterative closest points from many rotations."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+# The number of iterations from every rotation, and of further iterations from the best of them.
+_FIRST, _FURTHER = 10, 30
+_BEST = 5
+# The number of points of x that the first iterations move.
+_MOVED_FIRST = 500
+
+
+class Alignment(NamedTuple):
+    """A rigid motion: a point p moves to `rotation @ p + offset`.
+
+    **Attributes:**
+
+    - `rotation`: a rotation (3, 3) without reflection.
+    - `offset`: a translation (3,), in the unit of the points.
+    """
+
+    rotation: Float64[np.ndarray, "3 3"]
+    offset: Float64[np.ndarray, " 3"]
+
+    def apply(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+        """Move points (p, 3)."""
+        return points @ self.rotation.T + self.offset
+
+
+def align_rigidly(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"]) -> Alignment:
+    """Find the rigid motion that brings the points x near the points y.
+
+    Iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992) run from the
+    identity, from the 24 rotations between the principal axes of both sets, and from the 60 rotations of an
+    icosahedron. The motion with the least sum of mean distances, from x to y and from y to x, is chosen.
+
+    **Arguments:**
+
+    - `x`, `y`: points (p, 3) and (q, 3), evenly spread over the surfaces, in the same unit.
+
+    **Returns:** The motion from x to y.
+    """
+    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
+    tree = KDTree(y)
+    between_axes = _principal_axes(y - middle_y) @ Rotation.create_group("O").as_matrix()
+    rotations = [
+        np.eye(3),
+        *between_axes @ _principal_axes(x - middle_x).T,
+        *Rotation.create_group("I").as_matrix(),
+    ]
+
+    def closest_points(motion: Alignment, iterations: int, step: int = 1) -> Alignment:
+        moving = x[::step]
+        for _ in range(iterations):
+            _, nearest = tree.query(motion.apply(moving))
+            motion = _rigid_fit(moving, y[nearest])
+        return motion
+
+    def distance(motion: Alignment) -> float:
+        moved = motion.apply(x)
+        return float(tree.query(moved)[0].mean() + KDTree(moved).query(y)[0].mean())
+
+    starts = [Alignment(rotation, middle_y - rotation @ middle_x) for rotation in rotations]
+    step = -(-len(x) // _MOVED_FIRST)
+    first = sorted((closest_points(start, _FIRST, step) for start in starts), key=distance)[:_BEST]
+    return min((closest_points(motion, _FURTHER) for motion in first), key=distance)
+
+
+def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return a right-handed frame of principal axes, in columns."""
+    axes = np.linalg.svd(points, full_matrices=False)[2].T
+    return axes * np.linalg.det(axes)
+
+
+def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
+    """Return the motion that brings each point of x nearest to its target, in the least-squares sense."""
+    middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
+    left, _, right = np.linalg.svd((targets - middle_of_targets).T @ (x - middle))
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    return Alignment(rotation, middle_of_targets - rotation @ middle)

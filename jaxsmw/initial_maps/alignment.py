@@ -1,0 +1,33 @@
+"""The initial map of two shapes that are similar in space, such as teeth and bones."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsmw.descriptors import SampledPair
+from jaxsmw.geometry.alignment import align_rigidly
+from jaxsmw.geometry.sampling import poisson_disk_samples
+
+# The approximate number of evenly spread samples of each shape that are aligned.
+_SAMPLES = 2000
+
+
+def aligned_positions(sampled: SampledPair) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]:
+    """Align X with Y rigidly, in comparable units, and return the positions of the compared vertices.
+
+    **Arguments:**
+
+    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+
+    **Returns:** The positions of X after the alignment (m, 3) and of Y (n, 3), with one row per compared
+    vertex, in the units of `Pair.units_of_length`.
+    """
+    positions, samples = [], []
+    for side, unit in zip(sampled.sides, sampled.pair.units_of_length, strict=True):
+        scaled = side.mesh.vertices / unit
+        spread = poisson_disk_samples(side.mesh, _SAMPLES)
+        samples.append(scaled[spread.vertices])
+        positions.append(scaled if side.samples is None else scaled[side.samples.vertices])
+    motion = align_rigidly(*samples)
+    return motion.apply(positions[0]), positions[1]

@@ -1,0 +1,55 @@
+"""Rigid alignment, and the initial map that uses it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import bumpy_mesh
+
+from jaxsmw import Pair, initial_map, make_mesh, match, paired_spectra
+from jaxsmw.geometry.alignment import align_rigidly
+
+LUMP = bumpy_mesh(3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_moved_copy_is_aligned_exactly(seed):
+    generator = np.random.default_rng(seed)
+    turn, shift = Rotation.random(random_state=seed), generator.normal(size=3)
+    moved = turn.apply(LUMP.vertices)[generator.permutation(len(LUMP.vertices))] + shift
+    motion = align_rigidly(LUMP.vertices, moved)
+    np.testing.assert_allclose(motion.rotation, turn.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(motion.apply(LUMP.vertices), turn.apply(LUMP.vertices) + shift, atol=1e-6)
+
+
+def test_the_motion_is_never_a_reflection():
+    motion = align_rigidly(LUMP.vertices, LUMP.vertices * [-1, 1, 1])
+    assert np.linalg.det(motion.rotation) == pytest.approx(1)
+
+
+def test_noise_and_other_points_are_aligned_closely():
+    generator = np.random.default_rng(0)
+    turn = Rotation.random(random_state=1)
+    long = np.array([1, 1.3, 2])
+    fine = turn.apply(bumpy_mesh(4).vertices * long)
+    noisy = LUMP.vertices * long + 0.01 * generator.normal(size=LUMP.vertices.shape)
+    motion = align_rigidly(noisy, fine)
+    assert (Rotation.from_matrix(motion.rotation) * turn.inv()).magnitude() < 0.02
+
+
+@pytest.mark.parametrize("partial", [False, True])
+def test_the_initial_map_of_a_moved_copy_is_right(partial):
+    turn, scale = Rotation.random(random_state=2), 1.0 if partial else 5.0
+    order = np.random.default_rng(0).permutation(len(LUMP.vertices))
+    vertices = np.empty_like(LUMP.vertices)
+    vertices[order] = scale * turn.apply(LUMP.vertices) - 3
+    target = make_mesh(vertices, order[LUMP.faces])
+    pair = Pair.make(LUMP, target, partial=partial)
+    spectra = paired_spectra(pair, 20)
+    np.testing.assert_array_equal(initial_map(pair, *spectra, init="aligned"), order)
+
+
+def test_mirrored_shapes_are_aligned_as_their_mirror_images():
+    image = LUMP.mirrored()
+    target = make_mesh(image.vertices, image.faces)
+    found = match(LUMP, target, preset="paper", init="aligned", mirror="yes")
+    np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
