@@ -154,6 +154,27 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
 
 
 @pytest.mark.slow
+def test_the_reverse_map_of_registration_compares_all_columns():
+    """Above 15 000 vertices, the search in patches also compares columns that are not eigenvectors."""
+    creature = creature_pair(vertices=15_600)
+    truth = creature.truth.nearest_corners(creature.target)
+    stage = Stage(Registration((20, 30)), number_of_eigenvectors=30, number_of_samples=400)
+    found = match(creature.source, creature.target, preset=stage, init=truth, mirror="no")
+    queries, database = (np.asarray(points) for points in found._embeddings())
+    assert database.shape[1] > found.functional_map.shape[0]
+    with found._precision():
+        reverse = np.asarray(matching.compiled(matching._reverse_map)(*found._last_stage()))
+    _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
+    expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
+    agree = reverse == expected
+    # In float32, two vertices can have the same distance.
+    apart = np.linalg.norm(queries[reverse] - database, axis=1) - np.linalg.norm(
+        queries[expected] - database, axis=1
+    )
+    assert agree.mean() > 0.999 and apart.max() < 1e-5
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["exhaustive", "patches"])
 @pytest.mark.parametrize(
     "refiner", [WaveletPreservation, FeatureRegression, Registration], ids=lambda r: r.__name__
