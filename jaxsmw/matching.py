@@ -38,7 +38,7 @@ from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import padded_size
+from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
@@ -135,16 +135,22 @@ class Correspondence:
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
         with self._precision():
-            queries, database = self._embeddings()
             rows, candidates = self.mesh_y.faces_around(self.pointwise_map)
+            queries, database = self._embeddings()
             # Padding lets pairs of similar sizes share compiled programs.
             padding = padded_size(len(rows)) - len(rows)
             rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
-            faces, traced_weights = compiled(nearest_point_on_candidates)(
-                queries, database, *jax.device_put((self.mesh_y.faces, rows, candidates))
+            padded = (
+                pad_rows(queries, program_size(self.mesh_x)),
+                pad_rows(database, program_size(self.mesh_y)),
+                pad_rows(self.mesh_y.faces, padded_size(len(self.mesh_y.faces))),
+                rows,
+                candidates,
             )
+            found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
+        faces, weights = (np.asarray(values)[: len(queries)] for values in found)
         # Rounding errors can make weights negative.
-        weights = np.maximum(np.asarray(traced_weights, np.float64), 0)
+        weights = np.maximum(weights.astype(np.float64), 0)
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
@@ -180,7 +186,7 @@ class Correspondence:
         **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of X's and Y's
         numbers of referenced vertices is above 20 000².
         """
-        queries, database = (np.asarray(points) for points in self._embeddings())
+        queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
         found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
         return extend_to_unreferenced(self.mesh_x, found)
@@ -222,7 +228,7 @@ class Correspondence:
             )
         with self._precision():
             found = compiled(sinkhorn)(
-                *self._embeddings(),
+                *jax.device_put(self._embeddings()),
                 query_areas=self.spectrum_x.vertex_areas,
                 database_areas=self.spectrum_y.vertex_areas,
                 temperature=jnp.asarray(float(temperature)),
@@ -252,25 +258,31 @@ class Correspondence:
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,
-            np.asarray(reverse_map).astype(np.int64),
+            np.asarray(reverse_map)[: len(self.mesh_y.vertices)].astype(np.int64),
             self.spectrum_x,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 
-    def _embeddings(self) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
         """Return the embeddings of X and Y in the last stage.
 
         The match of a vertex of X is its nearest neighbour among the embedded vertices of Y. An unreferenced
         vertex of X has the same embedding as the nearest referenced vertex.
         """
         with self._precision():
-            queries, database = compiled(_embeddings)(*self._last_stage())
-            return jax.device_put(extend_to_unreferenced(self.mesh_x, np.asarray(queries))), database
+            padded_x, padded_y = map(np.asarray, compiled(_embeddings)(*self._last_stage()))
+        queries, database = padded_x[: len(self.mesh_x.vertices)], padded_y[: len(self.mesh_y.vertices)]
+        return extend_to_unreferenced(self.mesh_x, queries), database
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
+        """Return the refiner, the problem with padded spectra, and the state of the last stage."""
         # If the mirror image of X was matched, the state of the refiner belongs to the mirror image.
         spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
-        problem = Problem(spectrum_x, self.spectrum_y, partial=self.pair.partial)
+        # Padding lets pairs of similar sizes share compiled programs.
+        pad = compiled(Spectrum.pad)
+        padded_x = pad(spectrum_x, program_size(self.mesh_x))
+        padded_y = pad(self.spectrum_y, program_size(self.mesh_y))
+        problem = Problem(padded_x, padded_y, partial=self.pair.partial)
         return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
