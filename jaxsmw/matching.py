@@ -70,15 +70,17 @@ class Correspondence:
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps; None if the preset has no repair.
-    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down, or if both
-      hands are about equally likely (`mirror_evidence` between 0 and 0.1). Without repair in the preset, only
-      the hands are judged.
+    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. Also True
+      if `match` is uncertain whether X or its mirror image corresponds to Y, for example if `mirror_evidence`
+      is between 0 and 0.1. If the preset has no repair, only this second condition is checked.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
-      hands, such as a left and a right tooth. The map belongs to the vertices of X in both cases.
-    - `mirror_evidence`: the evidence that X and Y are of opposite hands, a logarithm; None if `match` did not
-      compare the hands. A coarse map of X itself changes distances by at least `exp(mirror_evidence)` times
-      as much as a coarse map of its mirror image. Values from 0.05 lead to `mirrored`; most correct decisions
-      for `mirrored` have values above 0.3.
+      hands, such as a left and a right tooth. In both cases, entry i of `pointwise_map` is the match of
+      vertex i of X.
+    - `mirror_evidence`: a logarithm that is positive if the mirror image of X seems to match Y better than X
+      itself; None if `match` did not compare the two. The distance error of a coarse map of X itself is at
+      least `exp(mirror_evidence)` times the distance error of a coarse map of the mirror image
+      (`jaxsmw.repair.chirality.Hands`). If X and Y differ enough from their own mirror images, a value of at
+      least 0.05 leads to `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
       meshes of a given size includes the time of compilation.
     """
@@ -127,9 +129,9 @@ class Correspondence:
 
         The last stage embeds X and Y in a common space. In this space, `pointwise_map` contains the nearest
         vertex of Y, and this method finds the nearest point on the triangles around this vertex. For 98 % of
-        the vertices, no other triangle is nearer; `jaxsmw.functional_maps.decode_to_triangles` searches all
-        triangles, which takes 20 times as long. An unreferenced vertex of X receives the point of the nearest
-        referenced vertex.
+        the vertices, this point is the nearest point of all triangles of Y.
+        `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long. An
+        unreferenced vertex of X receives the point of the nearest referenced vertex.
 
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
@@ -154,12 +156,12 @@ class Correspondence:
         return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
-        """Deform X onto Y, so that its vertices follow `surface_points`; see `jaxsmw.transfer.register_mesh`.
+        """Deform X onto Y, guided by `surface_points`; see `jaxsmw.transfer.register_mesh`.
 
         **Arguments:**
 
-        - `stiffness`: a positive length in units of the square root of Y's area, below which noise of the map
-          is smoothed. The default is 0.003.
+        - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with
+          shorter wavelengths is smoothed. The default is 0.003.
 
         **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
         unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
@@ -177,9 +179,9 @@ class Correspondence:
     def one_to_one(self) -> Int64[np.ndarray, " m"]:
         """Compute a map in which no two referenced vertices of X share a match.
 
-        See `jaxsmw.geometry.one_to_one_map`. The map is intended for shapes with the same triangulation.
-        Between different triangulations, `pointwise_map` has much smaller errors. An unreferenced vertex of X
-        receives the match of the nearest referenced vertex.
+        See `jaxsmw.geometry.one_to_one_map`. The map is intended for shapes with the same triangulation. For
+        shapes with different triangulations, the attribute `pointwise_map` has much smaller errors than the
+        one-to-one map. An unreferenced vertex of X receives the match of the nearest referenced vertex.
 
         **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
@@ -212,8 +214,8 @@ class Correspondence:
           temperature of 1 gives a softer map than 0.3.
         - `iterations`: the largest number of iterations, an integer of at least 1.
         - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
-          the area that vertices of Y receive in excess of their own areas. A tolerance below a few hundredths
-          leads to further iterations, which do not improve a map between two different bodies.
+          the area that vertices of Y receive in excess of their own areas. Between two different bodies, a
+          tolerance below a few hundredths costs further iterations but does not improve the map.
 
         **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y. Its method `pull_back` takes
         p functions on Y (n, p) to functions on X (m, p), and its method `pointwise_map` returns a map X -> Y
@@ -322,10 +324,10 @@ def match(
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement, which is one of the following. A preset (one of the first four
-      choices) uses at most half as many eigenvectors as the smaller mesh has vertices. A preset uses all
-      vertices instead of samples if a mesh does not have more vertices than samples. Stages of your own are
-      used unchanged.
+    - `preset`: the method of refinement, which is one of the following. The number of eigenvectors of a
+      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. A preset
+      uses all vertices instead of samples if a mesh does not have more vertices than samples. If you give
+      stages instead of a preset, `match` uses the stages unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -359,14 +361,15 @@ def match(
       large meshes. `"auto"` chooses `"approximate"` if one mesh has at least 50 000 referenced vertices, else
       `"exact"`.
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
-      length; see `paired_spectra`. False, the default, for two full shapes.
-    - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. The mirror image of X
-      is then matched instead of X, and the map belongs to the same vertices of X.
+      length; see `paired_spectra`. The default is False, for two full shapes.
+    - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
+      mirror image of X is matched instead of X. In both cases, entry i of the map is the match of vertex i of
+      X.
 
-        - `"auto"` (the default): compare both hands (`jaxsmw.repair.chirality.Hands`) if both shapes differ
-          from their own mirror images, as teeth do. Match the mirror image if its coarse maps preserve
-          distances better. People and animals are nearly their own mirror images, so X itself is matched. The
-          hands of a partial pair are not compared.
+        - `"auto"` (the default): decide by a comparison of coarse maps (`jaxsmw.repair.chirality.Hands`). If
+          a coarse map of the mirror image of X preserves distances better than a coarse map of X itself, the
+          mirror image is matched. X itself is matched if X and Y are nearly their own mirror images, as
+          people and animals are. X itself is also matched if `partial` is True.
         - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
 
@@ -383,7 +386,7 @@ def match(
     """
     check_choice(mirror, Mirror, "a mirror setting")
     pair = Pair.make(mesh_x, mesh_y, partial=partial)
-    adapts = isinstance(preset, str | Preset)  # stages of the caller are used unchanged
+    adapts = isinstance(preset, str | Preset)
     chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
@@ -441,7 +444,7 @@ def _correspondence(
     seconds: dict[str, float],
     decision: Decision,
 ) -> Correspondence:
-    """Make the result of `match`, and issue a warning if the map or the hand looks wrong.
+    """Make the result of `match`, and issue a warning if the result is suspicious.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -475,7 +478,7 @@ def _correspondence(
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:
-    """Return the text of the warning that the hand is doubtful."""
+    """Return the text of the warning that X and its mirror image match Y about equally well."""
     took = "the mirror image of the source" if decision.mirrored else "the source itself"
     return (
         f"{pair.name}: the source and its mirror image match the target about equally well (evidence "

@@ -93,7 +93,7 @@ def test_the_same_command_continues_after_a_kill(scape, tmp_path, capsys):
         assert (output / name).stat().st_size > 100
 
     assert run_command([*call[3:], "--seed", "1"]) == 2
-    assert "seed in settings was 0 and not 1" in capsys.readouterr().err
+    assert "seed = 0 (settings), but this run has seed = 1" in capsys.readouterr().err
 
 
 @pytest.mark.cluster

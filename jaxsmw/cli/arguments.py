@@ -91,11 +91,11 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
         "--eigensolver",
         choices=get_args(Eigensolver),
         default="auto",
-        help="method that computes eigenvectors. approximate is fast on large meshes. If triangles have "
-        "similar sizes and shapes, the eigenvalues of approximate have errors of a few tenths of a per cent. "
-        "If approximate would be inaccurate, a warning is printed and exact is used instead. auto chooses "
-        "approximate for meshes with at least "
-        f"{APPROXIMATE_FROM} vertices and exact for smaller meshes (default: %(default)s)",
+        help="method that computes eigenvectors. approximate is fast on large meshes. If all "
+        "triangles have similar sizes and shapes, the approximate eigenvalues have errors of a few tenths of "
+        "a per cent. If approximate would be inaccurate, a warning is printed and exact is used instead. "
+        f"auto chooses approximate for meshes with at least {APPROXIMATE_FROM} vertices, and exact for "
+        "smaller meshes (default: %(default)s)",
     )
 
 

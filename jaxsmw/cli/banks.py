@@ -93,5 +93,6 @@ def bounds_unless_tight(bank: FilterBank) -> tuple[float, float] | None:
 
 
 # A frame is treated as tight if its upper bound is less than this multiple of its lower bound. The bounds of
-# tight frames differ only by rounding errors. The bounds of all other banks differ by a third or more.
+# tight frames differ only by rounding errors. For all other banks, the upper bound exceeds the lower bound by
+# at least a third.
 _TIGHT = 1.01

@@ -30,10 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="METHOD",
         type=path,
         nargs="+",
-        help=f"methods to measure: {', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if "
-        "these libraries are installed; or directories of maps that other programs computed, in files named "
-        "X_Y.map (default: all methods that suit the pairs). cpd takes 30 seconds per pair, and bcicp takes "
-        "15 seconds per pair. pfm matches partial shapes only",
+        help="methods to measure (default: all methods that suit the pairs): "
+        f"{', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if these libraries are "
+        "installed. For a method of another program, give the directory of its maps, in files named X_Y.map. "
+        "cpd takes 30 seconds per pair, and bcicp takes 15 seconds per pair. pfm matches partial shapes only",
     )
     parser.add_argument(
         "--pairs",

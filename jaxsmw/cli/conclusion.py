@@ -31,8 +31,8 @@ def measure_match(
     - `truth`: the ground truth, or None.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
     - `stopwatch`: the stopwatch to which the time of the measurement is added.
-    - `others`: a dictionary from names to further maps. The initial map and the refined map are always
-      measured.
+    - `others`: a dictionary from the name of each further map to this map. The initial map and the refined
+      map are always measured.
 
     **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
     `others`, and `refined`. The dictionary is empty if there is no ground truth.

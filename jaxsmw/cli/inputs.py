@@ -92,7 +92,7 @@ def initial_map(text: str) -> str:
 def initial_map_files(init: str) -> list[str]:
     """Return the names of the files in a value of `--init`.
 
-    The list has two names for `landmarks:SOURCE_FILE,TARGET_FILE`, unless a file has a name with a comma.
+    For `landmarks:A,B`, the names are A and B, unless a file named `A,B` exists.
     """
     kind, _, file = init.partition(":")
     source, _, target = file.partition(",")

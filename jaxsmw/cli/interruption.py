@@ -1,10 +1,10 @@
 """Termination on Ctrl-C: the process ends immediately, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
-code returns to Python. During garbage collection, Python discards the exception. During the import of an
-extension module, the exception becomes another error. Therefore this module raises no exception. A signal
-handler in the main thread ends the process. If the main thread is in compiled code, a second thread ends the
-process.
+code returns to Python. If `KeyboardInterrupt` is raised during garbage collection, Python discards it. If
+`KeyboardInterrupt` is raised during the import of an extension module, Python raises another error instead.
+Therefore this module ends the process without an exception, by a signal handler in the main thread. If the
+main thread is in compiled code, a second thread ends the process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from _thread import allocate_lock
 from contextlib import contextmanager, suppress
 
 # Until the signal handler is installed, Ctrl-C prints a traceback. Therefore this module imports only a few
-# fast modules.
+# modules, which load quickly.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -53,7 +53,8 @@ def announce_consequence(consequence: str) -> None:
 
     **Arguments:**
 
-    - `consequence`: a clause, without a period, that says which results an interruption leaves.
+    - `consequence`: a clause that says what happens to the results of an interrupted command. It does not end
+      with a full stop.
     """
     global _message
     # The message begins with a newline because the cursor is at the end of the progress bar.
@@ -65,9 +66,9 @@ def quiet_children() -> Iterator[None]:
     """Return a context manager that prevents child processes from printing messages on interruption.
 
     The context manager applies to processes that this thread starts in the block. On Ctrl-C, a terminal also
-    sends SIGINT to these processes. Therefore SIGINT is blocked in this thread, and the child processes
-    inherit this setting. Another thread of this process still receives the signal. The context manager also
-    silences the warning of Python's resource tracker about leaked semaphores.
+    sends SIGINT to these processes. Therefore the context manager blocks SIGINT in this thread, and the child
+    processes inherit this setting. This process still receives SIGINT, in another thread. The context manager
+    also silences the warning of Python's resource tracker about leaked semaphores.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
@@ -83,8 +84,8 @@ def _wait_for_signal(reading: int) -> None:
         pass  # ignore other signals
     time.sleep(_PATIENCE)
     _end()
-    # The main thread is ending the process. If the main thread is stuck, for example because nobody reads its
-    # message from a pipe, this thread ends the process.
+    # If `_end` returns, the main thread is already ending the process. If the main thread is stuck, for
+    # example because nobody reads its message from a pipe, this thread ends the process.
     time.sleep(1)
     _die()
 
@@ -95,8 +96,8 @@ def _end(*_: object) -> None:
     console = -1
     with suppress(OSError):  # standard error may be closed
         console = os.dup(2)
-        # Other threads still run for a moment. Their output is discarded, because it would be mixed with the
-        # message.
+        # Other threads can still print until the process ends. Their output is discarded, because it would be
+        # mixed with the message.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
@@ -110,7 +111,7 @@ def _end(*_: object) -> None:
 
 
 def _remove_unfinished_files() -> None:
-    with suppress(Exception):  # the module may not be loaded completely
+    with suppress(Exception):  # `jaxsmw.runtime.files` may be only partly imported
         if files := sys.modules.get("jaxsmw.runtime.files"):
             files.remove_unfinished()
 

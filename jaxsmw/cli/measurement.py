@@ -30,9 +30,8 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
         type=path,
         nargs="+",
         required=required,
-        help=f"{purpose}; accepted files: a file with one target vertex per line; two .vts files, the first "
-        "for the source and the second for the target; a .baryc_gt file; or a file with a source and a "
-        "target vertex per line",
+        help=f"{purpose}: a file with one target vertex per line, a file with a source and a target vertex "
+        "per line, a .baryc_gt file, or two .vts files (source first)",
     )
 
 

@@ -109,9 +109,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--solution",
         choices=tuple(_SOLUTIONS),
-        help="computation of the functional map: filtering is meant for banks that are tight frames; "
-        "least-squares computes the exact minimiser for all banks; least-squares-frobenius is "
-        "least-squares with equal weights for all vertices; regularized is least-squares with additional "
+        help="method that computes the functional map. filtering is meant for banks that are tight frames. "
+        "least-squares computes the exact minimiser for all banks. least-squares-frobenius is "
+        "least-squares with equal weights for all vertices. regularized is least-squares with additional "
         f"terms for commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
     group.add_argument(
@@ -143,7 +143,7 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Refuse options that change the MWP paper's method if another preset is given.
+    """Refuse options that change the MWP paper's method if `--preset` names another method.
 
     **Raises:** `InputError` that names the first of these options.
     """
@@ -226,7 +226,7 @@ def match_meshes(
 
 
 def _say_hand(correspondence: Correspondence) -> None:
-    """Print which hand of the source was matched."""
+    """Print whether the source itself or its mirror image was matched."""
     took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
     evidence = correspondence.mirror_evidence
     known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"

@@ -27,7 +27,7 @@ def check_outputs(
     """Check before a long computation that all outputs can be written.
 
     No output may replace an input or another output. Paths are compared after symbolic links are resolved.
-    Entries that are None are skipped.
+    Paths that are None are ignored.
 
     **Arguments:**
 

@@ -37,7 +37,7 @@ def run_command(arguments: Sequence[str]) -> int:
             "numbers of vertices, eigenvectors or samples."
         )
         return 1
-    except BrokenPipeError:  # the program that reads the pipe, such as `head`, has closed it
+    except BrokenPipeError:  # the reader of standard output, such as `head`, has ended
         return 1
     return 0
 

@@ -42,7 +42,7 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def check_kind(name: str, value: object, *kinds: type) -> None:
     """Raises `TypeError` if the value is not an instance of one of the types `kinds`.
 
-    The error message names only the first type.
+    If `kinds` contains several types, the error message names only the first type.
     """
     if isinstance(value, kinds):
         return
@@ -67,7 +67,8 @@ def check_between(
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
-    # The comparison uses NumPy, because `jax.jit` would trace a comparison of JAX constants.
+    # Under `jax.jit`, JAX would trace the comparison even if both numbers are constants, so NumPy compares
+    # them.
     host = np.asarray(value)
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"

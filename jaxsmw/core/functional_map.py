@@ -68,11 +68,11 @@ Side = TypeVar("Side")
 
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Returns a quantity of X and the same quantity of Y in the order (out, in).
+    """Returns the two arguments in the order (out, in).
 
     "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
-    pullback convention and (Y, X) in the pushforward convention. The function is its own inverse: for the
-    arguments (out, in), it returns (X, Y).
+    pullback convention and (Y, X) in the pushforward convention. If its arguments are in the order (out, in),
+    the function returns them in the order (X, Y).
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -90,7 +90,8 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
       areas. The MWP paper uses this matrix, which is the projection in the inner product of the surface.
       `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
       authors' program uses `"least_squares"`. The two forms are nearly equal if the vertices are spread
-      evenly. If the spectrum contains only samples, only `"least_squares"` gives a pseudo-inverse.
+      evenly. The spectrum of samples (`Spectrum.sample`) needs `"least_squares"`, because its eigenvectors
+      are not orthonormal.
 
     **Raises:** `ValueError` for an unknown pseudo-inverse.
     """
@@ -141,10 +142,9 @@ def _encode(
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map of `encode` for given dual eigenvectors.
+    """Computes the result of `encode` from dual eigenvectors that the caller provides.
 
-    In both conventions the functional map is a sum over the vertices of X. Padded vertices of X do not
-    contribute, because their eigenvectors and dual eigenvectors are zero.
+    Padded vertices of X do not contribute, because their eigenvectors and dual eigenvectors are zero.
     """
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
@@ -173,11 +173,11 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares `sum_i
-    ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the energy of
-    C (k_out, k_in) as an array of shape (), and `energy.minimizer()` returns the C of least energy; it needs
-    a regular `gram` (`is_regular`). `energy + other` adds two energies, and `weight * energy` multiplies an
-    energy by an array of shape ().
+    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
+    `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
+    energy of C (k_out, k_in) as an array of shape (). `energy.minimizer()` returns the C of least energy, if
+    `gram` is non-singular (`is_regular`). `energy + other` adds two energies, and `weight * energy`
+    multiplies an energy by an array of shape ().
 
     **Attributes:**
 
@@ -224,7 +224,7 @@ class QuadraticEnergy(eqx.Module):
     def is_regular(self) -> Bool[Array, ""]:
         """Returns whether the gram matrix is non-singular to working precision."""
         # If the gram matrix is singular, one of its Cholesky pivots is negative or as small as the rounding
-        # error. A negative pivot and all later pivots become NaN, so the comparison is False.
+        # error. If a pivot is negative, the factor contains NaN, and the comparison below is False.
         pivots = jnp.diagonal(self.cholesky()) ** 2
         return jnp.min(pivots) > self.rounding()
 
@@ -270,7 +270,7 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Returns a quantity of X and the same quantity of Y in the order (out, in)."""
+        """Returns the two arguments in the order (out, in)."""
         return out_and_in(self.convention, of_x, of_y)
 
     @property
@@ -280,7 +280,7 @@ class WaveletProblem(eqx.Module):
 
     @property
     def responses(self) -> tuple[Float[Array, "filters k_out"], Float[Array, "filters k_in"]]:
-        """The responses on the shape that C maps to and on the shape that C maps from, in this order."""
+        """The responses on the shape that C maps to, then the responses on the shape that C maps from."""
         return self.out_and_in(self.responses_x, self.responses_y)
 
     def encode(
@@ -301,8 +301,8 @@ class WaveletProblem(eqx.Module):
 
         For each functional map C, the energy is a weighted sum of squared distances over all filters and all
         vertices x of X. In the pullback convention, C maps the wavelet at the match of x to a function on X.
-        The distance is measured from this function to the wavelet at x. The docstring of the module
-        `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
+        Each summand is the squared distance between this function and the wavelet at x. The docstring of the
+        module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
 
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
         also for frames that are not tight. `problem.energy(T).constant` is the energy of C = 0. In the

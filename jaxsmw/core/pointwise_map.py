@@ -26,11 +26,11 @@ def spectral_embeddings(
     of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
     convention, the points of X are the rows of `Phi_X C^T`, and the points of Y are the rows of `Phi_Y`.
 
-    The convention matters because filtering makes C shrink vectors. In the pushforward convention, C shrinks
-    the queries. A few database points of small norm are then nearest to most queries. In the pullback
-    convention, C shrinks the database, which hardly changes the order of the distances from a query. With
-    filtering, refinement therefore succeeds on real shapes in the pullback convention and fails in the
-    pushforward convention.
+    The convention matters because a filtered functional map shortens the vectors that it maps. In the
+    pushforward convention, C shrinks the queries. A few database points of small norm are then nearest to
+    most queries. In the pullback convention, C shrinks the database, which hardly changes the order of the
+    distances from a query. On real shapes, refinement with filtering therefore succeeds only in the pullback
+    convention.
 
     **Arguments:**
 
@@ -166,8 +166,8 @@ def chosen_patches(
 # `"auto"` uses patches if the geometric mean of the numbers of vertices of X and Y is at least this number.
 # For smaller shapes, the compilation of the search in patches takes more time than the search saves.
 _PATCHES_FROM = 15_000
-# With these values, the search was fastest in scripts/benchmark_speed.py. _QUERIES is the number of vertices
-# per patch of X. _RANK is the argument `rank` of `make_patches` for Y. If Y has _VERTICES_OF_SMALLEST
-# vertices or fewer, a patch of Y has _SMALLEST_PATCH vertices.
+# These values gave the fastest search in scripts/benchmark_speed.py. A patch of X has _QUERIES vertices. For
+# Y, the argument `rank` of `make_patches` is _RANK. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch
+# of Y has _SMALLEST_PATCH vertices.
 _QUERIES, _RANK = 128, 5
 _SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000

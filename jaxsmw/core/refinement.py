@@ -24,8 +24,8 @@ from jaxsmw.core.spectrum import Spectrum
 class History(eqx.Module):
     """A record of the iterations of `refine`, stored in `Refinement.history` if `history=True`.
 
-    If the refinement stopped early, the entries of the skipped iterations are NaN, except in
-    `pointwise_maps`.
+    If the refinement stopped early, `changed`, `energy` and `objective` contain NaN for the skipped
+    iterations.
 
     **Attributes:**
 
@@ -116,8 +116,8 @@ def refine(
     `jaxsmw.refine_pairs`.
 
     If samples are given, the first functional map is computed from all vertices. The iterations then match
-    only the samples, and the final search matches all vertices. With `WaveletPreservation`, refinement on
-    samples is the fast variant of the MWP authors' method.
+    only the samples, and the final search matches all vertices. The fast variant of the MWP authors' program
+    also iterates on samples.
 
     **Arguments:**
 
@@ -155,8 +155,8 @@ def refine(
     loop = _Loop(refiner, prepared, stop_when_unchanged, history, keeps_maps=history and samples is None)
     progress = loop.init(in_full, pointwise_map, first_map)
     if samples is None:
-        # The loop also runs the last search. A second search outside the loop would have to be compiled
-        # separately, and a search takes longer to compile than any other part of the program.
+        # The last search is a part of the loop. Outside the loop, the search would have to be compiled a
+        # second time, and a search takes longer to compile than any other part of the program.
         is_last = jnp.arange(iterations) == iterations - 1
         progress, records = lax.scan(loop.step, progress, is_last)
         refined = progress.pointwise_map
@@ -188,7 +188,10 @@ class _Progress(NamedTuple):
 
 
 class _Record(NamedTuple):
-    """The entries of the `History` for one iteration or, stacked, for all iterations."""
+    """The values that `History` contains for one iteration.
+
+    A stacked record contains the values for all iterations.
+    """
 
     changed: Float[Array, "*iterations"]
     energy: Float[Array, "*iterations"]
@@ -196,10 +199,10 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Returns the record of a loop on samples, extended by the final search of all vertices.
+        """Appends the final search of all vertices to the record of a refinement on samples.
 
-        The first and the last entry of `changed` become NaN, because no earlier map of the same vertices
-        exists.
+        The first and the last map cannot be compared with an earlier map of the same vertices. Their entries
+        in `changed` become NaN.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -222,8 +225,8 @@ class _Loop:
     """Algorithm 1 of the MWP paper for one prepared problem.
 
     `init` computes the first state. Then each call of `step` runs one iteration, until `terminate` returns
-    True. A step searches for the pointwise map of the current state. Every step except the last step then
-    computes the next state.
+    True. Each step recovers a pointwise map from the current state. Every step except the last step then
+    computes the next state from this map.
     """
 
     refiner: Refiner
@@ -351,10 +354,10 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Returns the status code of an update after a check of the new state.
+    """Checks the state that an update computed, and returns the status code of the update.
 
-    A failure in `result` is returned unchanged. A state that contains NaN or infinity is a failure, and so is
-    a functional map whose entries are all zero.
+    If `result` is a failure, this failure is returned unchanged. A state that contains NaN or infinity is a
+    failure, and so is a functional map whose entries are all zero.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -365,10 +368,10 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Returns the status code of a refinement after a check of its inputs.
+    """Checks the inputs of a refinement, and returns the status code of the refinement.
 
     If a spectrum contains NaN or infinity, or the initial map is invalid, the status code names this fault.
-    Otherwise the status code is `result`.
+    If the inputs are valid, `result` is returned unchanged.
 
     **Arguments:**
 

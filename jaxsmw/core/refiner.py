@@ -140,8 +140,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
         """Recovers the pointwise map X -> Y (m,) from a state.
 
-        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. The map must be a valid argument
-        of `update` with the same `prepared`.
+        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. For the same `prepared`,
+        `update` must accept this map as its argument `pointwise_map`.
         """
 
     @abc.abstractmethod
@@ -170,8 +170,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """Returns two point sets in which each vertex of X is close to its match on Y.
 
-        `jaxsmw.Correspondence.surface_points` searches the triangles of Y in these embeddings for the nearest
-        point to each vertex of X.
+        In these embeddings, `jaxsmw.Correspondence.surface_points` finds the nearest point to each vertex of
+        X on the triangles around its match.
 
         **Returns:** One point per vertex of X to be matched (m, d), and one point per vertex of Y (n, d).
         Each refiner chooses the dimension d and the unit, which is the same for both point sets.

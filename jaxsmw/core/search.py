@@ -26,7 +26,7 @@ from jaxsmw.core.products import product
 # argmax.
 BLOCK = 128
 _CHUNK = 64
-# `_maximum` divides the axis of a chunk into parts of _RUN rows, and the axis of all boxes into _PARTS parts.
+# `_maximum` divides each chunk into parts of _RUN rows, and the list of all patches into _PARTS parts.
 _RUN, _PARTS = 8, 16
 # `make_patches` divides points along their first _COORDINATES coordinates. After _POWER_ITERATIONS power
 # iterations, `Patches.variations` has nearly converged.
@@ -107,8 +107,9 @@ def in_blocks(
 def _maximum(values: Array, axis: int, parts: int) -> Array:
     """Returns the maximum along an axis.
 
-    The axis is first divided into parts, which may overlap. The elementwise maximum of the parts is then
-    reduced to one number. On CPUs, this order of operations reduces the time of a search by about 10 %.
+    The axis is first divided into parts of equal width, which may overlap. The elementwise maximum of all
+    parts has this width, and the function returns its maximum along the axis. On CPUs, this order of
+    operations reduces the time of a search by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -171,13 +172,12 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
 
     **Arguments:**
 
-    - `points`: the points (n, d). For a surface, they are the rows of the matrix of eigenvectors. The first
-      eigenvectors vary slowly over the surface, so neighbouring vertices have similar coordinates.
+    - `points`: the points (n, d). The points of a surface are the rows of the matrix of eigenvectors. The
+      first eigenvectors vary slowly over the surface, so neighbouring vertices have similar coordinates.
     - `mask`: a Boolean array (n,), False for points that are ignored.
     - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times the desired
       number.
-    - `rank`: the number r of `variations` per patch. Patches of queries need no variations, so their rank is
-      0.
+    - `rank`: the number r of `variations` per patch; 0 for patches of queries, which need no variations.
 
     **Returns:** The `Patches`. The number of patches is a power of two.
     """
@@ -233,8 +233,9 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
     def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The power iteration starts from coordinates 1, 2 and so on of the points. Coordinate 0 comes last,
-    # because the first eigenvector of a surface is constant and does not distinguish points.
+    # The initial vectors of the power iteration are coordinates of the points: first coordinate 1, then
+    # coordinate 2, and so on. Coordinate 0 comes last, because the first eigenvector of a surface is constant
+    # and does not distinguish points.
     _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
     return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)
@@ -253,7 +254,7 @@ def _centered(
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """Returns orthonormal vectors for each group. Their span contains the group's given vectors."""
+    """Returns r orthonormal vectors for each group, whose span contains the r given vectors of the group."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -277,9 +278,9 @@ def nearest_neighbor_in_patches(
     **Arguments:**
 
     - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `query_patches`, `database_patches`: the results of `make_patches` for these points, or for points that
-      a linear map takes to these points. Masked points of the database are never chosen. The results for
-      masked queries are meaningless.
+    - `query_patches`, `database_patches`: the results of `make_patches` for the queries and for the database.
+      Patches remain valid if a linear map is applied to their points. Masked points of the database are never
+      chosen. The results for masked queries are meaningless.
 
     **Returns:** One index from 0 to n - 1 per query, (m,).
     """
@@ -405,17 +406,17 @@ def _bounds(
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
     """Computes lower bounds on the distances from queries to the points of patches.
 
-    **Returns:** Three values for all patches and all queries of a block. The first value is an array of the
-    squared distances from the queries to the boxes around the patches. The second value is an array
-    of lower bounds on the distances from the queries to the points of the patches. The third value is a list
-    with one array per axis, which contains the coordinates of the queries along this axis of each patch.
+    **Returns:** Two arrays (p, block) and a list. The first array contains the squared distances from the
+    queries to the boxes around the patches. The second array contains lower bounds on the distances from the
+    queries to the points of the patches. Entry i of the list, an array (p, block), contains the coordinates
+    of the queries along axis i of each patch, relative to the centre of the patch.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
     norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
     squared = norms - 2 * products[rank * patches :]
     along = []
-    for i in range(rank):  # a loop, because XLA would not vectorise a sum over an axis
+    for i in range(rank):  # XLA would not vectorise a sum over the axes.
         along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
         outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
         squared = squared + (outside**2 - along[i] ** 2)
@@ -432,7 +433,8 @@ def _distance_to_promising_patch(
 ) -> Float[Array, " block"]:
     """Returns the distance from each query to one point of the patch with the nearest box.
 
-    This point is nearest to the query in the coordinates along the axes of the box.
+    Among the points of this patch, the function chooses the nearest point after projection onto the axes of
+    the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
     # A minimum, followed by a search for its position, takes a third of the time of argmin.

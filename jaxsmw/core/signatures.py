@@ -54,8 +54,8 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
-    # The outermost centres are `dimensions - 1` steps apart. The distance from each end of the range to the
-    # nearest centre is 2 widths, which are 14 steps.
+    # The outermost centres are `dimensions - 1` steps apart. The first and the last centre are
+    # 2 widths away from the ends of the range. One width is 7 steps.
     width = 7 * (high - low) / (dimensions - 1 + 28)
     energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
     positive = spectrum.eigenvalues >= smallest

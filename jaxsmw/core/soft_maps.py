@@ -21,8 +21,8 @@ from jaxsmw.core.checks import as_parameter, check_between, check_kind
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
-# The number of queries per block. Memory contains the distances from all queries of one block to all database
-# rows.
+# The number of queries per block. The distances from all queries of a block to all database rows are stored
+# at the same time.
 _BLOCK = 128
 
 
@@ -44,8 +44,8 @@ class SoftMap(eqx.Module):
       area-weighted mean of the database is the origin.
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
       zero. The shares of a query of area zero are still computed from its position.
-    - `potentials`: g (n,), without unit. The higher the potential of a database row, the more each query
-      gives it. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
+    - `potentials`: g (n,), without unit. A database row with a higher potential receives larger shares
+      from all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
       computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
     - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
@@ -170,8 +170,8 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
     **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
 
     Entries of a pointwise map are not checked: JAX replaces an index above n - 1 by n - 1, and counts a
-    negative index from the end. Check `Refinement.result` before the transfer, because all entries of the map
-    are -1 if the refinement failed.
+    negative index from the end. If a refinement failed, all entries of its map are -1, so check
+    `Refinement.result` first.
 
     **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
     """
@@ -384,8 +384,8 @@ def sinkhorn(
     The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
     transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
     minimises the mean squared distance minus `temperature` times the entropy of the plan. A nearest-neighbour
-    map can send many queries to one row and no query to another row. The returned plan instead sends to every
-    row an area equal to the row's own area.
+    map can send many queries to one row and no query to another row. With the returned plan, every row
+    receives an area equal to its own area, up to the tolerance.
 
     The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
     distances in blocks of queries, so no array of size m x n is stored. Derivatives through all iterations
@@ -395,15 +395,15 @@ def sinkhorn(
 
     - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
     - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. The areas of each
-      point set are scaled to sum 1. Points of zero area send no area, receive no area, and do not affect
+      point set are divided by their sum. Points of zero area send no area, receive no area, and do not affect
       other points.
     - `temperature`: a positive number, or a positive array of shape (). Its unit is the area-weighted mean
       squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
       area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
       temperatures give sharper maps and need more iterations. The rounding error of squared distances is eps
-      times the variance. If the temperature is below this error, the temperature is raised to the error, and
-      derivatives with respect to the temperature are zero. If the temperature is not positive, the result is
-      NaN.
+      times the variance. If the temperature is below this error, the error is used as the temperature. In
+      this case, derivatives with respect to the temperature are zero. If the temperature is not positive, the
+      result is NaN.
     - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
       are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
@@ -455,8 +455,8 @@ def _sinkhorn_potentials(
             return arrived + product(jax.nn.softmax(log_shares, axis=0), block[1]), None
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
-        # The area that arrives at a row can underflow to zero. This lower limit keeps the correction finite,
-        # so the potential of the row rises over several iterations.
+        # The area that arrives at a row can underflow to zero. The lower limit `least` keeps the logarithm
+        # finite. The potential of such a row needs several iterations to rise far enough.
         least = jnp.finfo(dtype).tiny
         correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2
@@ -530,7 +530,7 @@ def _normalized(
     The centre of the database becomes the origin, because distances between points far from the origin have
     large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A
     temperature below the rounding error of squared distances is raised to this error. At lower temperatures,
-    exponents would consist of rounding errors, and derivatives would overflow.
+    `distance² / temperature` would have large rounding errors, and derivatives would overflow.
     """
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
     center = lax.stop_gradient(product(b[None, :], database))
@@ -540,7 +540,7 @@ def _normalized(
     unit = jnp.sum(a * jnp.sum((queries - database[found]) ** 2, axis=1))
     eps = jnp.finfo(queries.dtype).eps
     unit = jnp.maximum(unit, eps**0.5 * spread)
-    unit = jnp.where(unit > 0, unit, 1)  # any unit is valid if all points coincide
+    unit = jnp.where(unit > 0, unit, 1)  # The unit is 0 if all queries coincide with one database row.
     relative = temperature.astype(queries.dtype)
     absolute = jnp.maximum(relative * unit, eps * spread)
     return _Transport(queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan))

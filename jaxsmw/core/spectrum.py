@@ -71,7 +71,7 @@ class Spectrum(eqx.Module):
 
     def reflect(self) -> Spectrum:
         """Returns the spectrum of the mirror image: the first coordinates of all positions and normals change
-        their signs. The descriptors stay the same.
+        their signs. The attribute `descriptors` is not changed.
         """
         flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(

@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 from jaxsmw.core.products import product
 from jaxsmw.core.search import in_blocks
 
-# The number of queries per block. Memory contains the distances from all queries of one block to all
-# triangles.
+# The number of queries per block. The distances from all queries of a block to all triangles are stored at
+# the same time.
 _BLOCK = 32
-# The number of pairs of a query and a triangle per block, if the triangles are given.
+# The number of candidates per block in `nearest_point_on_candidates`.
 _PAIRS = 4096
 
 
@@ -76,7 +76,7 @@ def nearest_point_on_candidates(
     rows: Int[Array, " p"],
     candidates: Int[Array, " p"],
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Finds, for each query, the nearest point on some triangles of a set, in a space of any dimension.
+    """Finds, for each query, the nearest point on the query's own candidate triangles, in any dimension.
 
     The time grows with the number of candidates, not with the number of all triangles.
 
@@ -114,14 +114,15 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns the squared distances from points q to triangles, and the nearest points as numbers s and t.
+    """Returns the squared distances from points q to triangles, and the coordinates s, t of the nearest
+    points.
 
     The nearest point of a triangle is `a + s u + t v`, where u and v are the edges from the corner a.
 
     **Arguments:**
 
-    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. The returned squared distance contains the same
-      constant.
+    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. In the second case, the returned squared distance
+      is also increased by this constant.
     - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`.
     - `uu`, `uv`, `vv`: the products `u·u`, `u·v` and `v·v`.
     """

@@ -53,7 +53,7 @@ class Results(NamedTuple):
         """Checks that every shape and every pair was measured.
 
         **Raises:** `InputError` if a measurement failed. The message lists the causes of all failures. For
-        each cause, it names the first three shapes or pairs that failed.
+        each cause, the message names the first three shapes or pairs that failed.
         """
         if not self.failures:
             return
@@ -73,7 +73,7 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Returns the first three names as text, followed by the number of further names."""
+    """Returns a text that contains the first three names and the number of further names."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
@@ -131,8 +131,9 @@ def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
     """Returns the number of eigenvectors to precompute.
 
     All results in a directory must be measured with the same number of eigenvectors, because the time of the
-    precomputation depends on this number. The number is at least `MOST_EIGENVECTORS`. Most later runs have
-    the same number and can therefore add methods to the directory.
+    precomputation depends on this number. The returned number is at least `MOST_EIGENVECTORS`, which suffices
+    for all of `METHODS`. A later benchmark of other methods therefore usually has the same number, and can
+    add its results to the same directory.
     """
     return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
 

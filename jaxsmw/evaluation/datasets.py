@@ -143,8 +143,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       contains the meshes. For each mesh, `corres/` contains a file `NAME.vts`, and optionally a file
       `NAME.sym.vts` for the mirrored ground truth.
     - **SHREC'19 humans** (Melzi et al. 2019): the meshes are `1.obj`, `2.obj`, …, and a folder `FARMgt_txt`
-      contains a file `I_J.txt` for each pair. In the remeshed version, a folder `corres` contains a file
-      `I_J.map` for each pair.
+      contains a file `I_J.txt` for each pair. In the remeshed version of this data set, a folder `corres`
+      contains a file `I_J.map` for each pair.
     - **SHREC'16 partial** (Cosmo et al. 2016): `null/` contains the full shapes, and `cuts/` or `holes/`
       contain the partial shapes. In each pair a partial shape is the source, and its full shape is the
       target.

@@ -23,8 +23,8 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.map_files import Table
 from jaxsmw.runtime.files import atomic_write
 
-# Barycentric weights in files are rounded. A weight may be below 0 by at most this number, and a sum of three
-# weights may differ from 1 by at most this number.
+# The barycentric weights in a file are rounded. A weight may be slightly negative, and the sum of three
+# weights may differ slightly from 1. This number limits both deviations.
 _WEIGHT_TOLERANCE = 1e-4
 
 
@@ -66,8 +66,8 @@ class GroundTruth:
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
         """Extends the ground truth to a map X -> Y (m,) for all vertices of X, with 0-based vertices of Y.
 
-        Each vertex of `mesh_x` receives the target of the vertex with ground truth that is nearest in
-        Euclidean distance.
+        A vertex without ground truth receives the target of the nearest vertex that has ground truth.
+        Distances are Euclidean.
 
         **Raises:** `InputError` if the targets are `SurfacePoints` and not vertices.
         """
@@ -182,7 +182,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
       recognises the format.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
     - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of Y.
-      The positions include faces that were dropped when the mesh was read.
+      These positions count all faces of the file, including faces that were dropped when the mesh was read.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.
@@ -204,8 +204,8 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
     """Returns a column of a table as 0-based faces of a mesh.
 
-    Face numbers in the file include faces that were dropped when the mesh was read. The returned face numbers
-    refer to `mesh.faces`, from which these faces are missing.
+    The face numbers in the table count all faces of the mesh file, including faces that were dropped when the
+    mesh was read. The returned numbers refer to `mesh.faces`, which contains only the faces that were kept.
     """
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)

@@ -233,9 +233,8 @@ def _check_origin(
             for name in {**before, **now}:
                 if before.get(name) != now.get(name):
                     raise InputError(
-                        f"{directory}: contains results for which the {name} in {group} was "
-                        f"{before.get(name)} and not {now.get(name)}: give another --output, or remove the "
-                        "directory."
+                        f"{directory}: contains results with {name} = {before.get(name)} ({group}), but this "
+                        f"run has {name} = {now.get(name)}: give another --output, or remove the directory."
                     )
     elif any(directory.glob("*.csv")):
         raise InputError(

@@ -56,7 +56,8 @@ def read_curve(text: str) -> list[float]:
 
     - `text`: one share for each threshold in `CURVE`, separated by spaces.
 
-    **Returns:** A list of numbers: for each threshold, the share of points with at most this error.
+    **Returns:** A list that contains, for each threshold in `CURVE`, the share of points with at most this
+    error.
 
     **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """
@@ -108,8 +109,8 @@ class Settings:
       (default), `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or `"aligned"` (see `jaxsmw.match`), or a
       directory with initial maps in files named `X_Y.map`.
     - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
-      the errors with the smaller mean are stored. Use this setting for methods and initial maps that do not
-      distinguish left from right.
+      errors are computed for both ground truths, and the errors with the smaller mean are stored. Use this
+      setting for methods and initial maps that do not distinguish left from right.
     - `evaluated_points`: the number of ground-truth points at which each map is evaluated. The points are the
       same for all methods. If None, each map is evaluated at all points.
     - `seed`: the seed of the random draw of these points.
@@ -203,8 +204,8 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
     - `task`: the pair and the methods.
     - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. No method of the task
-      may use more eigenvectors.
+    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. This number must be at
+      least as large as the `number_of_eigenvectors` of every method in the task.
 
     **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. If a method
     failed, all statistics of its map are NaN.
@@ -250,7 +251,8 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
         # The first run of a method takes longer than later runs, for example because of imports, so the
-        # method runs a second time. A long first run is not repeated, because the extra time is negligible.
+        # method runs a second time. A long first run is not repeated, because the time for imports is
+        # negligible in comparison.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
@@ -284,7 +286,7 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Returns the statistics of a map for the ground truth that gives the smallest mean error.
+    """Evaluates a map with every ground truth, and returns the statistics with the smallest mean error.
 
     `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
     `"mirrored"`. If the method failed, all statistics are NaN.

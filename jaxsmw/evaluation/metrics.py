@@ -31,11 +31,12 @@ LARGEST_THRESHOLD = 0.25
 class GeodesicError:
     """The geodesic errors of a pointwise map X -> Y, as `geodesic_error` returns them.
 
-    All errors and thresholds are in units of the square root of the area of Y. The properties `mean`,
-    `median` and `unreachable` (the share of infinite errors) are numbers. The property `within` is a
-    dictionary from each threshold (0.02, 0.05 and 0.1) to the share of points with at most this error. The
-    methods `correspondence_quality_curve` and `area_under_curve` compute further statistics. The method
-    `as_dictionary` returns all statistics as a dictionary for JSON.
+    All errors and thresholds are in units of the square root of the area of Y. The property `mean` is the
+    mean of all finite errors, and `median` is the median of all errors. The property `unreachable` is the
+    share of infinite errors. The property `within` is a dictionary from each threshold (0.02, 0.05 and 0.1)
+    to the share of points with at most this error. The methods `correspondence_quality_curve` and
+    `area_under_curve` compute further statistics. The method `as_dictionary` returns all statistics as a
+    dictionary for JSON.
 
     **Attributes:**
 

@@ -62,7 +62,7 @@ def prepare_pair(
 
 
 def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:
-    """Returns the argument `init` of `prepare`: the name of an initial map, or a map from a directory."""
+    """Returns `init` if it names an initial map; otherwise reads a map from the directory `init`."""
     return init if init in INITIAL_MAPS else read_published_map(Path(init), names, pair.meshes)
 
 

@@ -64,9 +64,9 @@ class Workers(ProcessPoolExecutor):
 class _OneCoreProcess(SpawnProcess):
     """A process that is limited to one core.
 
-    The environment variables that set this limit must exist before the process starts. NumPy and JAX read
+    The environment variables that set this limit must be set before the process starts. NumPy and JAX read
     these variables only once, when they are imported. A new process first imports the main module of the
-    calling program, which may import NumPy and JAX.
+    calling program. This module may import NumPy and JAX.
     """
 
     def start(self) -> None:
@@ -199,7 +199,7 @@ def run_tasks(
 
     - `function`: the function that is called once with each task. The function and the tasks must be
       picklable.
-    - `tasks`: a dictionary from the name of each task to the task, which is the argument of `function`.
+    - `tasks`: a dictionary from the name of each task to the argument with which `function` is called.
     - `executor`: the executor that runs the calls; see `open_executor`.
 
     **Yields:** A tuple for each task, with the name of the task and the result of `function`. If `function`

@@ -42,10 +42,10 @@ def alternative_initial_maps(
 ) -> Iterator[Int64[np.ndarray, " m"]]:
     """Yield alternative initial maps, which are computed one by one.
 
-    The first alternative initial maps come from functional maps. A nearest-neighbour search in SHOT from X to
-    Y gives one functional map, and a search from Y to X gives another functional map. The weighted mean of
-    both functional maps is filtered as in the MWP paper and converted to a pointwise map.
-    `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+    Each of the first alternative initial maps is computed from two functional maps. A nearest-neighbour
+    search in SHOT from X to Y gives one functional map, and a search from Y to X gives another functional
+    map. The weighted mean of both functional maps is filtered as in the MWP paper and converted to a
+    pointwise map. `RepairSettings.alternatives` lists the radii of SHOT and the weights.
 
     For two full shapes with descriptors (`describe`), further maps come from pairings of the extremities of X
     with the extremities of Y. The pairings are selected by the distances between extremities. For each
@@ -90,8 +90,8 @@ def _in_both_directions(
 ) -> Int64[np.ndarray, " m"]:
     """Compute the pointwise map from the weighted mean of two functional maps.
 
-    A nearest-neighbour search in feature space from X to Y gives one functional map. A search from Y to X
-    gives the other functional map, whose weight is `weight`.
+    A nearest-neighbour search in feature space from X to Y gives the functional map of weight `1 - weight`. A
+    search from Y to X gives the functional map of weight `weight`.
     """
     reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
     forward = nearest_map(sampled, features_x, features_y)
@@ -151,8 +151,9 @@ def _by_extremities(
 class _CoarseRefinement:
     """A function that computes maps by nearest-neighbour search and refines them by a feature regression.
 
-    A coarse feature regression suffices to determine the match of each limb. The feature regression begins
-    with few eigenvectors, so nearest neighbours are needed only for evenly spread vertices.
+    A coarse feature regression suffices to determine the match of each limb. The nearest-neighbour search is
+    made only for evenly spread vertices of X, and every other vertex receives the match of the nearest such
+    vertex.
     """
 
     def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:

@@ -1,4 +1,4 @@
-"""The search for the hand of a pair: whether X or the mirror image of X corresponds to Y."""
+"""The decision whether X or the mirror image of X corresponds to Y."""
 
 from __future__ import annotations
 
@@ -32,16 +32,17 @@ _Distances = Float[np.ndarray, "s s"]
 
 
 class Hands:
-    """A comparison of the two hands of a pair: X itself, and the mirror image of X.
+    """A comparison that decides whether X or the mirror image of X corresponds to Y.
 
-    Both hands have the same distances along the surface, and the same spectrum. Only descriptors that
-    distinguish left from right differ, such as SHOT. If the mirror image of X corresponds to Y, descriptors
-    of X itself agree with Y only in scattered places, and lead to a map that does not preserve distances. The
-    evidence compares how well maps of both hands preserve distances.
+    X and its mirror image have the same distances along the surface, and the same spectrum. They differ only
+    in descriptors that distinguish left from right, such as SHOT. If the mirror image of X corresponds to Y,
+    few descriptors of X itself agree with descriptors of Y. The map of X itself then does not preserve
+    distances.
 
-    Most bodies are their own mirror image, up to pose. For these bodies, maps of both hands preserve
-    distances equally well, but one of two coarse maps can be wrong by chance. The asymmetry of a shape
-    compares the shape with its own mirror image, and distinguishes such bodies from teeth.
+    Most bodies are their own mirror image, up to pose. For these bodies, the map of X and the map of its
+    mirror image preserve distances equally well. However, one of these coarse maps can be wrong by chance.
+    The asymmetry of a shape measures how much the shape differs from its own mirror image. Teeth have a
+    larger asymmetry than most bodies.
 
     The evidence is the logarithm of a ratio: the distance error of the map of X itself, divided by the
     distance error of the map of its mirror image. Positive evidence supports the mirror image. The distance
@@ -69,19 +70,20 @@ class Hands:
         self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
     def decide(self) -> Decision:
-        """Decide between the hands.
+        """Decide whether X or its mirror image is matched.
 
-        The mirror image is taken if both shapes are asymmetric, and if the evidence supports the mirror
-        image.
+        The mirror image is matched if the mean asymmetry of X and Y is large enough, and if the evidence
+        supports the mirror image.
 
-        **Returns:** The decision. The hands of shapes with too few samples are not compared.
+        **Returns:** The decision. If a shape has too few samples, X itself is matched.
         """
         settings = self.settings
         if min(len(shape.areas) for shape in (self.x, self.y)) < settings.fewest_samples:
             return Decision(False)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # sparse samples only weaken the evidence
+                # SHOT warns if samples are sparse, but sparse samples only make the evidence less reliable.
+                warnings.simplefilter("ignore")
                 asymmetry = self.asymmetry()
                 if asymmetry < settings.asymmetric_from - settings.asymmetry_doubt:
                     return Decision(False)
@@ -110,12 +112,13 @@ class Hands:
         return _distance_error(shape, shape, found) / _distance_error(shape, shape, random)
 
     def evidence(self) -> float:
-        """Compare coarse maps of both hands.
+        """Compare a coarse map of X with a coarse map of the mirror image of X.
 
         The coarse maps come from nearest neighbours of SHOT with large radii, and are refined by a feature
-        regression with few eigenvectors, at evenly spread samples. Several sets of radii give several pairs
-        of maps. The least evidence counts, because by chance one of two wrong maps can be much better than
-        the other. Further sets are not tried once the evidence is too small for the mirror image.
+        regression with few eigenvectors, at evenly spread samples. The comparison is repeated for each set of
+        radii in the settings. The smallest evidence is returned, because one of two wrong maps can be much
+        better than the other by chance. The method stops as soon as the evidence is clearly too small to
+        support the mirror image.
 
         **Returns:** The evidence for the mirror image, without unit.
 
@@ -165,7 +168,10 @@ class Hands:
         ]
 
     def _map(self, x: _Hand, y: _Hand) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " t"]]:
-        """Refine the map to nearest descriptors, and return the refined map (s,) and its reverse map (t,)."""
+        """Map each sample to the sample with the nearest descriptor, and refine this map.
+
+        **Returns:** The refined map (s,) and its reverse map (t,).
+        """
         first = np.argmin(cdist(x.shot, y.shot), axis=1)
         spectra = [hand.shape.described(hand.components) for hand in (x, y)]
         size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
@@ -199,9 +205,10 @@ class _Shape:
 
     @functools.cached_property
     def distances(self) -> _Distances:
-        """Distances between the samples: lengths of shortest paths over samples with adjacent regions.
+        """The lengths of the shortest paths between the samples.
 
-        Between two connected components, the distance is the distance in space.
+        A path consists of straight steps between samples whose regions are adjacent. Between two connected
+        components, the distance is the distance in space.
         """
         nearest, vertices = self.samples.nearest, self.samples.vertices
         pairs = np.unique(np.sort(nearest[self.mesh.edges], axis=1), axis=0)
@@ -214,7 +221,7 @@ class _Shape:
 
 
 class _Hand(NamedTuple):
-    """A shape or its mirror image, with the descriptors of its samples and their principal components."""
+    """A shape or its mirror image, with SHOT at its samples and the principal components of SHOT."""
 
     shape: _Shape
     shot: Float[np.ndarray, "s r"]
@@ -227,7 +234,7 @@ def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> flo
 
 
 def _log_ratio(own: float, mirrored: float) -> float:
-    tiny = 1e-9  # two maps without distance errors are equally good
+    tiny = 1e-9  # With this addend, the result is 0 if both errors are 0.
     return float(np.log((own + tiny) / (mirrored + tiny)))
 
 
@@ -236,15 +243,16 @@ def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int[Array,
 
 
 class Decision(NamedTuple):
-    """The hand of a pair.
+    """The decision whether X or the mirror image of X is matched to Y.
 
     **Attributes:**
 
     - `mirrored`: whether the mirror image of X corresponds to Y.
-    - `evidence`: the evidence for the mirror image; see `Hands`. None if the hand was given, or if the shapes
-      are their own mirror images.
-    - `doubtful`: whether the evidence is near its threshold, or whether it supports the mirror image although
-      the asymmetry is somewhat too small.
+    - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
+      example because the shapes are their own mirror images.
+    - `doubtful`: whether the decision is uncertain. If the shapes are asymmetric, True means that the
+      evidence is near its threshold. If the asymmetry is slightly below its threshold, True means that the
+      evidence supports the mirror image.
     """
 
     mirrored: bool
@@ -257,7 +265,7 @@ def decide(
     asymmetry: float,
     settings: ChiralitySettings = ChiralitySettings(),  # noqa: B008
 ) -> Decision:
-    """Decide between the hands of a pair.
+    """Decide whether X or its mirror image is matched, from the evidence and the asymmetry.
 
     **Arguments:**
 

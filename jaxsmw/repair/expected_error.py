@@ -23,7 +23,7 @@ def expected_error(
 
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
     first quantity is the detour: the distance between a vertex and the vertex to which the reverse map takes
-    its match. The second quantity is the mean change in length of the edges at a vertex.
+    its match. The second quantity is the mean change in length of a vertex's edges under the map.
 
     Where limbs look swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows
     with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices by
@@ -56,7 +56,7 @@ def expected_error(
     heat = np.exp(-settings.heat_time * eigenvalues) * (eigenvectors.T @ (areas * signs))
     misplaced = discontinuous_parts(pair, pointwise_map)
     misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x)
-    # On a misplaced limb, the distance between a match and the true match can be as large as the limb.
+    # On a swapped limb, the error of a match grows with the size of the limb.
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]

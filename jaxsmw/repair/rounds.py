@@ -101,7 +101,7 @@ _View = tuple[Spectrum, Spectrum]
 
 @dataclass(frozen=True)
 class _Runner:
-    """A runner of stages on one pair. `steps` contains each stage with the two spectra on which it runs."""
+    """Runs stages on one pair. `steps` contains each stage with the two spectra on which it runs."""
 
     prepared: PreparedPair
     steps: list[tuple[_View, Stage]]
@@ -157,8 +157,8 @@ class _Repairer:
         )
         last = self.finished(self._repeated(outcome, spectrum_x, fallback))
         # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
-        # fallback is preferred if it looks right and its score is not much worse. The tolerance excludes
-        # upside-down maps, whose scores are much worse.
+        # fallback is preferred if it looks right and its score is not much worse. Upside-down maps are not
+        # preferred, because their scores are worse by more than `score_tolerance`.
         score = self.judge.score
         preferred = (
             self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
@@ -167,7 +167,7 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Return the best of a suspicious outcome and the outcomes from alternative initial maps."""
+        """Repair outcomes from alternative initial maps, and return the best of these outcomes and `best`."""
         rough = self._rough_outcomes(alternatives)
         # The search does not stop at the first map that looks right, because a later map may be better.
         finished, tried = [best], [best, *rough]
@@ -224,7 +224,7 @@ class _Repairer:
     def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
         """Run `stage` instead of the repeated stage, starting from the final map of an outcome.
 
-        The method does not judge the returned outcome.
+        In the returned outcome, `distortion` and `suspicious` are still those of the given outcome.
         """
         (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
         found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))

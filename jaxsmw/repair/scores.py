@@ -26,10 +26,10 @@ def dirichlet_energy_ratio(
 ) -> float:
     """Return the Dirichlet energy of the matched positions, divided by the energy of X's own positions.
 
-    Both energies are computed in the span of X's eigenvectors. The span of the eigenvectors excludes the
-    scatter of single matches, which grows with the density of the mesh. For true maps between poses of one
-    body, the ratio is about 1, even if the triangulations differ. For true maps between non-isometric shapes,
-    the ratio is up to 1.1. Discontinuous maps have larger ratios.
+    Both energies are computed from the same first eigenvectors of X. The span of the eigenvectors excludes
+    the scatter of single matches, which grows with the density of the mesh. For true maps between poses of
+    one body, the ratio is about 1, even if the triangulations differ. For true maps between non-isometric
+    shapes, the ratio is up to 1.1. Discontinuous maps have larger ratios.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""The settings of the repair of wrong maps, of the expected error and of the search for the hand."""
+"""The settings of the repair, of the expected error, and of the choice between X and its mirror image."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class ScoreSettings:
     - `vertices_per_eigenvector`: the smallest number of vertices per eigenvector in the computation of
       Dirichlet energies. With more eigenvectors, the energies on a coarse mesh would depend on the mesh
       resolution.
-    - `discontinuity_distance`, `discontinuity_ratio`: an edge is discontinuous if the matches of its ends are
-      at least `discontinuity_distance` apart. The distance between the matches must also be at least
-      `discontinuity_ratio` times the length of the edge. (On bodies of 5000 vertices, the matches of
-      neighbouring vertices are 0.03 apart.)
+    - `discontinuity_distance`, `discontinuity_ratio`: the limits for discontinuous edges. An edge is
+      discontinuous if the distance between the matches of its ends is at least `discontinuity_distance` and
+      at least `discontinuity_ratio` times the length of the edge. On bodies of 5000 vertices, the distance
+      between the matches of neighbouring vertices is 0.03 times the square root of the area.
     - `orientation_eigenvectors`: the number of eigenvectors in whose span the density of signed area is
       smoothed.
     - `orientation_threshold`: a map reverses the orientation where the smoothed density of signed area is
@@ -97,7 +97,7 @@ class RepairSettings:
     - `fallback_levels` (entry R4): the numbers of eigenvectors in the iterations of the fallback. The
       fallback is one further repetition of the stage after the rounds. By default, the fallback begins with
       fewer eigenvectors than the stage.
-    - `suspicious` (Table R3): a map whose distortion is at least this value, a number above 1, is suspicious
+    - `suspicious` (Table R3): a number above 1. A map with a distortion of at least this value is suspicious
       and is repaired. Correct maps between poses of one body have a distortion below this value.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value, which should be at least `suspicious`. Between non-isometric shapes, some correct maps have
@@ -112,7 +112,7 @@ class RepairSettings:
       for alternative initial maps run the repeated stage but no later stages.
     - `finalists`: the largest number of alternative initial maps that are refined by all stages, at least 0.
     - `agreeing` (entry R7): if no map looks right, but at least this number of initial maps lead to the same
-      map, that map is chosen. (Two wrong maps sometimes agree, but three wrong maps seldom agree.)
+      map, that map is chosen. Two wrong maps sometimes agree, but three wrong maps seldom do.
     - `uncertainty_weight` (Table R13): the weight of the feature regression's uncertainty in the score,
       relative to the logarithm of the distortion; at least 0. Upside-down maps have a higher uncertainty than
       correct maps, and mirrored maps have a higher distortion. Weights from 6 to 12 lead to nearly the same
@@ -120,11 +120,11 @@ class RepairSettings:
     - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
       worse by less than this value (at least 0). The scores of two correct maps mostly differ by less than
       this value. The scores of a correct map and an upside-down map differ by more than this value.
-    - `alternatives` (Table R13): the alternative initial maps from functional maps, as a tuple of pairs. Each
-      pair contains a tuple of SHOT radii and a weight w from 0 to 1. The radii are positive integers, in
-      units of 0.06 times the square root of the area. A functional map of weight 1 - w is
-      computed from the map X -> Y of nearest neighbours. A functional map of weight w is computed from the
-      reverse map Y -> X. The initial map is computed from the weighted mean of the two functional maps.
+    - `alternatives` (Table R13): a tuple with one entry for each alternative initial map from functional
+      maps. Each entry is a pair: a tuple of SHOT radii, and a weight w from 0 to 1. The radii are positive
+      integers, in units of 0.06 times the square root of the area. A nearest-neighbour search in SHOT from X
+      to Y gives a functional map C_1. A search from Y to X gives a functional map C_2. The initial map is
+      computed from the weighted mean `(1 - w) C_1 + w C_2`.
     - `alternative_eigenvectors`: the number of eigenvectors of the functional maps in `alternatives`.
     - `extremity_levels`: the levels (numbers of eigenvectors) of the feature regression that refines maps
       from pairings of extremities (entry R14).
@@ -172,21 +172,23 @@ class ChiralitySettings:
     **Attributes:**
 
     - `samples`: the approximate number of evenly spread samples of each shape.
-    - `fewest_samples`: the hands of shapes with fewer samples are not compared, because the regression has
-      50 features.
-    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. Each
-      set gives one pair of coarse maps. With the usual radius alone, descriptors hardly distinguish a tooth
-      from its mirror image.
+    - `fewest_samples`: if a shape has fewer samples, X itself is matched without a comparison. Fewer samples
+      would not suffice for a regression with 50 features.
+    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. For
+      each set, coarse maps are computed both from X and from its mirror image. With the usual radius alone,
+      descriptors hardly distinguish a tooth from its mirror image.
     - `descriptors`, `levels` (entry R14): the number of descriptors and the levels of the feature regression
       that refines coarse maps.
     - `asymmetry_radii` (entry R23): the radii of SHOT for the asymmetry, in the same unit.
-    - `asymmetric_from` (entry R23): shapes with a smaller mean asymmetry count as their own mirror image, so
-      X itself is matched.
-    - `asymmetry_doubt` (entry R23): evidence is computed for asymmetries down to this much below the
-      threshold, and leads to a doubtful decision there if the evidence supports the mirror image.
-    - `mirrored_from` (entry R21): if the least evidence of all sets is at least this value, the mirror image
-      of X is matched.
-    - `doubt` (entry R21): a decision is doubtful if the evidence is nearer to `mirrored_from` than this.
+    - `asymmetric_from` (entry R23): shapes are asymmetric if the mean asymmetry of X and Y is at least this
+      value. If the mean asymmetry is smaller, X itself is matched.
+    - `asymmetry_doubt` (entry R23): evidence is also computed if the mean asymmetry is below
+      `asymmetric_from` by at most this value. In this case, the decision is doubtful if the evidence supports
+      the mirror image.
+    - `mirrored_from` (entry R21): for asymmetric shapes, the mirror image of X is matched if the evidence is
+      at least this value.
+    - `doubt` (entry R21): for asymmetric shapes, the decision is doubtful if the difference between the
+      evidence and `mirrored_from` is below this value.
     """
 
     samples: int = 1000

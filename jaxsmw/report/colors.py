@@ -47,8 +47,9 @@ _ERROR_SCALE = np.array(
 )
 
 # The colours of signed values in OKLab, from blue for the most negative value to red for the most positive
-# value. Both ends have the same lightness, so neither sign stands out. The keys of the dictionary say whether
-# the background is dark. Zero is paper white on light backgrounds, and dark on dark backgrounds.
+# value. Both ends have the same lightness, so neither sign stands out. The scale with the key False is for
+# light backgrounds; its colour for zero is paper white. The scale with the key True is for dark backgrounds;
+# its colour for zero is dark.
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -92,8 +93,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
 
     The right side of the body is green, and the left side is red. The hue changes from yellow to blue along
-    the height or the length of the body, whichever is larger. Along the smaller of height and length, only
-    the lightness changes. Each limb of people and animals therefore has its own hue, and swapped limbs are
+    the height or the length of the body, whichever is larger. Along the other of these two axes, only the
+    lightness changes. Each limb of people and animals therefore has its own hue, and swapped limbs are
     obvious.
 
     Along each axis, the colour depends on the vertex's relative position in the bounding box and on its
@@ -150,10 +151,11 @@ def signed_colors(
 
     **Arguments:**
 
-    - `values`: the values (m,) of a function or a matrix. Values outside of the scale are clipped.
+    - `values`: m signed numbers, such as the values of a function or the entries of a matrix. Values outside
+      of the scale are clipped.
     - `limit`: the end of the scale, positive, in the unit of the values.
-    - `on_dark`: whether the background is dark. If True, the colour of zero is dark. If False, the colour of
-      zero is white.
+    - `on_dark`: whether the background is dark. On a dark background, the colour for the value zero is dark.
+      On a light background, this colour is white.
 
     **Returns:** sRGB colours (m, 3) in [0, 1].
     """

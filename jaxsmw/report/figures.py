@@ -56,9 +56,9 @@ def draw_correspondence(
 ) -> Figure:
     """A figure that shows a map by colours: each vertex of X has the colour of its match on Y.
 
-    The colours of Y depend on the position on the body. Both bodies are shown at the same scale and from the
-    same direction. If the map is good, the colours of X are as smooth as the colours of Y, and corresponding
-    limbs have the same colours.
+    The colour of each vertex of Y depends on its position on the body. Both bodies are shown at the same
+    scale and from the same direction. If the map is good, the colours of X are as smooth as the colours of Y,
+    and corresponding limbs have the same colours.
 
     **Arguments:**
 
@@ -317,8 +317,8 @@ def draw_functions(
     for mesh, values in zip(meshes, functions, strict=True):
         if np.shape(values) != (len(titles), len(mesh.vertices)):
             raise InputError(
-                f"{mesh.name}: the functions have shape {np.shape(values)}, but {len(titles)} titles and "
-                f"{len(mesh.vertices)} vertices need shape {(len(titles), len(mesh.vertices))}."
+                f"{mesh.name}: the functions have shape {np.shape(values)}, but must have shape "
+                f"{(len(titles), len(mesh.vertices))}: one row per title and one column per vertex."
             )
     standing = [stand(mesh, up) for mesh in meshes]
     angle = choose_azimuth(standing) if azimuth is None else np.radians(azimuth)
@@ -370,9 +370,9 @@ def draw_forest(
 
     **Arguments:**
 
-    - `panels`: a nested dictionary. `panels[title][name]` is an array (rows, 3) for each title of a panel and
-      each name of a series. Each row of an array contains an estimate and the lower and upper end of its
-      interval, or NaN for a missing estimate. All panels have the same series.
+    - `panels`: a nested dictionary. `panels[title][name]` is an array (rows, 3) that contains one series of
+      one panel. Each row of an array contains an estimate and the lower and upper end of its interval, or NaN
+      for a missing estimate. All panels have the same series.
     - `rows`: the names of the rows, from top to bottom.
     - `xlabel`: the name of the estimated quantity.
     - `linear_up_to`: the absolute value of an estimate above which the scale is logarithmic.
@@ -445,7 +445,8 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure of tables of positive numbers. The colour of each cell represents its number.
+    """A figure that shows tables of positive numbers as heat maps. The colour of each cell represents its
+    number.
 
     Each cell also contains its number as text. All tables have the same logarithmic colour scale.
 
@@ -627,7 +628,7 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
 
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
-    """An empty white figure with a canvas in memory. The width and the height are in inches.
+    """An empty white figure that opens no window. The width and the height are in inches.
 
     With `plot`, matplotlib chooses the positions of axes and labels automatically.
     """

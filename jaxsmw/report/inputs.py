@@ -92,6 +92,6 @@ def check_functional_map(
 
 def describe(mesh: Mesh) -> tuple[str, str]:
     """The caption of a mesh: the name of its file without the directory, and its number of vertices."""
-    # File names may contain bytes that are not text. Question marks replace these bytes.
+    # File names may contain bytes that are not valid UTF-8. Question marks replace these bytes.
     name = Path(mesh.name).name.encode("utf-8", "replace").decode()
     return name, f"{len(mesh.vertices)} vertices"

@@ -122,8 +122,8 @@ def write_page(
     where g_l is the filter of scale l, and lambda_i and phi_i are the eigenvalues and eigenvectors of the
     shape. The page shows the wavelet on X around the vertex under the pointer, and the wavelet on Y around
     the match of this vertex. If the map preserves wavelets, the two wavelets look similar. The page also
-    prints their similarity. To compute the similarity, the map transfers the wavelet on Y to X. The
-    similarity is the cosine of the angle between the transferred wavelet and the wavelet on X.
+    prints the similarity of the two wavelets. The map first transfers the wavelet on Y to X. The similarity
+    is the cosine of the angle between the transferred wavelet and the wavelet on X.
 
     **Arguments:**
 
@@ -146,8 +146,8 @@ def write_page(
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
     - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file; None (the
-      default) for a page without them. The page can draw X over Y at these positions, and a slider moves X
-      there from its own shape. The positions take 16 bytes per vertex.
+      default) for a page without them. The page can draw X at these positions, over Y. A slider on the page
+      deforms X from its own shape to these positions. The positions take 16 bytes per vertex.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
@@ -193,7 +193,7 @@ def write_page(
 
 
 def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """The data from which the viewer looks at two upright meshes: the colours and the camera."""
+    """The colours of Y, and the settings of the camera that shows both upright meshes."""
     reach = np.max(
         [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
     )
@@ -263,7 +263,7 @@ def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str
 
 
 def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """The colours of a CSS gradient: up to nine colours of a scale."""
+    """Up to nine colours of a colour scale, as text for a CSS gradient."""
     chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
 

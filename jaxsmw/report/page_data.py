@@ -91,10 +91,10 @@ def encode_mesh(mesh: Mesh) -> dict[str, Any]:
 def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
     """Encodes a shape: its upright mesh, its name, and the similarity that takes the page back to the file.
 
-    The page shows positions in float32. The page computes a point on a triangle from the shown corners in
-    float64, and takes this point to the coordinates of the file by the similarity in float64
-    (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times the diagonal of the
-    bounding box, plus the float64 rounding of the file's own coordinates.
+    The page stores the positions of vertices in float32, but computes in float64. To convert a point on a
+    triangle to the coordinates of the file, the page interpolates the shown corners and applies the
+    similarity (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times the diagonal
+    of the bounding box, plus the float64 rounding of the file's own coordinates.
 
     **Arguments:**
 
@@ -111,11 +111,11 @@ def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
 def encode_registered(
     registered: Float[np.ndarray, "m 3"], mesh_x: Mesh, mesh_y: Mesh, standing_y: Mesh
 ) -> str:
-    """Encodes the positions of X's vertices on Y, in the coordinates of Y's file, for the upright target.
+    """Converts registered positions to the coordinates of the page, and encodes them.
 
     **Arguments:**
 
-    - `registered`: the positions (m, 3), in the unit of Y's file.
+    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file.
     - `mesh_x`, `mesh_y`: X (m vertices) and Y, in the coordinates of their files.
     - `standing_y`: Y as shown.
 
@@ -150,15 +150,15 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
     """Rounds the numbers of a matrix to one byte each, and encodes them in base64.
 
-    Each row has its own unit. The code c represents the number sign(c) c² times this unit, so small numbers
-    have smaller rounding errors than large numbers. An eigenvector that is large on a limb is small on the
-    rest of the body. Evenly spaced levels would therefore cause visible errors of wavelets there. On people
-    and animals, rounding changes the wavelets by 0.005 times the length of the colour scale (root mean
-    square).
+    Each row has its own unit. A byte c encodes the number sign(c) c² times the unit of its row. Small numbers
+    therefore have smaller rounding errors than large numbers. For example, an eigenvector can be large on one
+    limb and small on the rest of the body. If the encoded numbers were evenly spaced, the wavelets on the
+    rest of the body would have visible errors. On people and animals, the root mean square of the errors of
+    wavelets is 0.005 times the length of the colour scale.
 
     **Arguments:**
 
-    - `rows`: the matrix (k, n).
+    - `rows`: the matrix (k, n), such as k eigenvectors with n entries each.
 
     **Returns:** The codes (int8) and the units (float32) in base64.
     """

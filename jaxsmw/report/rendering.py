@@ -22,8 +22,8 @@ ELEVATION = np.radians(8)
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# `_SUPERSAMPLING` is the number of samples per pixel in each direction. About `_CHUNK` samples at a time are
-# tested against faces.
+# `_SUPERSAMPLING` is the number of samples per pixel in each direction. Faces are drawn in chunks, whose
+# bounding boxes contain about `_CHUNK` samples in total.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
@@ -181,8 +181,8 @@ def _rasterize(
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
     """The share of the light that reaches each sample, between 0 and 1.
 
-    The share is smaller next to the outline of a part of the body that is nearer to the viewer. It is
-    computed by unsharp masking of the depth (Luft et al. 2006).
+    Samples just behind the outline of a nearer part of the body receive less light. The share is computed by
+    unsharp masking of the depth (Luft et al. 2006).
     """
     # One sample per pixel is enough, because the depth is blurred.
     image = depth[::_SUPERSAMPLING, ::_SUPERSAMPLING]

@@ -13,7 +13,7 @@ from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh
 
 # For each axis, the rotation that makes this axis of a file point up. In files with y up, bodies face +z. In
-# files with z up, bodies face -y. After the rotation, bodies of both kinds of files face +z.
+# files with z up, bodies face -y. In both cases, bodies face +z after the rotation.
 _STAND = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -31,21 +31,21 @@ _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # files, the spread along z is at least 0.47 times the spread along y, except for two animals that leap or
 # crouch.
 _SLENDER = 0.45
-# If y or z is the usual axis, the score of another axis must be higher by at least this amount. For people
-# who stand on one foot with raised arms, the score of an upside-down axis is up to 0.18 higher than that of
-# the correct axis. For bodies that sit or leap, the score of a wrong axis is up to 0.09 higher.
+# This number is added to the score of the usual axis, y or z (see `guess_up`). For people who stand on one
+# foot with raised arms, the score of an upside-down axis is up to 0.18 higher than that of the correct axis.
+# For bodies that sit or leap, the score of a wrong axis is up to 0.09 higher than that of the correct axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
-# Stability is clipped to this range, because larger or smaller values carry no information. The range is in
-# units of the square root of the area.
+# Stability is clipped to this range, in units of the square root of the area. Differences outside of the
+# range do not indicate which axis is correct.
 _STABILITY_RANGE = (-0.2, 0.1)
 # A point is treated as touching the ground if its height above the lowest point is at most this share of the
 # body's height.
 _CONTACT = 0.1
 _DIRECTIONS = 32
-# `_CELL` is the side length of the grid cells in which vertices are merged. A body has about 1500 cells.
-# Limbs up to the length `_SHORTEST_LIMB` are ignored as noise. Both lengths are in units of the square root
-# of the area.
+# `_CELL` is the side length of the grid cells in which vertices are merged. The vertices of a body are in
+# about 1500 cells. Limbs up to the length `_SHORTEST_LIMB` are ignored as noise. Both lengths are in units of
+# the square root of the area.
 _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
 # A shape is treated as partial if its area is between these multiples of the area of the other shape.
@@ -123,7 +123,8 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
     """
     used = mesh.referenced_vertices
     scale = np.sqrt(mesh.area / standing.area)
-    # `stand` turns every mesh by one of these rotations. Only the right one leaves a constant offset.
+    # `stand` turns every mesh by one of these rotations. Only the rotation that `stand` applied gives the
+    # same offset at all vertices.
     matrices = [scale * np.array(rows, dtype=float) for rows in _STAND.values()]
     offsets = [mesh.vertices[used] - standing.vertices[used] @ matrix for matrix in matrices]
     best = min(range(len(matrices)), key=lambda i: float(np.ptp(offsets[i], axis=0).max()))
@@ -139,9 +140,10 @@ def guess_up(mesh: Mesh) -> Axis:
     along y, such as a person. For other bodies, the usual axis is z. The usual axis is returned unless the
     score of another axis is clearly higher.
 
-    The guess was checked by eye. The guess is right for all 70 FAUST bodies, 41 of 43 TOSCA bodies and 30 of
-    32 SMAL animals. The guess is also right for 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16
-    topology. The guess can be wrong for a body that leaps, crouches, lies down or is cut in half.
+    The guesses for several data sets were checked by eye. The guess is right for all 70 FAUST bodies, 41 of
+    43 TOSCA bodies and 30 of 32 SMAL animals. The guess is also right for 17 of 19 people of SHREC'19 and all
+    16 bodies of SHREC'16 topology. The guess can be wrong for a body that leaps, crouches, lies down or is
+    cut in half.
 
     **Arguments:**
 
@@ -165,8 +167,8 @@ def guess_up(mesh: Mesh) -> Axis:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """A coarse copy of the mesh. Each grid cell has one point, at the mean of its vertices, and edges join
-    cells.
+    """A coarse graph of the mesh. Its points are the means of the vertices in each grid cell. An edge joins
+    two points if an edge of the mesh joins the two cells.
     """
     used = mesh.vertices[mesh.referenced_vertices]
     keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
@@ -185,8 +187,8 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
     A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
     lower. The length of a limb is the persistence of its component in the sublevel sets of the height
     (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that
-    contains the lowest point of the body is left out. The sum therefore includes three legs of a standing
-    quadruped, but no leg of a quadruped that lies on its back.
+    contains the lowest point of the body is left out. For a standing quadruped, the sum therefore contains
+    three of the four legs. For a quadruped that lies on its back, the sum contains no leg.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 

@@ -188,7 +188,8 @@ def write_tables(
     **Arguments:**
 
     - `directory`: an existing directory. Existing files of the same names are replaced.
-    - `methods`: a dictionary from names to methods, which must contain every method in `results`.
+    - `methods`: a dictionary from the name of each method to a `Method`. The dictionary must contain every
+      method in `results`.
 
     **Returns:** A dictionary from the name of each method to its summary.
 

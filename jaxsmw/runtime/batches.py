@@ -81,8 +81,8 @@ def refine_pairs(
     processes (`jax.distributed`), call this function with the same arguments in each process. The function
     uses the devices of all processes, and every process receives all results.
 
-    The results agree with those of `refine` up to rounding errors. Functional maps agree to the precision of
-    the float type. A match can differ only if two vertices of Y are equally far away to this precision.
+    The functional maps equal those of `refine` up to rounding errors. A match can differ only if two vertices
+    of Y are equally near up to rounding errors.
 
     **Arguments:**
 
@@ -218,7 +218,7 @@ class _Sizes(NamedTuple):
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Returns a dictionary from sizes to the indices of all pairs in `pairs` with these sizes."""
+    """Returns a dictionary from each combination of sizes to the indices of its pairs in `pairs`."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)

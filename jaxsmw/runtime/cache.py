@@ -52,7 +52,8 @@ def cached(
     - `inputs`: all values on which the result depends, in a fixed order.
     - `compute`: a function without arguments, which returns the result as a dictionary from names to arrays.
 
-    **Returns:** The result of `compute`. A result from the disk is identical, bit for bit.
+    **Returns:** The result of `compute`. A result that was read from the disk is identical to the computed
+    result, bit for bit.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -87,7 +88,7 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Recompute all results in the block, so that the time of their computation can be measured.
+    """Ignore existing entries of the cache in the block, so that computation times can be measured.
 
     The results are still written to the cache.
     """

@@ -1,4 +1,4 @@
-"""Compilation of functions that Python calls directly, outside of other compiled functions."""
+"""Compilation of functions that are called from Python code, not from other compiled functions."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _OPTIONS: dict[str, str | bool] = {
     "xla_disable_hlo_passes": "tree_reduction_rewriter",
 }
 # Linux limits the number of memory maps of a process. Compiled programs are released when the process uses
-# more than this share of the limit. The programs for a pair with new sizes use up to 3 % of the limit, and up
-# to 250 MB of memory.
+# more than this share of the limit. For each new combination of sizes, the compiled programs use up to 3 % of
+# the limit and up to 250 MB of memory.
 _LARGEST_SHARE = 0.25
 
 
@@ -85,10 +85,10 @@ def compile_ahead(
 
     **Arguments:**
 
-    - `arguments`: a function without arguments that returns arrays of the given sizes. The function returns a
-      tuple of positional arguments and a mapping of named arguments. JAX traces this function without
-      computing the arrays.
-    - `settings`: the remaining keyword arguments of the function.
+    - `arguments`: a function that takes no arguments, and returns the arrays for `function`: a tuple of
+      positional arguments and a mapping of named arguments. JAX traces `arguments` to determine the sizes of
+      the arrays, and does not compute the arrays.
+    - `settings`: the remaining keyword arguments of `function`.
 
     **Returns:** A future that is done when the program is compiled. If compilation raises an exception, the
     future stores the exception. A later call of `compiled(function)` with the same arguments raises the

@@ -24,8 +24,8 @@ def largest_contents(size_of_file: int) -> int:
 
     A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to 1
     GiB are always accepted, because a mesh of ten million vertices has this size. Only files of eigenvectors
-    have larger contents. Compression hardly reduces the size of eigenvectors, so contents above 1 GiB may be
-    at most four times as large as the compressed file.
+    are expected to unpack to more than 1 GiB. Compression hardly reduces the size of eigenvectors, so
+    contents above 1 GiB may be at most four times as large as the compressed file.
 
     `size_of_file` is the size of the compressed file, in bytes.
     """
@@ -162,7 +162,8 @@ def _temporary(target: Path) -> Path:
 def _check_target(path: str | os.PathLike[str], target: Path) -> None:
     """Refuse a target that cannot become a regular file.
 
-    **Raises:** `InputError` if the target is refused; `OSError` if the system does not accept the name.
+    **Raises:** `InputError` if the target cannot be written as a regular file; `OSError` if the operating
+    system does not accept the name.
     """
     if not target.parent.is_dir():
         raise InputError(

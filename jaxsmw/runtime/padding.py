@@ -27,6 +27,6 @@ def padded_size(number_of_vertices: int) -> int:
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
     """Returns an array (n, ...) extended by rows of zeros to a given number of rows.
 
-    The rows of the result correspond to the rows of a padded `Spectrum`. `number_of_rows` must be at least n.
+    `number_of_rows` must be at least n.
     """
     return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))

@@ -55,7 +55,7 @@ def made_with() -> str:
 def measured_code() -> list[Path]:
     """Return the library's Python files, except those of the command line and of the report.
 
-    The results of computations depend on these files.
+    Changes to these files can change numerical results.
     """
     left_out = ("report", "cli", "__main__.py")
     return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]

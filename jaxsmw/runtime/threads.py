@@ -1,4 +1,4 @@
-"""The use of threads on computers with few cores."""
+"""Limits the number of linear-algebra threads, and runs two computations side by side."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[R
 
     If the function raises an exception in a thread, `side_by_side` raises this exception.
     """
-    # One context of `one_blas_thread` encloses both threads. With one context per thread, the first thread to
+    # Both threads share one context of `one_blas_thread`. With one context per thread, the first thread to
     # end would also remove the limit for the other thread.
     with one_blas_thread(), ThreadPoolExecutor(2) as executor:
         futures = [executor.submit(copy_context().run, compute, side) for side in (x, y)]

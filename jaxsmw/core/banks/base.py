@@ -62,7 +62,8 @@ def sample_bank(
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
     """Checks the number of filters of a bank.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `least`.
+    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below the minimum
+    `least`.
     """
     if not isinstance(filters, int | np.integer):
         raise TypeError(f"{type(bank).__name__} needs a whole number of filters, not {filters!r}")

@@ -29,7 +29,7 @@ class _LogSpacedDilates(FilterBank):
 
     @abc.abstractmethod
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the wavelet at `scaled`, the products of scales and eigenvalues."""
+        """Returns the values of the wavelet. Each entry of `scaled` is a scale times an eigenvalue."""
 
     @abc.abstractmethod
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -82,7 +82,8 @@ class CubicSpline(_LogSpacedDilates):
         return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        # At zero, the scaling function equals the wavelet's maximum, which is at 2 - 1 / sqrt(3).
+        # At zero, the scaling function equals the maximum of the wavelet. The wavelet has this maximum at
+        # `scaled = 2 - 1 / sqrt(3)`.
         return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
 
 

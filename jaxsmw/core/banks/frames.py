@@ -57,8 +57,8 @@ def frame_bounds(
     - `bank`: the filter bank, a `FilterBank`.
     - `eigenvalues`: (k,), the eigenvalues of a shape, ascending, in any unit. The last eigenvalue is
       lambda_max.
-    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then hold for
-      functions in the span of the corresponding eigenvectors. `"interval"` evaluates G at evenly spaced
+    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then apply to
+      every linear combination of the corresponding eigenvectors. `"interval"` evaluates G at evenly spaced
       points of [0, lambda_max]. If the bank depends only on lambda_max, these bounds hold for every shape
       with this lambda_max.
     - `resolution`: the number of points at which `"interval"` evaluates G, at least 2, by default 10 001.

@@ -49,7 +49,8 @@ class SoftmaxFrame(FilterBank):
         """Returns a `SoftmaxFrame` that imitates a given filter bank.
 
         At each knot, the squared filters of the frame are proportional to the squared filters of the bank.
-        The bank is evaluated by `bank(points, points)`, with `knots` evenly spaced points from 0 to 1.
+        The bank is evaluated at `knots` evenly spaced points from 0 to 1, which also serve as the eigenvalues
+        of a shape.
 
         **Arguments:**
 
@@ -66,7 +67,7 @@ class SoftmaxFrame(FilterBank):
         """
         if knots < 2 or not 1e-12 <= floor < 1:
             raise ValueError(
-                "SoftmaxFrame.like needs at least 2 knots and a floor from 1e-12 to 1, not "
+                "SoftmaxFrame.like needs at least 2 knots and a floor of at least 1e-12 and below 1, not "
                 f"knots={knots} and floor={floor}"
             )
         points = jnp.linspace(0, 1, knots)

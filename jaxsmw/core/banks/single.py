@@ -29,7 +29,7 @@ class ExponentialWindow(FilterBank):
     - `edge`: the eigenvalue above which the filter is zero, as a fraction of lambda_max, by default 0.2. The
       value is a single positive number, or an array of shape ().
     - `slope`: the steepness of the filter, by default 1. The value is a single positive number, or an array
-      of shape (). At half the edge, the derivative with respect to `lambda / lambda_max` is
+      of shape (). At half the edge, the derivative of the filter with respect to `lambda / lambda_max` is
       `-2 slope / edge`.
 
     **Raises:** `ValueError` if a parameter is not a single positive, finite number.

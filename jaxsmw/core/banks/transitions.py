@@ -24,7 +24,7 @@ class _Transitions(FilterBank):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        """Returns `theta / (pi / 2)`, which rises from 0 to 1, for each transition."""
+        """Returns the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -104,7 +104,7 @@ class SimpleTight(_DyadicBands):
     (arbitrary) unit as `points`; the last one is lambda_max.
 
     The frame is that of Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and
-    application to denoising", 2018, based on Coulhon, Kerkyacharian and Petrushev 2012.
+    application to denoising", 2018. Their construction is based on Coulhon, Kerkyacharian and Petrushev 2012.
 
     **Arguments:**
 

@@ -80,8 +80,8 @@ class HalfCosine(_UniformTranslates):
     `points`; the last one is lambda_max.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
-    tight graph wavelet and vertex-frequency frames", 2015. In that paper the squared filters sum to
-    `3/8 overlap`. Here the filters are scaled so that their squares sum to one.
+    tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to
+    `3 overlap / 8`. Here the filters are scaled so that their squares sum to one.
 
     **Arguments:**
 
@@ -105,9 +105,9 @@ class HalfCosine(_UniformTranslates):
 class Gabor(FilterBank):
     """A filter bank of Gaussians with evenly spaced centres from 0 to lambda_max. The bank is not tight.
 
-    The filters correspond to the windows of a short-time Fourier transform. Shuman, Ricaud and Vandergheynst,
-    "Vertex-frequency analysis on graphs", 2016, centre a window at every eigenvalue; this bank has only
-    `filters` centres. Each Gaussian is 1 at its centre.
+    The filters correspond to the windows of a short-time Fourier transform. In Shuman, Ricaud and
+    Vandergheynst, "Vertex-frequency analysis on graphs", 2016, every eigenvalue is the centre of a window.
+    This bank has only `filters` centres. Each Gaussian is 1 at its centre.
 
     `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max].
     `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as

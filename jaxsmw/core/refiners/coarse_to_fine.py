@@ -112,18 +112,18 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Reduces the weights of vertices that probably exist only on the full shape.
+    """Reduces the weights of vertices of the full shape that are probably missing on the partial shape.
 
-    The shape with the larger mean residual is treated as the full shape. The weight w of each of its vertices
-    becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean` is the
-    weighted mean residual of the other shape. Then the weights of the full shape are scaled to sum 1. The
-    weights of the other shape stay the same.
+    The shape with the larger mean residual is treated as the full shape. For each vertex of the full shape,
+    the weight w becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean`
+    is the weighted mean residual of the other shape. Then the weights of the full shape are scaled to sum 1.
+    The weights of the other shape stay the same.
 
     **Arguments:**
 
     - `weights_x`, `weights_y`: the weights of the vertices of X (m,) and of Y (n,), each with sum 1.
-    - `residuals_x`, `residuals_y`: the squared distances from vertices to their matches, (m,) for X and (n,)
-      for Y, in the same unit.
+    - `residuals_x`, `residuals_y`: the squared distance from each vertex to its match, (m,) for X and (n,)
+      for Y. Both arrays have the same unit.
 
     **Returns:** The new weights of the vertices of X (m,) and of Y (n,), each with sum 1.
     """

@@ -23,8 +23,8 @@ from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
 # _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is added to the variances of the residuals.
-# Features have a variance of about 1. If either number is divided or multiplied by a factor of up to 3, the
-# results hardly change.
+# Features have a variance of about 1. The results hardly change if either number is multiplied by a factor
+# between 1/3 and 3.
 _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 
 
@@ -42,9 +42,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
     increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. If the initial map is as accurate as a map of `WaveletPreservation`,
-    the refined map is closer to the ground truth than the initial map. docs/accuracy.md contains the
-    measurements.
+    The method does not assume isometry. If the initial map is as accurate as a result of
+    `WaveletPreservation`, refinement reduces its error. docs/accuracy.md contains the measurements.
 
     If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
     smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
@@ -86,7 +85,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Regresses the features of matched vertices. Returns the next state and `RESULTS.successful`.
+        """Computes both regressions from matched features. Returns the next state and `RESULTS.successful`.
 
         If there is a previous state, the regressions also use the matches of the reverse map.
         """
@@ -150,10 +149,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Returns the coordinates of the `embeddings` that depend only on eigenvectors.
+        """Returns the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
 
-        The search in patches uses only these coordinates, because patches are compact in these coordinates.
-        The whitening matrix is triangular, so these coordinates are the first k_x coordinates.
+        The search in patches uses only these coordinates, because the vertices of a patch are close together
+        in them.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
@@ -161,7 +160,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The features of the vertices of one shape, the vertices' shares of the area (`weights`), and the mask.
+    """The features, weights and mask of the vertices of one shape. The weights are the vertex areas, scaled
+    to sum 1.
 
     Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
     vertex if the spectrum has descriptors.
@@ -174,7 +174,7 @@ class _Features(NamedTuple):
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
         area = jnp.sum(spectrum.vertex_areas)
-        # This factor scales the eigenvectors to mean square 1 in every unit of length.
+        # With this factor, each eigenvector has mean square 1, whatever the unit of length.
         values = spectrum.eigenvectors * jnp.sqrt(area)
         if spectrum.descriptors is not None:
             values = jnp.concatenate([values, spectrum.descriptors], axis=1)
@@ -182,7 +182,7 @@ class _Features(NamedTuple):
 
 
 class PreparedFeatures(Prepared):
-    """The values that `FeatureRegression` computes once per problem.
+    """The result of `FeatureRegression.prepare`, computed once per problem.
 
     **Attributes:**
 
@@ -201,17 +201,17 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """A linear prediction of features, stored as two matrices that take features to points.
+    """A linear prediction of features, for use in a nearest-neighbour search.
 
     The distance between a query point and a target point is a Mahalanobis distance. This distance compares
     the features of the query vertex with the prediction of these features from the target vertex.
 
     **Attributes:**
 
-    - `queries`: a matrix (d_out, d_out). The product of the features of a query vertex and this matrix is the
-      query point in the nearest-neighbour search.
-    - `database`: a matrix (d_in, d_out). The product of the features of a target vertex and this matrix is
-      the target point in the nearest-neighbour search.
+    - `queries`: the matrix (d_out, d_out) for query vertices. The product of the features of a query vertex
+      and this matrix is the query point in the nearest-neighbour search.
+    - `database`: the matrix (d_in, d_out) for target vertices. The product of the features of a target vertex
+      and this matrix is the target point in the nearest-neighbour search.
     - `uncertainty`: half the log-determinant of the residual covariance, restricted to the active features.
     """
 
@@ -262,7 +262,7 @@ class Regression(CoarseToFineState):
 
 
 class _Moments(NamedTuple):
-    """The weighted second moments of the features of matched vertices."""
+    """Weighted sums of products of features, taken over all pairs of matched vertices."""
 
     xx: Float[Array, "d_x d_x"]
     xy: Float[Array, "d_x d_y"]

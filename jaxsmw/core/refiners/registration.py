@@ -30,16 +30,17 @@ from jaxsmw.core.spectrum import Spectrum
 # _EIGENFUNCTIONS is the weight of the first _NUMBER_OF_EIGENFUNCTIONS eigenfunctions, each of which is
 # divided by sqrt(1 + eigenvalue).
 _NORMALS, _EIGENFUNCTIONS, _NUMBER_OF_EIGENFUNCTIONS = 0.02, 0.2, 50
-# Descriptors have mean square 1. Their weight is _DESCRIPTORS / level**_FALLING. Descriptors therefore
-# outweigh positions at low levels and have little effect at the last level.
+# Each descriptor has mean square 1. The weight of descriptors is _DESCRIPTORS / level**_FALLING. Descriptors
+# therefore outweigh positions at low levels and have little effect at the last level.
 _DESCRIPTORS, _FALLING = 2.8, 1.5
 # Heat flow of duration _HEAT_TIME averages over a disk around each vertex. The radius of the disk is 0.1
 # times the square root of the area. If the spectrum has few eigenvectors, the duration is longer, because
 # heat flow must reduce the last eigenvector to at most exp(-_DECAY) times its size.
 _HEAT_TIME, _DECAY = 3e-3, 4.0
-# The least-squares fit on partial shapes uses this ridge, in units of the mean square of the eigenvectors.
+# _RIDGE is the ridge of the least-squares fit on partial shapes, relative to the mean diagonal entry of the
+# gram matrix.
 _RIDGE = 1e-3
-# `_nearest_rotations` squares matrices this many times. The result is nearly the projection onto the
+# `_nearest_rotations` squares each matrix _SQUARINGS times. The result is nearly the projection onto the
 # eigenvector of the largest eigenvalue.
 _SQUARINGS = 12
 
@@ -47,14 +48,14 @@ _SQUARINGS = 12
 class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     """A refiner that deforms X onto Y, and Y onto X, from low to high frequencies.
 
-    In each iteration, the positions of the matches are projected onto the first eigenvectors. The projection
-    gives the low frequencies of the deformed surface. The argument `levels` increases the number of
+    In each iteration, the positions of the matches are projected onto the first eigenvectors. The projected
+    positions form the smooth part of the deformed surface. The argument `levels` increases the number of
     eigenvectors from iteration to iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020). The
-    remaining details of the surface are rotated with the neighbourhood of each vertex, as in
-    as-rigid-as-possible deformation (Sorkine, Alexa 2007). Heat flow averages over the neighbourhood of each
-    vertex, and the best rotation is computed from these averages. On samples and on partial shapes,
-    eigenvectors are not orthonormal, so coefficients are computed by least squares. On full shapes without
-    samples, no linear system is solved.
+    details of the original surface are rotated and added to the smooth part. Each vertex has its own
+    rotation, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007). Heat flow averages over the
+    neighbourhood of each vertex, and the best rotation is computed from these averages. On samples and on
+    partial shapes, eigenvectors are not orthonormal, so coefficients are computed by least squares. On full
+    shapes without samples, no linear system is solved.
 
     The next matches are the nearest vertices in a joint space of both surfaces. The coordinates of this space
     are positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra
@@ -66,10 +67,10 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     must contain positions and normals, which `jaxsmw.compute_spectrum` computes. `Spectrum.with_positions`
     adds positions and normals to a spectrum.
 
-    Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are
-    instead scaled by the same factor, and vertices of the full shape with large residuals receive smaller
-    weights (`partial_matching_weights`). A residual is the squared distance from a vertex to its match in the
-    joint space, without descriptors.
+    Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are scaled
+    by the same factor instead. Vertices of the full shape with large residuals then receive smaller weights
+    (`partial_matching_weights`). A residual is the squared distance from a vertex to its match in the joint
+    space, without descriptors.
 
     **Arguments:**
 
@@ -122,7 +123,8 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         active_x, active_y = self.active_eigenvectors(prepared, iteration)
         level = jnp.maximum(jnp.sum(active_x), jnp.sum(active_y)).astype(x.weights.dtype)
         weight = _DESCRIPTORS / level**_FALLING
-        if previous is None:  # The first reverse map needs only the deformation of X.
+        if previous is None:
+            # Y is not deformed yet, so the first reverse map uses only the deformation of X.
             forward = Deformation.along(x, all_y, pointwise_map, active_x)
             reverse_map = nearest_vertices(y.points, forward.points(all_x), all_x.mask, patches)
         else:
@@ -167,7 +169,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
 
 
 class _Surface(NamedTuple):
-    """All or some vertices of a shape, with lengths in units of the square root of the area.
+    """All vertices or the samples of a shape. Lengths are in units of the square root of the area.
 
     `points` contains the positions, normals and eigenfunctions, multiplied by their weights.
     """
@@ -215,7 +217,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Returns the given vertices (s,) of the surface. `spectrum` is the spectrum of these vertices."""
+        """Returns a surface that contains only the given vertices (s,), whose spectrum is `spectrum`."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -224,7 +226,7 @@ class _Surface(NamedTuple):
         )
 
     def reweighted(self, weights: Float[Array, " s"]) -> _Surface:
-        """Returns the same vertices, with the given weights in the least-squares fit of coefficients."""
+        """Returns the same vertices with new weights for the least-squares fit of coefficients."""
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
         ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
@@ -232,7 +234,7 @@ class _Surface(NamedTuple):
 
 
 class PreparedSurfaces(Prepared):
-    """The values that `Registration` computes once per problem.
+    """The result of `Registration.prepare`, computed once per problem.
 
     **Attributes:**
 
@@ -261,9 +263,9 @@ class Deformation(NamedTuple):
     - `own`: the coefficients of the surface's positions (k_x, 3), zero for inactive eigenvectors.
     - `matched`: the coefficients of the positions, normals and eigenfunctions of the matches (k_x, d), zero
       for inactive eigenvectors.
-    - `moments`: the coefficients (k_x, 24) of quantities after heat flow. The quantities are positions,
-      matched positions, the products of positions with matched positions, and the products of normals with
-      matched normals.
+    - `moments`: the coefficients (k_x, 24) of 24 functions that heat flow has smoothed. The functions are
+      positions, matched positions, the products of positions with matched positions, and the products of
+      normals with matched normals.
     """
 
     own: Float[Array, "k_x 3"]
@@ -278,7 +280,7 @@ class Deformation(NamedTuple):
         matches: Int[Array, " s"],
         active: Bool[Array, " k_x"],
     ) -> Deformation:
-        """Computes the deformation of a surface onto another surface from the matches of its vertices.
+        """Computes the deformation of one surface onto another surface from given matches.
 
         **Arguments:**
 
@@ -335,9 +337,8 @@ def _product_space(
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-    The points of a vertex x of X and a vertex y of Y are close to each other if both deformations match the
-    two vertices. This means that the deformed x is close to y on Y, and that the deformed y is close to x on
-    X.
+    A vertex x of X and a vertex y of Y have nearby points under two conditions: the deformed x is close to y
+    on Y, and the deformed y is close to x on X.
     """
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
@@ -353,7 +354,8 @@ def _without_missing_parts(
 ) -> tuple[_Surface, _Surface]:
     """Returns both surfaces, with the vertex weights of `partial_matching_weights`.
 
-    The residuals are the squared distances between matched points of the joint space, without descriptors.
+    The residuals are the squared distances between matched points of the joint space. Descriptors do not
+    contribute to these distances.
     """
     x, y = prepared.x, prepared.y
     no_descriptors = jnp.zeros_like(state.descriptor_weight)
@@ -372,8 +374,8 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
     """
     own, matched = moments[:, :3], moments[:, 3:6]
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
-    # In the tangent plane, the variance of positions under heat flow is twice the heat time. The division
-    # scales this variance to 1, which is the squared length of normals.
+    # Heat flow gives positions in the tangent plane a variance of twice the heat time. The division scales
+    # this variance to 1, which equals the squared length of a unit normal.
     covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
     mirrored = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
     sign = jnp.where(mirrored, -1, 1).astype(covariance.dtype)
@@ -415,5 +417,6 @@ def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
     units = np.arange(4)
     multiplication = np.zeros((4, 4, 4))  # the product of two quaternion units is plus or minus a unit
     multiplication[units[:, None], units, units[:, None] ^ units] = signs
-    rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])  # v -> q v q*
+    # A unit quaternion q rotates a vector v to q v q*.
+    rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])
     return rotations[1:, 1:].reshape(9, 16)

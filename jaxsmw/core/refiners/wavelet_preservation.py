@@ -23,7 +23,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class PreparedWavelets(Prepared):
-    """The values that `WaveletPreservation` computes once per problem.
+    """The result of `WaveletPreservation.prepare`, computed once per problem.
 
     **Attributes:**
 
@@ -48,16 +48,17 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
 
     - `bank`: the filter bank, a `FilterBank`. The default is `Meyer()`, the Parseval frame of the MWP paper.
     - `solution`: the `Solution` that computes the functional map from a pointwise map. `Filtering()` (the
-      default) is equation (8) of the MWP paper, which is meant for Parseval frames. `LeastSquares()` computes
-      the exact minimiser of the energy for every frame. `RegularizedLeastSquares()` adds further terms to the
-      energy. `NearestOrthogonal()` makes the functional map of another solution orthogonal.
+      default) computes C by equation (8) of the MWP paper and is meant for Parseval frames. `LeastSquares()`
+      computes the exact minimiser of the energy for every frame. `RegularizedLeastSquares()` minimises a sum
+      of the energy and other terms, such as orthogonality. `NearestOrthogonal()` makes the functional map of
+      another solution orthogonal.
     - `convention`: the direction of the functional map C. A `"pullback"` (k_X, k_Y) takes functions on Y to
       functions on X. A `"pushforward"` (k_Y, k_X) takes functions on X to functions on Y, as in the notation
-      of the MWP paper. The pushforward is meant for study only, because it fails on real pairs. The docstring
-      of `spectral_embeddings` explains why.
+      of the MWP paper. The pushforward is meant for study only, because it fails on real pairs (see
+      `jaxsmw.core.pointwise_map.spectral_embeddings`).
     - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"` (the default), the bank ends at
-      the largest eigenvalue of each shape, so different sizes of the shapes have no effect. With `"common"`,
-      the bank ends at the same eigenvalue on both shapes: the larger of the two shapes' largest eigenvalues.
+      each shape's own largest eigenvalue. Scaling a shape then has no effect. With `"common"`, the bank ends
+      at the same eigenvalue on both shapes: the larger of the two shapes' largest eigenvalues.
     - `search`: the method of nearest-neighbour search. `"exhaustive"` compares all vertices of X with all
       vertices of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. For
       large shapes on a CPU, the search in patches is several times as fast, but its compilation takes some

@@ -1,7 +1,8 @@
 """Solutions: methods that compute a functional map from a pointwise map.
 
 The refiner `WaveletPreservation` uses a `Solution` in every iteration. The solutions minimise the
-wavelet-preservation energy exactly or approximately; `RegularizedLeastSquares` adds further terms.
+wavelet-preservation energy exactly or approximately. `RegularizedLeastSquares` minimises a sum of this energy
+and other terms.
 """
 
 from jaxsmw.core.functional_map import WaveletProblem

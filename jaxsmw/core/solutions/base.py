@@ -27,7 +27,8 @@ class Solution(eqx.Module, Generic[PreparedT]):
     ("out").
 
     A subclass may also define `prepare(problem)`. This method computes, once per refinement, values that
-    `solve` needs in every iteration. The type parameter of `Solution` is the type of these values.
+    `solve` needs in every iteration. The class is generic in the type of these values: `Solution[T]` if their
+    type is T.
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:

@@ -24,7 +24,7 @@ from jaxsmw.core.solutions.base import PreparedT, Solution
 
 
 class PreparedFiltering(NamedTuple):
-    """The values that `Filtering` prepares.
+    """The matrices that `Filtering` computes before the iterations.
 
     **Attributes:**
 

@@ -84,10 +84,11 @@ class RegularizedLeastSquares(Solution[None]):
     - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` in the following cases: a weight or the tolerance is not a single positive
-    number; `max_steps` is below 1; `norm` is unknown; neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight; descriptors are given without a weight, or a weight without
-    descriptors; descriptor commutativity has a weight, but the descriptors on X or Y have no operators.
+    **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
+    `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
+    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given, but neither descriptor
+    term has a weight, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
+    `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -169,8 +170,8 @@ class RegularizedLeastSquares(Solution[None]):
 
         **Arguments:**
 
-        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. It must
-          be None if, and only if, this weight is None.
+        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. Give None
+          if the weight `wavelet_preservation` is None, and only then.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
           the shape that C maps from (k_in,). `descriptors.x` must belong to the shape that C maps to, as in
           the pullback convention.
@@ -193,7 +194,10 @@ class RegularizedLeastSquares(Solution[None]):
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
         initial: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Implements `solve` and `minimize`. The descriptors are in the order (out, in)."""
+        """Implements `solve` and `minimize`.
+
+        `descriptors` contains the descriptors of the shape that C maps to, and then those of the other shape.
+        """
         quadratic = self._quadratic_energy(
             energy, descriptors, (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
         )
@@ -273,7 +277,7 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the sum of the squared residuals. The solver iterates on `C / unit`.
+        """Minimises the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
 
         Returns the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
 

@@ -1,25 +1,24 @@
 """BCICP: refines the maps X -> Y and Y -> X together, to make them bijective and continuous.
 
 This module reconstructs the method in section 5 of Ren, Poulenard, Wonka, Ovsjanikov, *Continuous and
-orientation-preserving correspondences via functional maps*, ACM Transactions on Graphics 37(6), 2018. Neither
-the authors' program nor the text of the paper was available for this reconstruction. The reconstruction
-follows the steps of the paper. If a step may differ from the paper, the docstring of its function says "our
-choice". One iteration consists of four steps:
+orientation-preserving correspondences via functional maps*, ACM Transactions on Graphics 37(6), 2018. This
+implementation was written without the authors' program and without the text of the paper. If a step may
+differ from the paper, the docstring of its function says "our choice". One iteration consists of four steps:
 
 1. `_bijective_step`: spectral ICP improves both maps together.
 2. `_improve_coverage`: vertices without a preimage receive a preimage from the reverse map, if possible.
    Steps 1 and 2 run twice in each iteration.
-3. `_smooth`: the positions of the images of neighbouring vertices are averaged.
-4. `_repair`: the vertices of small regions receive new images. Such a region is separated from the rest of
-   the shape by discontinuous edges. The new images are interpolated from the images of the surrounding
-   vertices.
+3. `_smooth`: the images of adjacent vertices are averaged.
+4. `_repair`: vertices in small, separate regions of a shape receive new images. Discontinuous edges separate
+   such a region from the rest of the shape. The new images are interpolated from the images of the
+   surrounding vertices.
 
 After the last iteration `_improve_coverage` runs once more, because steps 3 and 4 reduce coverage.
 
-The reconstruction has larger errors than the authors' program, although both start from the authors' initial
+This implementation has larger errors than the authors' program, although both start from the authors' initial
 maps. On the 45 non-isometric TOSCA pairs, the mean geodesic error is 0.373 for the initial maps, 0.169 for
-the reconstruction, and 0.110 for the maps that the authors published. On 5 of the 45 pairs, the
-reconstruction has a smaller error than the published maps. The number of iterations, the number of smoothing
+this implementation, and 0.110 for the maps that the authors published. On 5 of the 45 pairs, this
+implementation has a smaller error than the published maps. The number of iterations, the number of smoothing
 rounds and the order of the steps were chosen for small errors on 8 of the 45 pairs.
 
 `BCICP` has the settings of the benchmark: 50 eigenvectors and 10 iterations.
@@ -65,13 +64,12 @@ class _Surface:
 
     **Attributes:**
 
-    - `vertices`: the indices of the n remaining vertices in the mesh (n,).
+    - `vertices`: for each of the n vertices, its index in the mesh (n,).
     - `positions`: the positions of these vertices (n, 3), scaled such that the shape has area 1.
     - `edges`: the ends of each edge (e, 2).
     - `component`: the index of the connected component that contains each vertex (n,).
-    - `near`: a sparse Boolean matrix (n, n), True for two vertices whose distance along edges is at most the
-      larger of 0.1 and twice the mean edge length. An edge of the other shape is continuous if `near` is True
-      for the images of its ends.
+    - `near`: a sparse Boolean matrix (n, n), True for two vertices that are near each other. Their distance
+      along edges is then at most 0.1, or at most twice the mean edge length.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -140,14 +138,15 @@ def bcicp(
       connected components, non-manifold edges and unreferenced vertices are allowed.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not, with the same number of eigenvectors.
       The benchmark uses 50 eigenvectors.
-    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. Padded maps may have more
-      entries.
+    - `map_xy`, `map_yx`: the initial maps X -> Y (m,) and Y -> X (n,), 0-based. A padded map may have more
+      entries than its mesh has vertices.
     - `iterations`: the number of iterations, at least 1.
     - `smoothing`: the number of smoothing rounds in the first iteration, at least 0. The number of rounds
       decreases to 1 in the last iteration. If `smoothing` is 0, no map is smoothed.
 
     **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and
-    masked vertices keep their initial images. No other vertex is mapped to an unreferenced or masked vertex.
+    masked vertices keep their initial images. The images of all other vertices are referenced, unmasked
+    vertices.
 
     **Raises:** `InputError` if `iterations` or `smoothing` is too small, if the arguments do not fit each
     other, or if an initial map sends a vertex to an unreferenced, masked or missing vertex.
@@ -179,8 +178,9 @@ def bcicp(
 def _schedule(iterations: int, smoothing: int) -> list[int]:
     """Returns the number of smoothing rounds of each iteration.
 
-    The number of rounds decreases geometrically to 1 (our choice). Many rounds in the first iterations remove
-    the folds of a poor initial map. Many rounds in every iteration would shrink limbs.
+    The number of rounds decreases geometrically, and is 1 in the last iteration (our choice). Many rounds in
+    the first iterations remove the folds of a poor initial map. Many smoothing rounds in every iteration
+    would shrink limbs.
     """
     if smoothing == 0:
         return [0] * iterations
@@ -249,12 +249,14 @@ def _bijective_step(
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
     The functional map of a closed cycle is the identity, so `C_XX = C_XY C_YX` should be the identity. In
-    each of the two equations, the second C is a rotation times the first C. The rotation closes the cycle.
+    each of the two equations, the second C is the first C, multiplied from the left by C_XX^T or C_YY^T. If
+    `C_XX = C_XY C_YX`, this factor turns the cycle into the identity: `C_XX^T C_XY C_YX = I`.
 
-    The embeddings of the four conditions are concatenated with equal weights, and one search for nearest
-    neighbours gives the new map X -> Y. A second search, with queries and targets exchanged, gives the new
-    map Y -> X. The equal weights and the form of the cycle conditions are our choice. On six pairs the
-    alternative condition `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps.
+    Each condition compares an embedding of X with an embedding of Y. The four embeddings of each shape are
+    concatenated with equal weights. One search for nearest neighbours between the concatenated embeddings
+    gives the new map X -> Y. A second search, with queries and targets exchanged, gives the new map Y -> X.
+    The equal weights and the form of the cycle conditions are our choice. On six pairs, the cycle condition
+    `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps.
     """
     phi_x, phi_y = x.eigenvectors, y.eigenvectors
     dual_x, dual_y = phi_x * x.areas[:, None], phi_y * y.areas[:, None]
@@ -286,11 +288,11 @@ def _improve_coverage(
 
 
 def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int) -> Int64[np.ndarray, " m"]:
-    """Averages the positions of the images of neighbouring vertices, then takes the nearest vertices of Y.
+    """Smooths the map X -> Y by averaging the images of adjacent vertices.
 
-    In each round, the position of every image becomes the mean of this position and the positions of the
-    images of neighbouring vertices. Positions are moved to vertices of Y only after the last round, because
-    displacements shorter than an edge would otherwise be lost. The uniform weights are our choice.
+    In each round, the image of each vertex moves to the mean of this image and the images of all adjacent
+    vertices. Images are moved to the nearest vertices of Y only after the last round, because displacements
+    shorter than an edge would otherwise be lost. The uniform weights are our choice.
     """
     if rounds == 0:
         return t_xy
@@ -305,8 +307,8 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
     """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
-    Two vertices of Y are far apart if `y.near` is False for them. The thresholds and the distance along edges
-    are our choice.
+    Two vertices of Y are far apart if `y.near` is False for them. The thresholds, and the measurement of
+    distances along edges, are our choice.
     """
     tail, head = t_xy[x.edges].T
     return ~np.asarray(y.near[tail, head], dtype=bool).ravel()
@@ -316,8 +318,8 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
     """Returns a mask (m,) of the outliers, which are the vertices in small regions of X.
 
     A region is a connected component of the graph of continuous edges. A region is small if its area is less
-    than 5 % of the area of X (our choice). The region of a whole limb is larger, and is corrected only by
-    `_bijective_step`. The largest region of each connected component of X contains no outliers.
+    than 5 % of the area of X (our choice). A mismatched limb forms a larger region, which only
+    `_bijective_step` corrects. The largest region of each connected component of X contains no outliers.
     """
     _, region = connected_components(x.adjacency(~_discontinuous_edges(x, y, t_xy)), directed=False)
     area = np.bincount(region, weights=x.areas)

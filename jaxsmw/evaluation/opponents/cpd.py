@@ -67,7 +67,7 @@ from jaxsmw.evaluation.opponents.presets import Refined
 # The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
 # EM stops when the variance s falls below this threshold, which Myronenko's program also uses. For point sets
-# of unit variance, a variance below this threshold is a rounding error.
+# of unit variance, a variance below `_LEAST_VARIANCE` is due to rounding.
 _LEAST_VARIANCE = 1e-8
 
 
@@ -106,9 +106,9 @@ def coherent_point_drift(
     points from their mean is then 1. The docstring of this module contains the equations. The default values
     are those of Myronenko's program, except for the rank. Myronenko's program uses the exact kernel matrix by
     default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
-    5000 vertices show the effect of the rank. With 30 eigenvectors, the errors for the ranks 70, 300 and 1200
-    are 22.4, 20.8 and 20.8 x 10^-3. With 100 eigenvectors, the errors for the ranks 150, 600 and 1200 are
-    17.2, 11.4 and 11.3 x 10^-3.
+    5000 vertices show the effect of the rank. With 30 eigenvectors, the mean geodesic error is 22.4 x 10^-3
+    at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200. With 100 eigenvectors, the mean geodesic error is
+    17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank 1200.
 
     **Arguments:**
 
@@ -146,9 +146,9 @@ def kernel_factor(
     """Returns a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
 
     Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. L is computed by a pivoted
-    Cholesky factorisation that stops at the given rank. Each step eliminates the point with the largest
-    residual on the diagonal. The eliminated points are spread over the whole set, and their choice is
-    deterministic. The result is the Nyström approximation from these points. The factorisation computes
+    Cholesky factorisation that stops at the given rank. Each step selects the point whose diagonal entry is
+    approximated worst. The selected points are spread over the whole set, and their selection is
+    deterministic. `L L^T` is the Nyström approximation from the selected points. The factorisation computes
     `rank` rows of the kernel matrix, and needs about `n rank^2` operations.
 
     **Arguments:**
@@ -227,15 +227,16 @@ class DriftRecovery(WaveletPreservation):
 
     Without a filter (the default), the functional map is the least-squares solution `Phi_X^+ P Phi_Y`, which
     is not orthogonal. A single iteration performs the recovery of Rodolà, Moeller and Cremers (2015). Several
-    iterations perform the refinement in the same paper, which updates the functional map and the pointwise
-    map alternately. The paper's formula for the functional map was not available for this reconstruction, so
-    least squares is our choice.
+    iterations perform the refinement of the same paper: they update the functional map and the pointwise map
+    alternately. The paper's formula for the functional map was not available to us, so least squares is our
+    choice.
 
     **Arguments:** the arguments of `WaveletPreservation`, and the following arguments.
 
     - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
 
-    **Raises:** `ValueError` if `convention` is `"pushforward"`; and the errors of `WaveletPreservation`.
+    **Raises:** `ValueError` if `convention` is `"pushforward"`. The other errors are those of
+    `WaveletPreservation`.
     """
 
     bank: FilterBank = Identity()
@@ -245,7 +246,7 @@ class DriftRecovery(WaveletPreservation):
     def __check_init__(self) -> None:
         if self.convention != "pullback":
             raise ValueError(
-                f"DriftRecovery moves Phi_Y C^T, for which C must be a pullback, but the convention is "
+                f"DriftRecovery needs a functional map in the pullback convention, but the convention is "
                 f"{self.convention}: use pullback"
             )
 

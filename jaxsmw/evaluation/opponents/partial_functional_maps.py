@@ -1,8 +1,8 @@
 r"""Partial functional maps: finds a functional map and the region of Y that X covers.
 
 This module reconstructs the method of Rodolà, Cosmo, Bronstein, Torsello, Cremers, *Partial functional
-correspondence*, Computer Graphics Forum 36(1), 2017. Neither the authors' program nor the text of the paper
-was available for this reconstruction. The formula of the weights W was written from memory.
+correspondence*, Computer Graphics Forum 36(1), 2017. This implementation was written without the authors'
+program and without the text of the paper. The formula of the weights W was written from memory.
 
 X is the partial shape, and Y is the full shape. Functions F on X correspond to functions G on Y, but only
 inside the region of Y that X covers. A membership function v on Y describes the region: eta(v) is near 1
@@ -20,45 +20,44 @@ which is the transpose of the paper's C. The paper minimises the following energ
 
 The first line of the energy is the fidelity term. The second line regularises the functional map, and the
 third line regularises the region. The weights W grow with the distance from a slanted diagonal of C. The
-slope of this diagonal is `r / k`, where the r-th eigenvalue of X is about as large as the k-th eigenvalue of
-Y. The slope of the diagonal is approximately the area of X divided by the area of Y. The number d_i is 1 for
-i <= r and 0 for larger i.
+slope of this diagonal is `r / k`. Here k is the number of eigenvectors of Y, and the r-th eigenvalue of X is
+about as large as the k-th eigenvalue of Y. The slope of the diagonal is approximately the area of X divided
+by the area of Y. The number d_i is 1 for i <= r and 0 for larger i.
 
-The reconstruction differs from the paper in the following points.
+This implementation differs from the paper in the following points.
 
-- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. In the
-  reconstruction, the first C is the functional map of the initial map, because all compared methods start
-  from the initial map.
+- **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. In this
+  implementation, the first C is computed from the initial map, from which all compared methods start.
 - **Iterations.** A few steps of spectral ICP follow each minimisation over C. Each step makes the rows of C
   orthonormal, like the final refinement in the paper. Without steps of spectral ICP, the computed regions are
-  wrong. On three real pairs, the intersection over union of the computed and the true region is 39, 21 and
-  21 % without these steps, and 83, 81 and 43 % with these steps.
+  wrong. The computed region was compared with the true region on three real pairs. The intersection over
+  union of both regions is 39, 21 and 21 % without spectral ICP, and 83, 81 and 43 % with spectral ICP.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
-  [0, 1]. A minimisation that starts from v = 1 or from the previous v does not correct wrong regions, because
-  the derivative of eta nearly vanishes where v is near 0 or 1.
+  [0, 1]. If a minimisation starts from v = 1 or from the previous v, it does not correct wrong regions. The
+  reason is that the derivative of eta nearly vanishes where v is near 0 or 1.
 - **Descriptors.** The last column of F and of G is the constant function 1. The other columns are the first
   principal components of the SHOT descriptors of both shapes, scaled to mean square 1. The paper uses all 352
   entries of the SHOT descriptors as columns. SHOT entries are nonnegative, so every column in the paper has a
-  large constant part. In the reconstruction, the constant function has as much weight as all principal
+  large constant part. In this implementation, the constant function has as much weight as all principal
   components together. The number of components has little effect between 10 and 30. With 100 components, the
   energy of the true functional map and region is higher than the energy of C = 0.
 - **Rank.** Only the r nonzero columns of the paper's C are stored.
-- **Length.** The function xi is 1, so the term of mu_5 is the total variation of v. In the paper, xi(v)
-  vanishes unless v is near 1/2.
-- **Weights.** Y has area 1, and column norms are averaged instead of summed, so the weights have other units
-  than in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published values, and the fidelity
-  term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real pairs. No other value of mu_4
-  was tested.
+- **Length.** This implementation sets xi to 1. The term with the weight mu_5 is then the total variation of
+  v. In the paper, xi(v) vanishes unless v is near 1/2.
+- **Weights.** Y has area 1, and column norms are averaged instead of summed. The units of the weights
+  therefore differ from those in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published
+  values, and the fidelity term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real
+  pairs. No other value of mu_4 was tested.
 - **Recovery.** The nearest-neighbour search includes all vertices of Y. A search among only the vertices of
   the region gave the same maps, or worse maps if the region was wrong.
 - **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
   number of steps. The variable v is scaled by the square roots of the vertex areas. All norms are smoothed at
   zero.
 
-The reconstruction was tested on 12 pairs of SHREC'16 that were not used to choose weights. On 6 pairs with
-cuts, the mean geodesic error is 0.135 for the initial maps, 0.015 for the reconstruction, and 0.011 for MWP
+This implementation was tested on 12 pairs of SHREC'16 that were not used to choose weights. On 6 pairs with
+cuts, the mean geodesic error is 0.135 for the initial maps, 0.015 for this implementation, and 0.011 for MWP
 from the same initial maps. On 6 pairs with holes, the mean geodesic error is 0.160 for the initial maps,
-0.018 for the reconstruction, and 0.017 for MWP.
+0.018 for this implementation, and 0.017 for MWP.
 
 `PARTIAL_FUNCTIONAL_MAPS` has the settings of the benchmark: 100 eigenvectors, 15 descriptors and 5
 iterations. Functional maps have the pullback convention of `jaxsmw.core.functional_map`.
@@ -98,8 +97,8 @@ REGION_WEIGHTS = (10.0, 0.01)
 
 # The rate at which the slanted weights decay towards high frequencies (sigma of W in the paper).
 _DECAY = 0.03
-# Norms of columns and of gradients are smoothed below this threshold. The threshold is 0.1 % of the norm of a
-# descriptor, and 0.1 % of the gradient of a function that changes by 1 across Y.
+# `_smoothed_norm` smooths the norms of columns and of gradients below this threshold. A descriptor has a norm
+# of about 1, and a function that changes by 1 across Y has a gradient of about 1.
 _SMOOTHING = 1e-3
 # The largest numbers of L-BFGS steps in a minimisation over C and in a minimisation over v.
 _MAP_STEPS, _REGION_STEPS = 100, 60
@@ -107,7 +106,7 @@ _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
 
 class SurfaceGradient(eqx.Module):
-    """The gradient of piecewise linear functions on a mesh, in the unit of length of a spectrum.
+    """The gradient operator for piecewise linear functions on a mesh.
 
     **Attributes:**
 
@@ -124,7 +123,7 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Returns the gradient on a mesh, in the unit of length of its spectrum.
+        """Returns the gradient operator of a mesh. Lengths are in the unit of length of the spectrum.
 
         **Arguments:**
 
@@ -202,15 +201,16 @@ def partial_functional_map(
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the unit of length in which Y has area 1, cut to
       their common range of eigenvalues (`jaxsmw.pair.common_range`). After this cut, the number k_X of
       eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors
-      of X are used. Both spectra need the same number of comparable descriptors, scaled to mean square 1.
+      of X are used. Both spectra need the same number of descriptors. The descriptors of X and Y must be
+      comparable, and scaled to mean square 1.
     - `gradient_y`: the gradient of functions on Y, in the unit of length in which Y has area 1.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `iterations`: the number of iterations, at least 1. Each iteration minimises the energy over C, then
       over v.
     - `icp_steps`: the number of steps of spectral ICP after each minimisation over C.
 
-    **Returns:** A `PartialMap`. NaN and infinite numbers raise no error, so check the status code in its
-    attribute `result`.
+    **Returns:** A `PartialMap`. No error is raised for NaN or infinite numbers, so check the attribute
+    `result` of the `PartialMap`.
 
     **Raises:** `ValueError` if `iterations` is less than 1, if a spectrum has no descriptors, or if the
     numbers of descriptors differ.
@@ -231,8 +231,8 @@ def partial_functional_map(
     state, _ = lax.scan(iterate, (initial, energies.covered(initial)), None, length=iterations)
     functional_map, membership = state
     region = jnp.where(spectrum_y.mask, eta(membership), 0)
-    # If an energy overflows, the minimisations leave C and v unchanged. Only the value of the energy shows
-    # that the computation failed.
+    # If an energy overflows, the minimisations leave C and v unchanged. C and v are then finite, so the
+    # fidelity term is checked as well.
     left = fidelity(functional_map, energies.coefficients_x, energies.inside(membership))
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
@@ -242,11 +242,12 @@ def partial_functional_map(
 
 
 class _Energies(eqx.Module):
-    """The energies of one pair, with methods that minimise them over C and over v.
+    """The data of one pair, with methods that minimise the energy over C and over v.
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. X has r eigenvectors, at most k_Y.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. The spectrum of X contains r eigenvectors, and r is
+      at most k_Y.
     - `gradient_y`: the gradient of functions on Y.
     - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
     - `coefficients_x`: A (r, functions), the coefficients of the descriptors and of the constant function on
@@ -302,7 +303,7 @@ class _Energies(eqx.Module):
     def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
         """Minimises the energy over the membership function for a fixed `c`, starting from `covered(c)`."""
         area_x = jnp.sum(self.spectrum_x.vertex_areas)
-        # The solver minimises over u = v sqrt(vertex area), which makes the solver nearly independent of the
+        # The solver minimises over u = v sqrt(vertex area), so its convergence is nearly independent of the
         # mesh density.
         metric = jnp.sqrt(jnp.where(self.spectrum_y.mask, self.spectrum_y.vertex_areas, 1))
 
@@ -343,8 +344,8 @@ def fidelity(
 ) -> Float[Array, ""]:
     """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
 
-    The last column of the matrix `C A - B` belongs to the constant function. The fidelity term is the norm of
-    this column plus the mean norm of all other columns, which belong to descriptors.
+    The last column of the matrix `C A - B` belongs to the constant function, and each other column belongs to
+    a descriptor. The fidelity term is the norm of the last column plus the mean norm of the other columns.
 
     **Arguments:**
 
@@ -384,14 +385,15 @@ def region_energy(
 ) -> Float[Array, ""]:
     """Returns the energy that regularises the region: the weighted terms of mu_4 and mu_5.
 
-    The term of mu_4 keeps the area of the region close to the area of X. The term of mu_5 keeps the boundary
-    of the region short.
+    The term with the weight mu_4 keeps the area of the region close to the area of X. The term with the
+    weight mu_5 keeps the boundary of the region short.
 
     **Arguments:**
 
     - `membership`: the membership function v on Y (n,).
-    - `area_x`: the area of X, in the unit in which Y has area 1.
-    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient on Y, in the unit in which Y has area 1.
+    - `area_x`: the area of X, divided by the area of Y.
+    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient operator of Y, in the unit of length in
+      which Y has area 1.
     """
     area, length = REGION_WEIGHTS
     missing = area_x - jnp.sum(spectrum_y.vertex_areas * eta(membership))

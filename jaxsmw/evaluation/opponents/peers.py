@@ -4,9 +4,9 @@ The methods need optional packages, and are available only if these packages are
 
     pip install 'jaxsmw[benchmark,peers]'
 
-The methods receive the same spectra and initial maps as all other methods, and run on the same number of
-cores. Both methods use the settings of the ZoomOut paper (see `zoomout`): the number of eigenvectors k is 20,
-25, ..., 120, and every iteration uses all vertices.
+`PyFM` and `Geomfum` receive the same spectra and initial maps as all other compared methods, and run on the
+same number of cores. Both methods use the settings of the ZoomOut paper (see `zoomout`): the number of
+eigenvectors k is 20, 25, ..., 120, and every iteration uses all vertices.
 
 - `PyFM` calls the function `zoomout_refine` of Robin Magnet's pyFM (`pyfmaps` on the package index) with
   `n_jobs=1`.

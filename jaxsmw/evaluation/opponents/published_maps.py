@@ -26,7 +26,8 @@ class PublishedMaps(Method):
     **Attributes:**
 
     - `directory`: the directory that contains the files `X_Y.map`.
-    - `number_of_eigenvectors`: 1, the smallest number, because the method uses no eigenvectors.
+    - `number_of_eigenvectors`: 1, because a benchmark computes at least one eigenvector. The method itself
+      uses no eigenvectors.
     """
 
     directory: Path
@@ -34,7 +35,7 @@ class PublishedMaps(Method):
 
     @property
     def reference(self) -> str:  # type: ignore[override]
-        """The text that is printed with the results, which contains the name of the directory."""
+        """The text that is printed with the results. It contains the name of the directory."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:

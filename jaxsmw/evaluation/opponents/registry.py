@@ -54,10 +54,10 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     **Arguments:**
 
     - `names`: names of known methods, or paths of directories with maps of other programs (files named
-      `X_Y.map`). Repeated names are used once.
+      `X_Y.map`). Duplicate names are ignored.
 
-    **Returns:** A dictionary from names to methods. For a directory with maps, the name of the method is the
-    name of the directory.
+    **Returns:** A dictionary from the name of each method to the method. For a directory with maps, the name
+    of the method is the name of the directory.
 
     **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would have
     the same name.
