@@ -13,6 +13,9 @@ DEFAULT_PRESET: PresetName = "accurate"
 InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional", "aligned"]
 """The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
+MatchInit = Literal["auto", InitialMap]
+"""The names that `jaxsmw.match` accepts; `"auto"` chooses between `"shot"` and `"aligned"`."""
+DEFAULT_MATCH_INIT: MatchInit = "auto"
 
 Mirror = Literal["auto", "no", "yes"]
 """Whether the mirror image of the source is matched instead of the source; see `jaxsmw.match`."""

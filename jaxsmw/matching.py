@@ -16,7 +16,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MIRROR, DEFAULT_PRESET, Eigensolver, Laplacian, Mirror
+from jaxsmw.choices import (
+    DEFAULT_INITIAL_MAP,
+    DEFAULT_MATCH_INIT,
+    DEFAULT_MIRROR,
+    DEFAULT_PRESET,
+    Eigensolver,
+    Laplacian,
+    MatchInit,
+    Mirror,
+)
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
@@ -27,7 +36,6 @@ from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
-from jaxsmw.initial_maps import InitialMap
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
@@ -60,6 +68,8 @@ class Correspondence:
     - `functional_map`: the functional map of the last iteration, a property. Its shape is (k_X, k_Y) for a
       pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
     - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
+    - `init`: the name of the initial map, such as `"shot"`; None if a map or landmarks were given. If repair
+      chose an alternative initial map, `initial_map` is the alternative.
     - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
       the stages of a preset differ from the stages in `PRESETS`; see `match`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the k_X and k_Y eigenvectors of the last stage.
@@ -88,6 +98,7 @@ class Correspondence:
     pair: Pair
     pointwise_map: Int64[np.ndarray, " m"]
     initial_map: Int64[np.ndarray, " m"]
+    init: str | None
     preset: Preset
     spectrum_x: Spectrum
     spectrum_y: Spectrum
@@ -307,7 +318,7 @@ def match(
     mesh_y: Mesh | MeshLike,
     *,
     preset: PresetName | Preset | Stage | Sequence[Stage] = DEFAULT_PRESET,
-    init: InitialMap | ArrayLike | SurfacePoints = DEFAULT_INITIAL_MAP,
+    init: MatchInit | ArrayLike | SurfacePoints = DEFAULT_MATCH_INIT,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
@@ -338,7 +349,10 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"shot"` (the default), `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
+        - `"auto"` (the default): `"shot"`. If both shapes differ from their own mirror images, as teeth do,
+          and `partial` is False, then `"shot"` and `"aligned"` are both refined. The map with the smaller
+          mean `expected_error` is returned.
+        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
           the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative initial maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
@@ -393,9 +407,10 @@ def match(
 
     of_one_hand = pair.mirrored() if mirror == "yes" else pair
     compiling = _compile_ahead(pair, chosen, history)
+    automatic = isinstance(init, str) and init == "auto"
     prepare_hand = functools.partial(
         prepare,
-        init=init,
+        init=DEFAULT_INITIAL_MAP if automatic else init,
         laplacian=laplacian,
         eigensolver=eigensolver,
         number_of_eigenvectors=chosen.number_of_eigenvectors,
@@ -406,20 +421,38 @@ def match(
     prepared = prepare_hand(of_one_hand)
     seconds = dict(prepared.seconds)
     decision = Decision(mirror == "yes")
-    if mirror == "auto" and not partial:
+    if (mirror == "auto" or automatic) and not partial:
         with timed("mirror test", seconds):
-            decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide()
-        if decision.mirrored:
+            decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide(mirror)
+        if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
             prepared = prepare_hand(pair.mirrored())
             seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
+    starts = [prepared]
+    if automatic and decision.asymmetric:
+        with timed("initial map", seconds):
+            starts.append(prepared.started_from("aligned"))
     if prepared.spectrum_x.descriptors is None:
         chosen = chosen.without_descriptors()
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
-        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
-        jax.block_until_ready(outcome.refinements[-1])
-    return _correspondence(pair, prepared, chosen, outcome, seconds, decision)
+        outcomes = [
+            refine_in_stages(start, chosen.stages, chosen.repair, history=history) for start in starts
+        ]
+        jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
+    # A failed outcome counts only if all outcomes failed.
+    candidates = [
+        (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
+    ] or [(prepared, outcomes[0])]
+    found = [
+        _correspondence(pair, start, chosen, outcome, seconds, decision) for start, outcome in candidates
+    ]
+    best = 0
+    if len(found) > 1:
+        with timed("expected error", seconds):
+            best = int(np.argmin([one.expected_error().mean() for one in found]))
+    _warn_if_suspicious(*candidates[best], chosen, decision)
+    return found[best]
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -444,7 +477,7 @@ def _correspondence(
     seconds: dict[str, float],
     decision: Decision,
 ) -> Correspondence:
-    """Make the result of `match`, and issue a warning if the result is suspicious.
+    """Make the result of `match`.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -452,11 +485,6 @@ def _correspondence(
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
-    if outcome.suspicious:
-        assert preset.repair is not None
-        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
-    if decision.doubtful:
-        warnings.warn(_doubt(pair, decision), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -464,6 +492,7 @@ def _correspondence(
         pair=pair,
         pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
+        init=prepared.init if isinstance(prepared.init, str) else None,
         preset=preset,
         spectrum_x=spectrum_x.reflect() if decision.mirrored else spectrum_x,
         spectrum_y=spectrum_y,
@@ -475,6 +504,14 @@ def _correspondence(
         mirror_evidence=decision.evidence,
         seconds=seconds,
     )
+
+
+def _warn_if_suspicious(prepared: PreparedPair, outcome: Outcome, preset: Preset, decision: Decision) -> None:
+    if outcome.suspicious:
+        assert preset.repair is not None
+        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
+    if decision.doubtful:
+        warnings.warn(_doubt(prepared.pair, decision), stacklevel=3)
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:

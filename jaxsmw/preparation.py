@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import jax
@@ -64,6 +64,14 @@ class PreparedPair:
     initial_map: Int64[np.ndarray, " m"]
     samples: Samples | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def started_from(self, init: InitialMap) -> PreparedPair:
+        """Return the prepared pair with the initial map of another name.
+
+        **Raises:** As `jaxsmw.initial_map`.
+        """
+        start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init)
+        return replace(self, init=init, initial_map=start)
 
     @cached_property
     def padded(self) -> tuple[Spectrum, Spectrum]:

@@ -1,11 +1,13 @@
 """Rigid alignment, and the initial map that uses it."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw import Pair, initial_map, make_mesh, match, paired_spectra
+from jaxsmw import Pair, creature_pair, initial_map, make_mesh, match, matching, paired_spectra
+from jaxsmw.core.results import RESULTS
 from jaxsmw.geometry.alignment import align_rigidly
 
 LUMP = bumpy_mesh(3)
@@ -53,3 +55,45 @@ def test_mirrored_shapes_are_aligned_as_their_mirror_images():
     target = make_mesh(image.vertices, image.faces)
     found = match(LUMP, target, preset="paper", init="aligned", mirror="yes")
     np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
+
+
+def _expected(found):
+    return found.expected_error().mean()
+
+
+@pytest.mark.parametrize("mirror", ["auto", "no"])
+def test_asymmetric_shapes_are_matched_from_both_initial_maps(mirror):
+    """The lump differs from its mirror image, so `match` keeps the better of two maps."""
+    generator = np.random.default_rng(1)
+    noise = 0.004 * generator.normal(size=LUMP.vertices.shape)
+    target = make_mesh(Rotation.random(random_state=3).apply(LUMP.vertices + noise), LUMP.faces)
+    chosen = match(LUMP, target, preset="paper", mirror=mirror)
+    each = {init: match(LUMP, target, preset="paper", init=init, mirror="no") for init in ("shot", "aligned")}
+    best = min(each, key=lambda init: _expected(each[init]))
+    assert _expected(each["shot"]) != _expected(each["aligned"])
+    assert chosen.init == best
+    np.testing.assert_array_equal(chosen.pointwise_map, each[best].pointwise_map)
+    assert {"mirror test", "expected error"} <= chosen.seconds.keys()
+
+
+def test_bodies_are_matched_from_descriptors_alone():
+    pair = creature_pair(vertices=700)
+    found = match(pair.source, pair.target, preset="paper")
+    assert found.init == "shot" and "expected error" not in found.seconds
+
+
+def test_a_failed_refinement_does_not_hide_a_successful_one(monkeypatch):
+    """With two initial maps, `match` ignores an outcome that failed."""
+    real, failed = matching.refine_in_stages, []
+
+    def refine_in_stages(prepared, *arguments, **settings):
+        outcome = real(prepared, *arguments, **settings)
+        if prepared.init == "shot":
+            failed.append(prepared.init)
+            last = outcome.refinements[-1]
+            outcome.refinements[-1] = eqx.tree_at(lambda r: r.result, last, RESULTS.nonfinite_functional_map)
+        return outcome
+
+    monkeypatch.setattr(matching, "refine_in_stages", refine_in_stages)
+    found = match(LUMP, LUMP, preset="paper", mirror="no")
+    assert failed == ["shot"] and found.init == "aligned"

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
-from jaxsmw.choices import IndexBase, InitialMap
+from jaxsmw.choices import IndexBase, MatchInit
 from jaxsmw.cli.arguments import path
 from jaxsmw.cli.console import report_progress, say
 
@@ -83,8 +83,8 @@ def initial_map(text: str) -> str:
     if file and kind in ("landmarks", "map"):
         for name in initial_map_files(text):
             path(name)
-    elif text not in get_args(InitialMap):
-        choices = (*get_args(InitialMap), "landmarks:FILE", "landmarks:SOURCE_FILE,TARGET_FILE", "map:FILE")
+    elif text not in get_args(MatchInit):
+        choices = (*get_args(MatchInit), "landmarks:FILE", "landmarks:SOURCE_FILE,TARGET_FILE", "map:FILE")
         raise argparse.ArgumentTypeError(f"{text!r} is not an initial map: choose from {', '.join(choices)}")
     return text
 

@@ -6,13 +6,12 @@ import argparse
 from typing import TYPE_CHECKING, Any, get_args
 
 from jaxsmw.choices import (
-    DEFAULT_INITIAL_MAP,
+    DEFAULT_MATCH_INIT,
     DEFAULT_MIRROR,
     DEFAULT_PRESET,
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
     IndexBase,
-    InitialMap,
     Mirror,
     PresetName,
     Search,
@@ -61,15 +60,17 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--init",
         metavar="INITIAL_MAP",
         type=initial_map,
-        default=DEFAULT_INITIAL_MAP,
-        help=f"initial map: {', '.join(get_args(InitialMap))}, landmarks:FILE, "
+        default=DEFAULT_MATCH_INIT,
+        help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
-        "%(default)s). With shot, wks, hks and wavelet, each source vertex is matched to the target vertex "
-        "with the most similar descriptor. functional computes a functional map that preserves SHOT "
+        "%(default)s). auto is shot; for shapes that differ from their own mirror images, like teeth, auto "
+        "refines both shot and aligned, and keeps the map with the smaller expected error. With shot, wks, "
+        "hks and wavelet, each source vertex is matched to the target vertex with the most similar "
+        "descriptor. With aligned, each source vertex is matched to the nearest target vertex after a rigid "
+        "alignment. functional computes a functional map that preserves SHOT "
         "descriptors. A landmarks file has a source and a target vertex per line. Two landmark "
         "files contain named points on the source and on the target, in the formats of "
-        "transfer --landmarks. Of these initial maps, only shot, "
-        "functional and landmarks distinguish left from right",
+        "transfer --landmarks. wks, hks and wavelet do not distinguish left from right",
     )
     group.add_argument(
         "--preset",
@@ -167,7 +168,7 @@ def given_method(options: argparse.Namespace) -> list[str]:
     """Return the names of the given options that have no effect without a match, such as `--preset`."""
     given = _changes(options)
     given += ["--preset"] if options.preset else []
-    defaults = {"init": DEFAULT_INITIAL_MAP, "mirror": DEFAULT_MIRROR}
+    defaults = {"init": DEFAULT_MATCH_INIT, "mirror": DEFAULT_MIRROR}
     return given + [f"--{name}" for name, default in defaults.items() if getattr(options, name) != default]
 
 

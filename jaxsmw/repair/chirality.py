@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, Int64
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
+from jaxsmw.choices import Mirror
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.spectrum import Spectrum
@@ -69,27 +70,31 @@ class Hands:
         )
         self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
-    def decide(self) -> Decision:
+    def decide(self, mirror: Mirror = "auto") -> Decision:
         """Decide whether X or its mirror image is matched.
 
-        The mirror image is matched if the mean asymmetry of X and Y is large enough, and if the evidence
-        supports the mirror image.
+        With `mirror="auto"`, the mirror image is matched if the mean asymmetry of X and Y is large enough,
+        and if the evidence supports the mirror image. With `"yes"` and `"no"`, only the asymmetry is
+        computed.
 
-        **Returns:** The decision. If a shape has too few samples, X itself is matched.
+        **Returns:** The decision. If a shape has too few samples, X itself is matched with `"auto"`.
         """
         settings = self.settings
+        given = Decision(mirror == "yes")
         if min(len(shape.areas) for shape in (self.x, self.y)) < settings.fewest_samples:
-            return Decision(False)
+            return given
         try:
             with warnings.catch_warnings():
                 # SHOT warns if samples are sparse, but sparse samples only make the evidence less reliable.
                 warnings.simplefilter("ignore")
                 asymmetry = self.asymmetry()
+                if mirror != "auto":
+                    return given._replace(asymmetric=asymmetry >= settings.asymmetric_from)
                 if asymmetry < settings.asymmetric_from - settings.asymmetry_doubt:
-                    return Decision(False)
+                    return given
                 return decide(self.evidence(), asymmetry, settings)
         except InputError:  # the samples are too sparse for SHOT
-            return Decision(False)
+            return given
 
     def asymmetry(self) -> float:
         """Return the mean asymmetry of X and Y.
@@ -253,11 +258,13 @@ class Decision(NamedTuple):
     - `doubtful`: whether the decision is uncertain. If the shapes are asymmetric, True means that the
       evidence is near its threshold. If the asymmetry is slightly below its threshold, True means that the
       evidence supports the mirror image.
+    - `asymmetric`: whether the mean asymmetry of X and Y reaches its threshold.
     """
 
     mirrored: bool
     evidence: float | None = None
     doubtful: bool = False
+    asymmetric: bool = False
 
 
 def decide(
@@ -276,4 +283,4 @@ def decide(
     supported = evidence >= settings.mirrored_from
     asymmetric = asymmetry >= settings.asymmetric_from
     near = abs(evidence - settings.mirrored_from) < settings.doubt
-    return Decision(supported and asymmetric, evidence, near if asymmetric else supported)
+    return Decision(supported and asymmetric, evidence, near if asymmetric else supported, asymmetric)
