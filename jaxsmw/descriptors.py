@@ -19,29 +19,29 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import side_by_side
 
-# A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors do not
-# distinguish vertices at a distance of a few hundredths of the square root of the area, so 10 000 samples are
-# dense enough.
+# A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors cannot
+# distinguish two vertices that are a few hundredths of the square root of the area apart. Therefore 10 000
+# samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten or more
 # vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
-# Descriptors with a larger radius than usual vary slowly over the surface, so they are computed only at this
-# number of samples.
+# Descriptors with a radius above `SHOT_RADIUS` vary slowly over the surface. Therefore they are computed at
+# only about `_SPREAD` samples.
 _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
     """A shape with the vertices at which its descriptors are compared (the compared vertices).
 
-    On a large mesh, the compared vertices are samples. On any other mesh, descriptors of all vertices are
-    compared.
+    On a large mesh, descriptors are compared only at samples. On any other mesh, they are compared at all
+    vertices.
 
     **Attributes:**
 
     - `mesh`: the mesh with n vertices.
-    - `samples`: the samples, or None if all vertices are compared vertices.
-    - `spectrum`: the spectrum at the compared vertices.
+    - `samples`: the `SurfaceSamples` of the mesh, or None if descriptors are compared at all vertices.
+    - `spectrum`: the spectrum of the mesh, restricted to the compared vertices.
     """
 
     mesh: Mesh
@@ -64,10 +64,10 @@ class SampledShape(NamedTuple):
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """Return the row numbers of given vertices (v,) in arrays with one row per compared vertex.
+        """Return the row of each given vertex (v,) in arrays that have one row per compared vertex.
 
-        The row of a vertex is the row of the nearest sample. On a shape without samples, the row number of a
-        vertex is the vertex index itself.
+        A vertex that is not a sample shares the row of the nearest sample. On a shape without samples, the
+        row number of a vertex is the vertex index itself.
         """
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
@@ -92,7 +92,7 @@ class SampledPair(NamedTuple):
 
 
 def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
-    """Choose the vertices of both shapes at which descriptors are compared.
+    """Choose the vertices of X and of Y whose descriptors are compared with each other.
 
     On a mesh with more than 15 000 vertices, descriptors are compared at about 10 000 evenly spread samples.
     On any other mesh, descriptors are compared at all vertices.
@@ -176,7 +176,7 @@ def _shot_at_all_radii(
 def principal_components(
     values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, " n"], number: int
 ) -> Float[np.ndarray, "n d"]:
-    """Compute the first principal components of weighted rows, each scaled to a weighted mean square of 1.
+    """Compute the first principal components of weighted rows, scaled to weighted mean squares of 1.
 
     **Arguments:**
 

@@ -14,7 +14,8 @@ class InputError(ValueError):
 def check_choice(value: object, choices: Any, kind: str) -> None:
     """Raise an error if a value is not one of the choices.
 
-    `choices` is a `Literal` type. `kind` says what is chosen, with its article: "an eigensolver".
+    `choices` is a `Literal` type. `kind` describes a valid value in the message, with an article, such as "an
+    eigensolver".
 
     **Raises:** `InputError` if the value is not one of the choices; the message lists them.
     """

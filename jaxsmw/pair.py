@@ -73,7 +73,7 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The units of length on X and on Y, each as a length in the unit of its mesh.
+        """The unit of length for X and the unit of length for Y, each in the coordinates of its mesh.
 
         For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
         a difference in size. For a partial pair, both units are the square root of the larger area.
@@ -162,13 +162,14 @@ def paired_spectra(
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
     """Remove eigenpairs above the smaller of the two shapes' largest eigenvalues.
 
-    The MWP paper uses this rule for partial shapes.
+    The MWP paper truncates the spectra of partial shapes in the same way.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
 
-    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. At least one spectrum is unchanged.
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. The spectrum whose largest eigenvalue
+    is smaller is unchanged.
     """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)

@@ -84,7 +84,8 @@ class PreparedPair:
 
     def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
         """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # Refinement returns int32 maps. For a map of another type, JAX would compile another program.
+        # The map is converted to int32, the type that refinement returns. For another type, JAX would compile
+        # a second program.
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
@@ -136,9 +137,10 @@ def prepare(
     for mesh, spectrum in zip(pair.meshes, spectra, strict=True):
         if np.asarray(spectrum.eigenvalues)[-1] == 0:
             raise InputError(
-                f"{mesh.name}: {number_of_eigenvectors} eigenvectors only distinguish connected components: "
-                "compute more eigenvectors than the mesh has components, or join vertices at the same "
-                "position (weld=True, on the command line --weld)."
+                f"{mesh.name}: the largest of the {number_of_eigenvectors} eigenvalues is zero, so the "
+                "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh "
+                "has components, or join vertices at the same position (weld=True, on the command line "
+                "--weld)."
             )
     with timed("initial map", seconds):
         start = initial_map(pair, *spectra, init=init)

@@ -34,9 +34,9 @@ class Stage:
     - `refiner`: the method, an instance of a subclass of `Refiner`: `WaveletPreservation` (the default),
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
-    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
-      refiner with levels, such as `Registration(levels=(35, 60))`, leave the argument out, because the
-      largest level is used.
+    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. Leave
+      the argument out for a refiner with levels, such as `Registration(levels=(35, 60))`. The stage then uses
+      the largest level.
     - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
       argument out, because each level is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
@@ -116,8 +116,7 @@ class Stage:
     def with_levels(self, levels: tuple[int, ...]) -> Stage:
         """Return the stage with other levels.
 
-        The number of eigenvectors becomes the largest level, and the number of iterations becomes the number
-        of levels.
+        The largest level is the new number of eigenvectors. The stage has one iteration per level.
 
         **Arguments:**
 
@@ -256,7 +255,7 @@ class Stage:
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """Return the number that the refiner's levels determine, else the given number, else the default."""
+    """Return `derived` if the refiner has levels; else `given`, or `default` if `given` is None."""
     if derived is None:
         return default if given is None else given
     if given is not None and given != derived:

@@ -9,10 +9,10 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-# The number of iterations from every rotation, and of further iterations from the best of them.
+# `_FIRST` iterations run from every rotation. `_FURTHER` iterations then run from the `_BEST` best results.
 _FIRST, _FURTHER = 10, 30
 _BEST = 5
-# The number of points of x that the first iterations move.
+# The first iterations move at most this number of points of x.
 _MOVED_FIRST = 500
 
 
@@ -38,7 +38,8 @@ def align_rigidly(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"]) 
 
     Iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992) run from the
     identity, from the 24 rotations between the principal axes of both sets, and from the 60 rotations of an
-    icosahedron. The motion with the least sum of mean distances, from x to y and from y to x, is chosen.
+    icosahedron. Each resulting motion is rated by the mean distance from x to the nearest points of y, plus
+    the mean distance from y to the nearest points of x. The motion with the smallest sum is returned.
 
     **Arguments:**
 

@@ -22,18 +22,18 @@ def one_to_one_map(
 
     Each vertex of X is matched to a different vertex of Y. SciPy computes the exact optimum by shortest
     augmenting paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). The function
-    stores an (m, n) matrix in float64. For two real bodies of 5000 vertices, the computation takes 15 seconds
-    and 0.7 GiB of memory. The computation time grows with the third power of the number of vertices.
+    stores an (m, n) matrix in float64. For two real bodies of 5000 vertices each, the computation takes 15
+    seconds and 0.7 GiB of memory. The computation time grows with the third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
-    triangulation. On other shapes, several vertices often have the same best match, and only one of them can
-    be assigned this match. On pairs of the remeshed FAUST data set, the restriction to one-to-one maps
-    increases the mean geodesic error from 0.022 to 0.062.
+    triangulation. On other shapes, several vertices of X often have the same best match. A one-to-one map can
+    assign this match to only one of them. On pairs of the remeshed FAUST data set, the restriction to
+    one-to-one maps increases the mean geodesic error from 0.022 to 0.062.
 
     **Arguments:**
 
     - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex of X and of Y, in
-      the same unit. The point of a vertex of X should be close to the point of its match.
+      the same unit. A vertex of X and its match should have points that are close together.
     - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. If a mask is
       None (the default), all vertices are matched.
 

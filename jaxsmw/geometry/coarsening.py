@@ -25,8 +25,8 @@ class Coarsening(NamedTuple):
       sums to one.
     - `stiffness`, `mass`: the projected matrices P^T W P and P^T A P, each (c, c). W and A are the matrices
       of the original eigenproblem.
-    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter keeps the
-      frequencies that the subspace can represent, and slightly higher frequencies.
+    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter passes low
+      frequencies, up to slightly above those that the subspace can represent.
 
     Prolongation and smoothing use single precision, whose rounding errors are far smaller than the projection
     errors.
@@ -47,8 +47,8 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
     Unlike the method of Vaněk et al., this function needs only one coarsening step for cells of any size. The
     indicator functions are smoothed by a Chebyshev polynomial. The degree of the polynomial is 1.5 times the
-    radius of the cells, counted in edges. (If the degree were equal to the radius, coarsening would take 20 %
-    less time, but the errors of the eigenvalues would be ten times as large.)
+    radius of the cells, counted in edges. With a degree equal to the radius, coarsening would take 20 % less
+    time, but the errors of the eigenvalues would be ten times as large.
 
     **Arguments:**
 
@@ -90,8 +90,8 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
 
 _MOST_NEIGHBORS = 100
-# A cell is large if its area is more than `_LARGE` times the mean area of a cell. Large cells may cover at
-# most the share `_MOST_IN_LARGE` of the total area.
+# A cell is large if its area is more than `_LARGE` times the mean area of a cell. The share of the total area
+# in large cells may be at most `_MOST_IN_LARGE`.
 _LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
@@ -111,9 +111,9 @@ class _Smoother:
     """A low-pass filter for functions on a mesh. Constant functions pass unchanged.
 
     The filter is a Chebyshev polynomial of D^-1 W, where W is the stiffness matrix and D is the diagonal of
-    W. The filter damps eigenvalues of D^-1 W above 1.5 / `size` times the largest eigenvalue, which cells of
-    `size` vertices cannot represent. (On bodies, any factor from 1 to 3 instead of 1.5 gives about the same
-    accuracy.)
+    W. The filter damps the eigenvectors of D^-1 W whose eigenvalues are above 1.5 / `size` times the largest
+    eigenvalue. Cells of `size` vertices cannot represent these eigenvectors. (On bodies, factors from 1 to 3
+    instead of 1.5 give about the same accuracy.)
     """
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):
@@ -129,7 +129,7 @@ class _Smoother:
         self.operator = sp.diags(1 / diagonal) @ stiffness
 
     def single(self) -> _Smoother:
-        """Return this smoother in single precision."""
+        """Return a copy of this filter that computes in single precision."""
         other = copy(self)
         other.operator = self.operator.astype(np.float32)
         return other

@@ -2,8 +2,8 @@
 
 A creature is an implicit surface: a smooth union of tapered tubes around a skeleton. The surface is exactly
 mirror symmetric in the rest pose. Marching cubes, decimation and relaxation on the surface give well-shaped
-triangles. The joints move each point by a smooth function of the point's position in the rest pose. Two
-points of a creature in two poses correspond if they have the same position in the rest pose.
+triangles. Rotations of the joints deform the rest pose smoothly into the other poses. Two points of a
+creature in two poses correspond if they have the same position in the rest pose.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from jaxsmw.geometry.mesh import Mesh
 _Vector = tuple[float, float, float]
 
 _MINIMUM_VERTICES = 500
-_REACH = 0.25  # up to this value, the implicit function is a distance; above it, only the sign is meaningful
-_STIFFNESS = 4.0  # a larger value divides the skin more sharply between the bones
+_REACH = 0.25  # larger values of the implicit function only show that a point is outside
+_STIFFNESS = 4.0  # a larger value makes the skin bend more abruptly between the bones
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
@@ -53,7 +53,8 @@ class CreaturePair:
     def true_map(self) -> Int64[np.ndarray, " m"]:
         """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
 
-        Each true point is replaced by the nearest corner of the target triangle that contains it.
+        Each true point lies in a triangle of the target, and is replaced by the nearest corner of this
+        triangle.
         """
         return self.truth.nearest_corners(self.target)
 
@@ -101,7 +102,7 @@ class _Tube:
 
 
 def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Return the minimum, smoothed by a parabola where the two values differ by less than `width`."""
+    """Return the minimum of a and b, smoothed by a parabola where a and b differ by less than `width`."""
     overlap = np.maximum(1 - np.abs(a - b) / width, 0)
     return np.minimum(a, b) - overlap**2 * (width / 4)
 
@@ -149,8 +150,8 @@ class _Body:
     ) -> None:
         """Add a tube or a plate to the body, or carve a tube out of the body.
 
-        `balls` lists the balls of the tube's chain. `joint` names the joint that moves the tube; it is needed
-        only if the tube projects far from the body.
+        `balls` lists the balls of the tube's chain. `joint` is the name of the joint that moves the tube.
+        Only a tube that projects far from the body needs a joint.
         """
         chain = self._individual(balls)
         if joint:
@@ -185,7 +186,7 @@ class _Body:
         """Return the values (p,) of the implicit function at points (p, 3).
 
         The implicit function is 0 on the skin and negative inside the body. Values up to `_REACH` are
-        distances to the skin.
+        approximate distances to the skin. A larger value only shows that a point is outside the body.
         """
         folded = np.stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]])
         result = np.full(len(points), 2 * _REACH)
@@ -302,7 +303,7 @@ def _flipped_to_delaunay(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     faces = faces.copy()
     for _ in range(20):
         edges, _, sides, corners = igl.edge_flaps(faces)
-        # An edge between tip[0] and tip[1] is replaced by the edge between apex[0] and apex[1].
+        # A flip replaces the edge from tip[0] to tip[1] by the edge from apex[0] to apex[1].
         apex, tip = (faces[sides, (corners + i) % 3].T for i in (0, 1))
         flipped = np.stack([np.stack([apex[s], tip[s], apex[1 - s]], axis=1) for s in (0, 1)])
         before, after = _unit_normals(vertices[faces[sides.T]]), _unit_normals(vertices[flipped])
@@ -336,8 +337,8 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     """
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per spacing² of surface area. The following spacing gives four times
-    # `count` vertices.
+    # Marching cubes give 1.5 vertices per spacing² of surface area. The chosen spacing gives about four times
+    # `count` vertices, or more.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)

@@ -27,7 +27,8 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The shift that ARPACK uses for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is
 # between 1 and 30.
 _SHIFT = -1e-2
-# The largest accepted values of the two numbers that `_check` returns.
+# The largest accepted relative residual of an exact solver, and the largest accepted deviation from
+# orthonormality of any solver; see `_check`.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
@@ -169,7 +170,7 @@ def eigenpairs(
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
-    """Choose one eigensolver for all meshes whose spectra will be compared, for the setting `"auto"`.
+    """Choose the eigensolver that the setting `"auto"` uses for meshes whose spectra will be compared.
 
     **Returns:** `"approximate"` if any mesh has 50 000 referenced vertices or more, else `"exact"`.
     """
@@ -272,10 +273,10 @@ def _number_below(factors: SuperLU) -> int:
 
 
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
-    """Return a shift in the middle of the first k eigenvalues, and the factors of W - shift A.
+    """Return a shift with about k/2 eigenvalues below it, and the LU factors of W - shift A.
 
-    By Weyl's law, about k/2 eigenvalues are below the first trial shift. If the true number of smaller
-    eigenvalues is far from k/2, as on a thin tube, another shift is tried.
+    Weyl's law gives the first trial shift. If the number of eigenvalues below it is far from k/2, as on a
+    thin tube, up to three other shifts are tried.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -305,8 +306,9 @@ def _lanczos(
     """Return the k smallest eigenpairs by the block Lanczos method for (W - shift A)^-1 A, without restarts.
 
     The shift is in the middle of the wanted eigenvalues, so the wanted eigenpairs are at both ends of the
-    spectrum of the inverse. Therefore the method needs only two products with the inverse per eigenpair.
-    Keeping every vector A-orthogonal to all earlier vectors takes less time than ARPACK's restarts.
+    spectrum of the inverse. The Lanczos method converges fastest at these ends, so it needs only two products
+    with the inverse per eigenpair. Keeping every vector A-orthogonal to all earlier vectors takes less time
+    than ARPACK's restarts.
 
     Blocks of b vectors find at most b copies of a multiple eigenvalue. If the result lacks some eigenvalues,
     the method is repeated with larger blocks. An eigenpair has converged when its relative residual as an
@@ -323,8 +325,8 @@ def _lanczos(
 
 
 # The number of vectors in a block. SuperLU holds Python's global lock while it manages memory, so other
-# threads wait. Solving for several vectors together reduces this waiting time. Larger blocks need more
-# products to converge.
+# threads must wait. Larger blocks reduce the time for which other threads wait, but need more products to
+# converge.
 _BLOCK = 4
 
 
@@ -360,8 +362,8 @@ def _converged(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # The large overlaps with the last two blocks are removed first. Otherwise rounding errors of the
-        # large overlaps would hide the small overlaps with earlier blocks.
+        # The overlaps with the last two blocks are large and are removed first. Otherwise their rounding
+        # errors would be larger than the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
         overlaps[:, before:] += large
@@ -373,7 +375,7 @@ def _converged(
         # NumPy's `eigh` is used, because SciPy's `eigh` would hold Python's global lock.
         inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])
         eigenvalues = shift + 1 / inverted
-        # Very large eigenvalues, which are not wanted, can become negative by rounding.
+        # Rounding errors can make very large eigenvalues negative, so negative eigenvalues are sorted last.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -449,9 +451,9 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
     for columns in _slices(k):
         eigenvectors[:, columns] = basis @ combinations[:, columns]
-    # If all triangles are badly shaped, the last eigenvectors are the least accurate. If only one region has
-    # badly shaped triangles, any eigenvector can be the least accurate. Therefore the last ten eigenvectors
-    # and every third eigenvector are checked.
+    # The last ten eigenvectors are checked, because they are the least accurate if all triangles are badly
+    # shaped. Every third eigenvector is also checked, because any eigenvector can be the least accurate if
+    # only one region has badly shaped triangles.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
     smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
     norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
@@ -463,13 +465,13 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
 
 # The number of subspace dimensions per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
-# One more smoothing step may lower an eigenvalue by at most this fraction. The relative error of an
-# eigenvalue is up to three times this fraction.
+# If one more smoothing step lowers an eigenvalue by more than this fraction, the approximation is rejected.
+# The relative error of an accepted eigenvalue is up to three times this fraction.
 _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Return slices of at most 32 columns. Copying more columns at a time may exceed the memory."""
+    """Divide columns into slices of at most 32. Copies of more columns at a time may not fit into memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 
@@ -490,5 +492,5 @@ def _check(
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
         # Unlike `max`, `np.maximum` returns NaN if one of the numbers is NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # The divisor is at least 1, because the only eigenvalue may be zero.
+    # The divisor is at least 1, because all eigenvalues may be zero, for example if k = 1.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

@@ -1,8 +1,8 @@
 """Geodesic distances on piecewise flat surfaces, accurate even for short distances.
 
-In evaluation, the distances between matches and true points are often short. For short distances, the heat
-method has errors of several percent. Exact window propagation takes about 100 times as long as the method of
-this module.
+Maps are evaluated by the distances between matches and true points. These distances are often short. For
+short distances, the heat method has errors of several percent. Exact window propagation takes about 100 times
+as long as the method of this module.
 
 This module runs Dijkstra's algorithm on a graph of mesh edges and of straight lines across faces. Strips of
 triangles around each vertex are unfolded into the plane. If a straight line within a strip joins two
@@ -33,13 +33,13 @@ from jaxsmw.runtime.cache import cached
 # A straight line of the graph may cross at most this number of edges of the mesh.
 _DEPTH = 10
 
-# The number of sides from which strips are unfolded together, and the number of distances that are stored
-# together. With these sizes, the arrays fit into the processor's cache.
+# Strips are unfolded from at most `_SIDES_AT_ONCE` sides at a time. `geodesic_distances_between` stores up to
+# about `_DISTANCES_AT_ONCE` distances at a time. With these sizes, the arrays fit into the processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
-# `geodesic_distances_between` searches within these radii one after the other, and finally on the whole
-# surface. The radii are in units of the square root of the area. Each search takes a small fraction of the
-# time of the next search.
+# `geodesic_distances_between` first searches within the smallest radius, then within the larger radii, and
+# finally on the whole surface. The radii are in units of the square root of the area. Each search takes far
+# less time than the next search.
 _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
@@ -86,20 +86,19 @@ class _Sides(NamedTuple):
     """The 6 f sides of all f triangles and of their mirror images.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. A line that crosses an edge leaves one
-    triangle by a side and enters the next triangle by the side with opposite direction. Because of the mirror
-    images, lines can cross between faces of any orientation, and at edges with any number of faces.
+    images: the faces 0 … f - 1 with reversed order of corners. A line leaves a triangle by one side, and
+    enters the next triangle by a side in the opposite direction. The mirror images let lines cross edges
+    whose faces have opposite orientations, and edges with more than two faces.
     """
 
     tail: Int64[np.ndarray, " s"]
     head: Int64[np.ndarray, " s"]
     apex: Int64[np.ndarray, " s"]
     length: Float64[np.ndarray, " s"]
-    # The position of the apex in the complex plane, in which the side is the segment from 0 to 1. The apex is
-    # never below the real axis.
+    # The position of the apex as a complex number, after the side was mapped to the segment from 0 to 1. The
+    # apex is never below the real axis.
     shape: Complex128[np.ndarray, " s"]
-    # A line that leaves a triangle by side i enters other triangles by the sides across[first[i]], …,
-    # across[first[i + 1] - 1].
+    # Lines that leave a triangle by side i enter other triangles by sides across[first[i]:first[i + 1]].
     first: Int64[np.ndarray, " s1"]
     across: Int64[np.ndarray, " c"]
 
@@ -111,7 +110,7 @@ def _sides(mesh: Mesh) -> _Sides:
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
-    # No line crosses a side of length zero, so the direction and shape of this side can be set to zero.
+    # For sides of length zero, direction and shape are set to zero, because no line crosses such sides.
     direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
     shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
@@ -158,7 +157,7 @@ def _is_left(a: Complex128[np.ndarray, " b"], b: Complex128[np.ndarray, " b"]) -
 
 
 def _visible(beams: _Beams, position: Complex128[np.ndarray, " b"]) -> Bool[np.ndarray, " b"]:
-    """Return for each beam whether one of its lines reaches the given position."""
+    """Return for each beam i whether `position[i]` lies inside the beam."""
     return _is_left(beams.rightmost, position) & _is_left(position, beams.leftmost)
 
 
@@ -178,8 +177,9 @@ def _unfold(
     - `position`: the complex coordinate of the point, in the frame in which `side` leads from 0 to 1 (b,).
     - `depth`: the number of sides to cross.
 
-    **Returns:** An iterator with one item per crossing: the beams that enter the next triangles, and the
-    positions of the third corners of these triangles.
+    **Returns:** An iterator with `depth` pairs. Pair i contains the beams that have crossed i + 1 sides. For
+    each of these beams, it also contains the position of the third corner of the triangle that the beam has
+    entered.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
@@ -189,8 +189,9 @@ def _unfold(
         beams = beams.at(beam)._replace(side=sides.across[entry])
         corner = beams.left + sides.shape[beams.side] * (beams.right - beams.left)
         yield beams, corner
-        # Lines that pass the corner on its right leave by the side from `right` to the corner. Lines that
-        # pass the corner on its left leave by the side from the corner to `left`.
+        # The corner splits each beam in two. Lines to the right of the corner leave the triangle by the side
+        # between `right` and the corner. Lines to the left of the corner leave by the side between the corner
+        # and `left`.
         triangle, k = np.divmod(beams.side, 3)
         visible = _visible(beams, corner)
         to_right = beams._replace(
@@ -215,7 +216,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """Return the straight lines from points to vertices that `_unfold` finds."""
+    """Return the straight lines that lead from the given points to vertices across 1 to `depth` sides."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)
@@ -241,7 +242,8 @@ def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
 def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     """Return the graph of the edges of a mesh and of straight lines through strips of triangles.
 
-    Graphs are cached on disk (`jaxsmw.runtime.cache`). The last four graphs are also kept in memory.
+    Graphs are cached on disk (`jaxsmw.runtime.cache`). The four most recently used graphs are also kept in
+    memory.
 
     **Arguments:**
 
@@ -263,7 +265,8 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
         smaller, larger = mesh.edges.T
         edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
         lines = [_Lines(smaller, larger, edge_lengths)]
-        # Only the first half of the sides is used, because the mirrored triangles give the same lines again.
+        # Lines start only in the original triangles, because the mirrored triangles would give the same lines
+        # again.
         for start in range(0, s, _SIDES_AT_ONCE):
             side = np.arange(start, min(start + _SIDES_AT_ONCE, s))
             origins, ends, lengths = _lines(sides, sides.apex[side], side, sides.shape[side], depth)
@@ -299,7 +302,7 @@ def geodesic_distances(
         `"exact"` works only between vertices of manifold meshes, and takes about 100 times as long as
         `"strips"`.
     - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
-        `"strips"`, a limit saves time.
+        `"strips"`, a limit reduces the computation time.
 
     **Returns:** Distances (s, n), float64, in the unit of the mesh. A distance is inf if no path connects the
     source and the vertex, or if the distance is above the limit.
@@ -396,7 +399,7 @@ def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray
 def _straight_distances(
     mesh: Mesh, points: SurfacePoints, partners: SurfacePoints
 ) -> Float64[np.ndarray, " p"]:
-    """Return the length of the straight line from each point to its partner; inf if there is no such line."""
+    """Return the lengths of straight lines from `points[i]` to `partners[i]`, or inf if no line exists."""
     lengths = np.linalg.norm(points.positions(mesh) - partners.positions(mesh), axis=1)
     lengths[points.faces != partners.faces] = np.inf
     sides = _sides(mesh)
@@ -419,8 +422,8 @@ def _network(
 ) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
     """Add surface points to the geodesic graph as nodes.
 
-    The added lines lead from the points to vertices, and from vertices to the ends. No path leads through an
-    added node, so a distance does not depend on the other added points.
+    The added lines are directed: from `points` to vertices, and from vertices to `ends`. Therefore no path
+    leads through an added node, and a distance does not depend on the other added points.
 
     **Returns:** The graph, the nodes of the points, and the nodes of the ends.
     """

@@ -22,18 +22,19 @@ from jaxsmw.geometry.scans import between_neighbors, in_small_components, lost_v
 # attributes, because the other libraries are not imported.
 MeshLike: TypeAlias = Any
 
-# A triangle whose height is at most this fraction of its longest edge is degenerate. This fraction is far
-# above the rounding errors of a mesh near the origin, and far below the relative height of any intended
-# triangle.
+# A triangle whose height is at most this fraction of its longest edge is degenerate. Near the origin,
+# relative rounding errors are far smaller than this fraction. Triangles that are thin on purpose have far
+# larger relative heights.
 DEGENERATE_HEIGHT = 1e-10
 
-# The limits for the extent of a mesh. A mesh outside these limits is damaged or has an unsuitable unit.
-# Descriptors contain squares of areas, which neither overflow nor underflow within these limits.
+# The smallest and the largest accepted extent of a mesh. A mesh outside these limits is damaged or has an
+# unsuitable unit. Descriptors contain squares of areas, which neither overflow nor underflow within these
+# limits.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
 # The limits for the distances of vertices from the origin and from the middle of the mesh, in units of the
 # median edge length. At `LARGEST_COORDINATE` from the origin, float64 rounds positions by 1e-4 edge lengths.
-# Maps are refined in float32, which rounds positions by 0.1 edge lengths at `LARGEST_DISTANCE` from the
-# middle of a mesh. (The meshes of the data sets extend up to 1e4 edge lengths.)
+# Maps are refined in float32. At `LARGEST_DISTANCE` from the middle of a mesh, float32 rounds positions by
+# 0.1 edge lengths. (The meshes of the data sets measure at most 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
@@ -66,7 +67,7 @@ class Mesh:
     dropped_faces: Int64[np.ndarray, " d"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def mirrored(self) -> Mesh:
-        """Return the mirror image: the first coordinates change their signs.
+        """Return the mirror image of the mesh: all x coordinates change sign.
 
         Vertices and faces keep their numbers. The corners of each face are reversed, so that normals that
         point outward still point outward.
@@ -115,13 +116,13 @@ class Mesh:
         """
         total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
-        # `length` is about six vertex areas unless the normals of the faces cancel.
+        # If the normals of the faces do not cancel, `length` is about six times the vertex area.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
         return np.divide(total, length, out=np.zeros_like(total), where=defined)
 
     @cached_property
     def is_inside_out(self) -> bool:
-        """Whether the normals point inward, which makes the enclosed signed volume negative."""
+        """Whether the normals point inward: True if the enclosed signed volume is negative."""
         corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
         return bool(np.linalg.det(corners).sum() < 0)
 
@@ -171,10 +172,10 @@ class Mesh:
 
     @cached_property
     def _edge_table(self) -> _EdgeTable:
-        """The edges, the number of faces at each edge, and the balance of each edge.
+        """A table of all edges, with the number of faces and the orientation balance of each edge.
 
-        The balance of an edge is the number of faces that traverse it in one direction, minus the number that
-        traverse it in the opposite direction.
+        The orientation balance of an edge is the number of faces that traverse it in one direction, minus the
+        number that traverse it in the opposite direction.
         """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
@@ -188,7 +189,8 @@ class Mesh:
     ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
         """Return all pairs of a given vertex and a face around it.
 
-        **Returns:** For each of p pairs, the index of the vertex in `vertices` (p,) and the face (p,).
+        **Returns:** Two arrays with one entry per pair: indices into `vertices` (p,), and indices of faces
+        (p,).
         """
         faces = np.argsort(self.faces.ravel(), kind="stable") // 3
         counts = np.bincount(self.faces.ravel(), minlength=len(self.vertices))
@@ -366,11 +368,11 @@ def make_mesh(
     The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
     Vertices are never dropped or renumbered.
 
-    Scans may contain vertices without a usable position, and small components such as dust. If at most one
-    vertex in 1000 is not finite or very far away, such vertices are moved between their neighbours, and their
-    faces are dropped. Faces of components with less than 1 % of the area are dropped if another component has
-    at least half of the area. Like all unreferenced vertices, the vertices of dropped faces receive the match
-    of the nearest vertex.
+    Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
+    if its position is not finite or is very far away. If at most one vertex in 1000 is lost, each lost vertex
+    is moved to the mean of its neighbours, and its faces are dropped. Faces of components with less than 1 %
+    of the area are dropped if another component has at least half of the area. Vertices that lose all their
+    faces become unreferenced, and receive the match of the nearest referenced vertex.
 
     **Arguments:**
 

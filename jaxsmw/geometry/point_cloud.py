@@ -2,8 +2,8 @@
 
 A mesh through the points makes all methods for meshes work for point clouds. The tetrahedra of the Delaunay
 triangulation of the points are labelled inside or outside, and the surface consists of the triangles between
-the two. Compared with triangulations of tangent planes, the labels keep sheets apart that nearly touch, and
-the surface has a consistent orientation.
+the two. Unlike triangulations in tangent planes, this method separates sheets that nearly touch, and orients
+the surface consistently.
 """
 
 from __future__ import annotations
@@ -25,24 +25,28 @@ from jaxsmw.geometry.scans import usable_positions
 FEWEST_POINTS = 20
 """The smallest number of different points that `triangulate_points` accepts."""
 
-# Two tetrahedra attract or repel each other with weights from exp(-4) to exp(4), as in the eigencrust.
+# The weight of a pair of tetrahedra is between exp(-4) and exp(4), as in the paper that `triangulate_points`
+# cites.
 _CONTRAST = 4.0
-# Points on a sphere around the cloud; its radius is in units of the extent of the cloud. All tetrahedra at
-# these points are outside.
+# `_AROUND` points are added on a sphere around the cloud. The radius of the sphere is `_DISTANCE_AROUND`
+# times the extent of the cloud. Every tetrahedron with an added point as a corner is labelled outside.
 _AROUND, _DISTANCE_AROUND = 60, 3.0
-# A larger circumsphere, in the same unit, belongs to a tetrahedron that is almost flat.
+# A tetrahedron is almost flat if the radius of its circumsphere is above `_LARGEST_RADIUS` times the extent
+# of the cloud.
 _LARGEST_RADIUS = 20.0
-# The signs of the labels do not change any more at this relative residual, which takes 100 to 200 iterations.
+# At this relative residual, the signs of the labels no longer change. The solver reaches it in 100 to 200
+# iterations.
 _TOLERANCE, _ITERATIONS = 1e-6, 5000
-# A triangle closes a hole if an edge is longer than this multiple of the distances from both ends to their
-# 12th neighbours. Such triangles are dropped.
+# Triangles that close holes are dropped. A triangle closes a hole if one of its edges is longer than `_GAP`
+# times the spacing at each end of the edge. The spacing at a point is the distance to its 12th nearest point.
 _GAP, _NEIGHBORS = 1.5, 12
-# At least this share of the points must be on the surface.
+# At least this share of the points must be vertices of the surface.
 _ON_SURFACE = 0.5
-# Normals are ignored if fewer than this share of the points has a normal with a direction.
+# Normals are ignored if the share of finite, non-zero normals is below this number.
 _KNOWN_NORMALS = 0.5
-# Points on a surface have about 7 tetrahedra per point. Qhull needs very much time for points with far more,
-# for example on two lines, so this number of points is tried first.
+# Points on a surface have about 7 tetrahedra per point. Qhull takes very long for points that have far more
+# tetrahedra, for example points on two lines. Therefore `_TRIED` random points are triangulated first. No
+# surface is computed if they have more than `_MOST_TETRAHEDRA` tetrahedra per point.
 _MOST_TETRAHEDRA, _TRIED = 50, 1000
 
 
@@ -59,13 +63,14 @@ def triangulate_points(
     Kolluri, Shewchuk, O'Brien, "Spectral surface reconstruction from noisy point clouds", SGP 2004. Adjacent
     tetrahedra whose circumspheres overlap deeply are likely to have the same label. The two poles of a point
     are the farthest vertices of its Voronoi cell on both sides of the surface, and their tetrahedra are
-    likely to have opposite labels. The labels minimise the sum of the weighted squares of the violations,
-    with the tetrahedra far away labelled as outside; this linear system replaces the eigenvalue problem of
-    the paper.
+    likely to have opposite labels. The labels are real numbers that minimise a weighted sum of squared
+    violations of these two conditions. Tetrahedra far from the points have the fixed label outside. The
+    function solves a linear system, whereas the paper solves an eigenvalue problem.
 
     Triangles whose edges are much longer than the distances between neighbouring points are dropped, so open
-    surfaces stay open. Points that the surface does not use, such as outliers, are unreferenced vertices.
-    Points with the same position count once, and points that are not finite have no triangles.
+    surfaces stay open. Points that the surface does not use, such as outliers, are unreferenced vertices. If
+    several points have the same position, only the first of them is used. Points that are not finite, or are
+    very far from the other points, have no triangles.
 
     **Arguments:**
 
@@ -139,10 +144,10 @@ def _surface(
 
 
 class _Tetrahedra(NamedTuple):
-    """The Delaunay triangulation of the points and of points far around them, scaled to extent 1.
+    """The Delaunay triangulation of the given points, scaled to extent 1, and of points added far away.
 
     `neighbors[t, i]` is the tetrahedron across the triangle opposite to corner i of tetrahedron t, or -1.
-    `outer` marks tetrahedra with a corner far away.
+    `outer` is True for a tetrahedron if at least one of its corners is an added point.
     """
 
     points: Float64[np.ndarray, "p 3"]
@@ -186,7 +191,10 @@ def _tetrahedra(points: Float64[np.ndarray, "n 3"]) -> _Tetrahedra | None:
 def _circumspheres(
     corners: Float64[np.ndarray, "t 4 3"],
 ) -> tuple[Float64[np.ndarray, "t 3"], Float64[np.ndarray, " t"]]:
-    """Return the centres and radii of circumspheres, and the centroids of tetrahedra that are almost flat."""
+    """Return the centres and radii of circumspheres.
+
+    For a tetrahedron that is almost flat, the centroid and `_LARGEST_RADIUS` replace centre and radius.
+    """
     a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
     volume = np.einsum("ti,ti->t", a, np.cross(b, c))
     squares = ((v**2).sum(axis=1)[:, None] for v in (a, b, c))
@@ -204,8 +212,9 @@ def _poles(
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
     """Return the tetrahedra of the two poles of each point that has poles on both sides.
 
-    The first pole is the farthest circumcentre around a point. The second pole is the farthest circumcentre
-    in the opposite half-space. Given normals determine the half-spaces; otherwise the first pole does.
+    Poles are circumcentres of tetrahedra around a point. Without normals, the first pole is the farthest
+    circumcentre, and the second pole is the farthest circumcentre in the opposite half-space. With normals,
+    the poles are the farthest circumcentres on both sides of the tangent plane.
     """
     point, tetrahedron = tetrahedra.corners.ravel(), np.repeat(np.arange(len(tetrahedra.corners)), 4)
     given = point < n
@@ -238,11 +247,12 @@ def _inside(
 ) -> Bool[np.ndarray, " t"]:
     """Label the tetrahedra: True for inside.
 
-    The labels x, 1 for outside, minimise the sum of w (x_i - x_j)^2 over adjacent tetrahedra and of
-    w (x_i + x_j)^2 over the poles of each point. All outer tetrahedra share one label, which is 1.
+    The labels x are real numbers, negative for inside. They minimise the sum of w (x_i - x_j)^2 over adjacent
+    tetrahedra i, j plus the sum of w (x_i + x_j)^2 over the two poles i, j of each point. The label of every
+    outer tetrahedron is fixed at 1.
     """
     count = int((~tetrahedra.outer).sum())
-    unknown = np.full(len(tetrahedra.outer), count)  # the number `count` is the common label
+    unknown = np.full(len(tetrahedra.outer), count)  # outer tetrahedra share the label of index `count`
     unknown[~tetrahedra.outer] = np.arange(count)
     i, j = np.repeat(np.arange(len(unknown)), 4), tetrahedra.neighbors.ravel()
     i, j = i[once := i < j], j[once]

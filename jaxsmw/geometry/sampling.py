@@ -64,11 +64,11 @@ class SurfaceSamples(NamedTuple):
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    This is Poisson-disk sampling. In space, all samples are farther apart than a minimum distance, and every
-    candidate is within this distance of a sample. The minimum distance follows from the area and the number
-    of samples. The candidates contain one vertex from each occupied box of a grid. The boxes are a third of
-    the minimum distance wide. Two sheets of surface that are closer to each other than the minimum distance
-    share their samples. For many samples, the function is much faster than `farthest_point_samples`.
+    This is Poisson-disk sampling. Any two samples are farther apart than a minimum Euclidean distance, and
+    every candidate is within this distance of a sample. The minimum distance follows from the area and the
+    number of samples. The candidates are one vertex from each occupied box of a grid. The side of a box is a
+    third of the minimum distance. Two sheets of surface that are closer to each other than the minimum
+    distance share their samples. For many samples, the function is much faster than `farthest_point_samples`.
 
     **Arguments:**
 
@@ -99,8 +99,8 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     """Return the edges of a coarse graph of the surface.
 
     If the mesh has at most 15 000 vertices, its edges are returned. Otherwise the nodes of the graph are
-    about 5000 evenly spread samples. Two samples are connected if an edge of the mesh joins a vertex nearest
-    to the first sample and a vertex nearest to the second sample.
+    about 5000 evenly spread samples. Each vertex belongs to its nearest sample. Two samples are connected if
+    an edge of the mesh joins a vertex of one sample to a vertex of the other.
 
     **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
     are given as vertex indices of the mesh.
@@ -113,8 +113,8 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
 
 
-# Every map looks discontinuous at edges that are much shorter than the usual errors of matches. Therefore a
-# mesh with more than `_DENSE` vertices is reduced to about `_SPREAD` samples.
+# If edges are much shorter than the usual errors of matches, even good maps look discontinuous at these
+# edges. Therefore a mesh with more than `_DENSE` vertices is reduced to about `_SPREAD` samples.
 _DENSE, _SPREAD = 15_000, 5000
 
 

@@ -139,8 +139,8 @@ def _describe(
 
     **Arguments:**
 
-    - `positions`, `normals`: the positions of all vertices, in units of the square root of the area, and
-      their unit normals.
+    - `positions`: the positions of all vertices, in units of the square root of the area.
+    - `normals`: the unit normals of all vertices.
     - `block`: the vertices to describe.
     - `center`, `neighbor`, `distance`: all pairs of a vertex in the block and one of its neighbours. `center`
       contains indices into `block`, `neighbor` contains vertices, and `distance` contains the distances
@@ -152,15 +152,15 @@ def _describe(
     x, y, z = np.einsum("pad,pd->ap", frames, offsets)
     cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
 
-    # Coordinates are in units of bins: the centre of bin b has the coordinate b.
+    # Each coordinate is scaled so that the integer b is the centre of bin b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
     elevation = np.arcsin(np.clip(z / distance, -1, 1)) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
     # A pair contributes to two bins each of azimuth, elevation, distance and cosine. Elevation and distance
-    # have only two bins, so every pair has weights for all four combinations. Azimuth and cosine select the
-    # histogram rows to which the four weights are added.
+    # have only two bins, so every pair has weights for all four combinations. The bins of azimuth and cosine
+    # determine the row of `histogram`. The four combinations of elevation and distance are its columns.
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
     shares = np.empty((len(center), _ELEVATION * _RADIAL))
     for low, of_elevation in enumerate((1 - upper, upper)):
@@ -189,8 +189,7 @@ def _local_frames(
 ) -> Float64[np.ndarray, "b 3 3"]:
     """Return one right-handed frame per described vertex, with the axes x, y and z as rows.
 
-    The x axis is the direction of the largest scatter, and the z axis is the direction of the smallest
-    scatter.
+    The neighbours are scattered most along the x axis, and least along the z axis.
     """
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
@@ -202,7 +201,8 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Ties occur on regular meshes. The arbitrary signs of the eigenvectors must not decide ties.
+        # Ties occur on regular meshes. Weighted heights decide them, because the signs of the eigenvectors
+        # are arbitrary.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

@@ -25,7 +25,8 @@ def nearest_surface_points(
     """
     if not len(points):
         return SurfacePoints(np.empty(0, np.int64), np.empty((0, 3))), np.empty(0)
-    # The shift keeps the precision of a mesh that is far from the origin.
+    # Coordinates relative to the middle of the mesh reduce rounding errors if the mesh is far from the
+    # origin.
     middle = mesh.vertices[mesh.referenced_vertices].mean(axis=0)
     vertices = mesh.vertices - middle
     squared, faces, nearest = igl.point_mesh_squared_distance(points - middle, vertices, mesh.faces)

@@ -9,7 +9,7 @@ from jaxsmw.descriptors import SampledPair
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.sampling import poisson_disk_samples
 
-# The approximate number of evenly spread samples of each shape that are aligned.
+# The alignment uses about this number of evenly spread samples per shape.
 _SAMPLES = 2000
 
 

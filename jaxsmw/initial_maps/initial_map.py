@@ -125,8 +125,8 @@ def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     unused = ~mesh_y.referenced_vertices[given] & mesh_x.referenced_vertices
     if unused.any():
         raise InputError(
-            f"the initial map sends {unused.sum()} vertices to unreferenced vertices of {mesh_y.name} (in no "
-            f"face), for example vertex {np.flatnonzero(unused)[0]} to vertex {given[unused][0]}: choose "
+            f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that are in no "
+            f"face, for example vertex {np.flatnonzero(unused)[0]} to vertex {given[unused][0]}: choose "
             "vertices in faces."
         )
     return given

@@ -9,12 +9,12 @@ from jaxsmw.descriptors import SampledPair, SampledShape, paired_shot
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
-# The weight of distances to landmarks relative to SHOT descriptors, which are unit vectors. With this weight,
-# a distance of half the square root of the area is as large as the norm of a SHOT descriptor. On pairs of
-# real bodies, weights from 1 to 3 give nearly the same maps.
+# Distances to landmarks, in units of the square root of the area, are multiplied by this weight. A distance
+# of half a unit becomes 1, which is the norm of a SHOT descriptor. On pairs of real bodies, weights from 1 to
+# 3 give nearly the same maps.
 _WEIGHT = 2.0
-# This finite value replaces the infinite distance between two connected components. The value is larger than
-# any distance within a component.
+# This finite value replaces the infinite distance between two connected components. It is larger than any
+# distance within a component.
 _ELSEWHERE = 100.0
 
 
@@ -28,8 +28,8 @@ def landmark_features(
     - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
     - `landmarks`: integers (l, 2), with a vertex of X and its match on Y in each row.
 
-    **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex. The first 352
-    columns are SHOT, and the other l columns are distances.
+    **Returns:** The features of X (m, d) and of Y (n, d), where m and n are the numbers of compared vertices.
+    The first 352 columns are SHOT, and the other l columns are distances.
 
     **Raises:** `InputError` if `landmarks` does not have the shape (l, 2), or gives two matches to one vertex
     of X. Also `InputError` if a number in `landmarks` is not a referenced vertex, or if a mesh is too coarse
@@ -68,13 +68,12 @@ def distance_features(
 
     **Arguments:**
 
-    - `side`: the shape, with its vertices at which descriptors are compared.
+    - `side`: X or Y, as a `SampledShape`.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
     - `unit`: the unit of the returned distances, as a length in the unit of the mesh; see
       `Pair.units_of_length`.
 
-    **Returns:** The distances (n, l), multiplied by their weight relative to SHOT, with one row per compared
-    vertex.
+    **Returns:** The weighted distances (n, l) from the n compared vertices to the l given vertices.
     """
     distances = geodesic_distances(side.mesh, vertices).T / unit
     distances = _WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)

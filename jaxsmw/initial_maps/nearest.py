@@ -58,7 +58,8 @@ def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int
     **Arguments:**
 
     - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
-    - `found`: for each compared vertex of X (a,), the 0-based number of a compared vertex of Y.
+    - `found`: the match of each compared vertex of X (a,), as a 0-based index into the compared vertices of
+      Y.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
     """

@@ -1,4 +1,4 @@
-"""The contents of a landmark file before the names are checked, and the numbers in its text."""
+"""The parsed contents of a landmark file, with checks of names and positions."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", 
 class Entries(NamedTuple):
     """The landmarks of a file, in the order of the file.
 
-    `numbers` contains the place of each landmark in the file, such as a line number, and `noun` says what it
-    counts. Both are for messages.
+    `numbers` contains the place of each landmark in the file, such as a line number. `noun` is the thing that
+    these numbers count, such as `line`. Messages contain both.
     """
 
     names: list[str]
@@ -63,7 +63,7 @@ class Entries(NamedTuple):
 
 
 def check_count(count: int) -> None:
-    """Refuse a number of landmarks that no file of landmarks has."""
+    """Refuse more than `MOST_LANDMARKS` landmarks."""
     if count > MOST_LANDMARKS:
         raise InputError(f"contains more than {MOST_LANDMARKS} landmarks: give fewer landmarks.")
 

@@ -1,6 +1,6 @@
 """Reader and writer of landmark files: named points in the formats of 3D Slicer, MeshLab, MITK and tables.
 
-The readers are made here, because libraries for these formats read them without checks: a damaged file must
+jaxsmw has its own readers, because other libraries read these formats without checks. A damaged file must
 cause one clear error message, and a coordinate system must not be guessed.
 """
 
@@ -88,9 +88,9 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
     - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files in the other formats
       cannot state a coordinate system, so readers must know it.
 
-    **Raises:** `InputError` for another suffix, if the file cannot be written, or if it would be larger than
-    `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the coordinate system of
-    the landmarks is None.
+    **Raises:** `InputError` for another suffix, for a file that cannot be written, or for more landmarks or
+    bytes than `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the
+    coordinate system of the landmarks is None.
     """
     suffix = check_landmark_suffix(path)
     check_known_system(path, landmarks)
@@ -132,8 +132,8 @@ def _suffix(path: str | os.PathLike[str], known: list[str]) -> str:
         if name.lower().endswith(suffix):
             return suffix
     raise InputError(
-        f"{path}: the suffix {Path(path).suffix!r} does not belong to a format of landmark files that can be "
-        f"used here: choose one of {', '.join(known)}."
+        f"{path}: the suffix {Path(path).suffix!r} is not supported for this landmark file: choose one of "
+        f"{', '.join(known)}."
     )
 
 
@@ -155,7 +155,7 @@ def _decode(data: bytes) -> str:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"is not text in UTF-8 (byte {error.start} differs): save the file in UTF-8."
+            f"is not text in UTF-8 (byte {error.start} is not valid): save the file in UTF-8."
         ) from None
     if "\0" in text:
         raise InputError("contains null characters, so it is not a text file: give a file of landmarks.")

@@ -1,7 +1,7 @@
 """Parsers and writers of landmarks in tables: `.csv` and `.txt` files, and the `.fcsv` files of 3D Slicer.
 
-The standard library splits the lines into cells, because its errors are specific and no cell is converted by
-a guess.
+The module `csv` splits the lines into cells, because its error messages are specific and it does not guess
+the types of cells.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class _Columns(NamedTuple):
 def parse_table(text: str) -> Entries:
     """Parse rows of `name x y z` or `x y z`, with or without a line of column names.
 
-    Semicolons, tabs, commas or blanks separate the cells: the first of these that the first line contains at
-    least twice.
+    The separator is the first of semicolon, tab and comma that occurs at least twice in the first line. If
+    there is none, blanks separate the cells.
     """
     lines = _lines(text)
     first = next((line for line in lines if line.strip()), "")
@@ -69,7 +69,7 @@ def parse_table(text: str) -> Entries:
 
 
 def _is_value(cell: str) -> bool:
-    """Return whether a cell is a number, also one that is not finite or has a decimal comma."""
+    """Return whether a cell is a number; `nan`, `inf` and decimal commas are accepted."""
     return is_number(cell.replace(",", "."), finite=False)
 
 
@@ -88,7 +88,7 @@ def _lines(text: str) -> list[str]:
 
 def _rows(lines: list[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not empty."""
-    # Without line ends, the reader would join the lines of a name in quotes.
+    # With line ends, a quoted name over several lines contains a newline, so it is refused later.
     reader = csv.reader(
         (f"{line}\n" for line in lines), delimiter=separator, skipinitialspace=True, strict=True
     )
@@ -126,8 +126,8 @@ def _named_columns(number: int, cells: list[str]) -> _Columns:
     surplus = next((title for title in others if title not in _NAME_COLUMNS), "")
     if surplus or len(others) > 1:
         raise InputError(
-            f"line {number} has the column {surplus or others[1]!a} besides one name and x, y and z: give "
-            "the landmarks of one mesh in only these columns."
+            f"line {number} names the column {surplus or others[1]!a}, but a table has only x, y, z and one "
+            "column of names: give the landmarks of one mesh in only these columns."
         )
     name = titles.index(others[0]) if others else None
     return _Columns([titles.index(axis) for axis in "xyz"], name, len(titles))

@@ -15,8 +15,9 @@ from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import LARGEST_EXTENT, Mesh
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to_surface
 
-# Mean distances to the surface, as fractions of the diagonal of the mesh. Landmarks in the wrong coordinate
-# system are above `FAR`. Landmarks in the right one are below `NEAR`, like all landmarks of the data sets.
+# Limits for the mean distance from landmarks to the surface, as fractions of the diagonal of the box around
+# the mesh. Landmarks whose mean distance is above `FAR` may be in the wrong coordinate system. The mean
+# distance of landmarks in the right coordinate system is below `NEAR` in all data sets.
 FAR, NEAR = 0.05, 0.02
 
 # Control characters, line separators, and characters that UTF-8 or XML cannot represent.
@@ -92,7 +93,9 @@ class Landmarks:
         return self if self.coordinates == coordinates else self.flipped()
 
     def stated(self, coordinates: CoordinateSystem) -> Landmarks:
-        """Return the same positions, with a coordinate system that their file does not state.
+        """Return landmarks with the same positions, whose coordinate system is `coordinates`.
+
+        Use this method if the file of the landmarks does not state a coordinate system.
 
         **Raises:** `InputError` if the file states the other coordinate system.
         """
@@ -199,7 +202,7 @@ class FrameDistances(NamedTuple):
     **Attributes:**
 
     - `as_read`: the mean distance from the landmarks to the surface.
-    - `flipped`: the same distance after the signs of x and y are reversed, as between LPS and RAS.
+    - `flipped`: the mean distance after the signs of x and y are reversed, as between LPS and RAS.
     """
 
     as_read: float
@@ -224,7 +227,7 @@ def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
 
 
 def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
-    """Check that landmarks lie on a surface, and find a change between LPS and RAS that is missing.
+    """Check that landmarks lie on a surface, and do not have to be converted between LPS and RAS first.
 
     **Arguments:**
 

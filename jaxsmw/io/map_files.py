@@ -130,7 +130,9 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 
 
 class Table:
-    """The numbers of a file as a matrix. Each line of text, or each row of a stored array, is one row.
+    """The numbers of a file as a matrix.
+
+    Each row of the matrix is one line of a text file, or one row of an array in a file.
 
     The readers of maps, landmarks and ground truth use this class, so the same fault causes the same message.
     In text files, spaces or tabs separate numbers. Commas are refused, because `3,5` could be a number with a
@@ -166,7 +168,8 @@ class Table:
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """Read an array in the `.npy` format as a matrix.
 
-        A list becomes a matrix with one column. If `columns` is 1, a single row also becomes a column.
+        A list becomes a matrix with one column. If `columns` is 1, an array with a single row also becomes
+        one column.
         """
         data = io.BytesIO(read_bytes(self.path))
         try:
@@ -276,7 +279,7 @@ class Table:
         - `base`: the index of the first element in the file, 0 or 1.
 
         **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
-        the other index base fits all numbers, the message recommends the other index base.
+        all numbers are valid with the other index base, the message recommends this index base.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)

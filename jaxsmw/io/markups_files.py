@@ -58,7 +58,8 @@ def parse_markups(text: str) -> Entries:
 def _parse_json(text: str) -> Any:
     """Parse JSON with all numbers as floats, and refuse objects that repeat a key."""
     try:
-        # Python refuses long integers and nested lists of great depth with other errors than syntax errors.
+        # Integers become floats, because `int` refuses integers with many digits. Deep nesting causes a
+        # RecursionError.
         return json.loads(text, parse_int=float, object_pairs_hook=_object)
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
@@ -109,7 +110,7 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
 
 
 def _is_defined(point: dict[str, Any], number: int) -> bool:
-    """Return whether the position of a control point is defined. The default of the format is yes."""
+    """Return whether the position of a control point is defined. A point without a status is defined."""
     status = point.get("positionStatus", "defined")
     if status != "defined" and status not in _NOT_DEFINED:
         _refuse(number, f"has the unknown position status {_excerpt(status)}")

@@ -26,8 +26,8 @@ _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18:
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# Every array is counted as at least this number of bytes. SciPy takes at least 10 microseconds per array, and
-# could read a few KiB of numbers in this time.
+# This number of bytes is added for every array, even for an empty array. SciPy takes at least 10 microseconds
+# per array; in this time, it can read a few KiB of numbers.
 _LEAST_BYTES_OF_ARRAY = 4096
 # The largest accepted size of all field names of a struct, in bytes. The limit allows 1000 fields with names
 # of 64 bytes. The structs of shapes have about ten fields.
@@ -48,7 +48,7 @@ def unpacked(data: bytes) -> bytes:
             "is in MATLAB's format 7.3, which is not supported: save it in MATLAB with save(..., '-v7')."
         )
     if matfile_version(io.BytesIO(data))[0] == 0:
-        return data  # level 4 has neither compression nor nesting
+        return data  # level 4 has neither compression nor nested arrays
     order = "<" if data[126:128] == b"IM" else ">"
     remaining = largest_contents(len(data))
     elements, position = [data[:128]], 128

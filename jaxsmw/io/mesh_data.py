@@ -78,9 +78,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.obj`: the `vt` lines as texture. The `g`, `o` and `usemtl` lines as the face data `group`, `object`
       and `material`. Colours after the positions.
     - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
-      array `a`. The lists `texcoord` of faces, or the properties `s` and `t` of vertices, become the texture.
+      array `a`. The texture comes from the face lists `texcoord`, or from the vertex properties `s` and `t`,
+      `u` and `v`, or `texture_u` and `texture_v`.
     - `.stl`: none.
-    - `.mat`: the further fields of the struct that `write_mesh_data` writes.
+    - `.mat`: the data that `write_mesh_data` writes into the struct, besides vertices and faces.
     - `.vtk`: VTK legacy files up to version 5.1, text or binary, with a POLYDATA or an UNSTRUCTURED_GRID of
       triangles, polygons and triangle strips: all arrays on points and cells.
     - `.vtp`: VTK XML files in all encodings, also compressed: all arrays on points and cells. Compression
@@ -176,7 +177,10 @@ def _fans(
 
 
 def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
-    """Return the data of each triangle's polygon. `MeshData` refuses arrays of a wrong length."""
+    """Return data with one row per triangle: the row of the triangle's polygon.
+
+    Arrays that are too short are returned unchanged, because `MeshData` refuses them.
+    """
     if values.ndim == 0 or len(values) <= polygon.max(initial=-1):
         return values
     return values[polygon]
@@ -214,7 +218,7 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
         its `mesh`.
 
     **Returns:** Sentences about the data that the format cannot hold; an empty tuple if the file contains
-    everything. Only `.npz` files hold everything.
+    everything. Only a `.npz` file can contain all data of any `MeshData`.
 
     **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
     be written.

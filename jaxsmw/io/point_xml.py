@@ -19,7 +19,8 @@ from jaxsmw.io.text import is_number
 # Limits far above any file of points, so that a malicious file cannot use gigabytes of memory.
 _DEEPEST, _LONGEST_TAG = 20, 2**16
 
-# A function that receives the names of an element and of all its ancestors, and its attributes or its text.
+# Functions for the beginning and the end of an element. The list contains the names of all ancestors and,
+# last, of the element. The other argument contains the attributes, or the text.
 _OnStart = Callable[[list[str], dict[str, str]], None]
 _OnText = Callable[[list[str], str], None]
 

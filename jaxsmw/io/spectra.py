@@ -30,13 +30,13 @@ from jaxsmw.io.mat_files import (
 )
 from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
 
-# `make_spectrum` documents which objects these types contain.
+# The docstring of `make_spectrum` lists the accepted objects.
 SpectrumLike: TypeAlias = Any
 MassMatrix: TypeAlias = Any
 
 # The largest accepted deviation of eigenvectors from orthonormality with respect to vertex areas.
-# Eigenvectors that were computed with a lumped mass matrix deviate less, even in single precision.
-# Eigenvectors that were computed with a finite-element mass matrix deviate far more.
+# Eigenvectors that were computed with a lumped mass matrix stay below this limit, even in single precision.
+# Eigenvectors that were computed with a finite-element mass matrix exceed the limit by far.
 _ORTHONORMALITY_TOLERANCE = 1e-3
 # The largest accepted rounding error of an eigenvalue, relative to the largest eigenvalue.
 _EIGENVALUE_TOLERANCE = 1e-5
@@ -134,8 +134,7 @@ def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
         matrix = areas.to_sparse_coo().coalesce()
         areas = sp.coo_array((np.asarray(matrix.values()), np.asarray(matrix.indices())), shape=matrix.shape)
     if sp.issparse(areas) or np.ndim(areas) == 2:
-        # A malicious file can contain a sparse matrix with so many rows that their sums would fill the
-        # memory.
+        # The row sums of a malicious sparse matrix could fill the memory, so its shape is checked first.
         if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
             raise InputError(
                 f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "

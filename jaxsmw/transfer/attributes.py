@@ -18,18 +18,19 @@ from jaxsmw.io.mesh_data import MeshData, Skin, Texture
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 from jaxsmw.transfer.textures import transfer_texture
 
-# A vertex of the target is far from the registered mesh beyond this distance, in units of the square root of
-# the target's area. The vertex then probably belongs to a part that the source lacks.
+# A vertex of the target is far from the registered mesh if its distance exceeds this number times the square
+# root of the target's area. The vertex then probably belongs to a part that the source lacks.
 _FAR = 0.03
-# Each face of the target has the data of four points: its centroid, and the centroids of the three triangles
-# at its corners that arise when its edges are halved. The centroid decides when two labels have two votes.
+# A face of the target receives its data from four of its points. One point is the centroid of the face. Each
+# other point is the centroid of a triangle between a corner and the midpoints of the two edges at this
+# corner. If two labels have two points each, the label at the face's centroid wins.
 _SAMPLES = np.vstack([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])
 _VOTES = np.array([1.5, 1, 1, 1])
 _Value = TypeVar("_Value")
 
 
 class _Corners(NamedTuple):
-    """Rows of an array and their weights (p, k), for each of p results."""
+    """For each of p results, k rows of an array and the weights of these rows."""
 
     rows: Int64[np.ndarray, "p k"]
     weights: Float64[np.ndarray, "p k"]
@@ -48,23 +49,24 @@ def transfer_attributes(
     Each vertex of Y receives the values at the nearest point of the registered mesh, and each face of Y the
     values at four of its points:
 
-    - Floats and colours are interpolated. A value that is not finite is never mixed with others: it spreads
-      only to where its vertex has the largest weight. Components of vectors are interpolated without a
-      rotation.
-    - Integers, such as labels, are never averaged. They are decided by a vote of the three corners with
-      barycentric weights, or of the four points of a face. A row of several integers is one label.
-      Labels are not smoothed, so a region that is thinner than a face of Y may leave single faces.
-    - Texture coordinates: each face of Y is mapped to one side of the seams of X, the side at its centroid.
-      Along seams, vertices of Y have several texture vertices. A face whose nearest face of X has no texture
-      has none.
+    - Floats and colours are interpolated. If the vertex with the largest weight has a value that is not
+      finite, this value is the result. Otherwise, values that are not finite are left out. Components of
+      vectors are interpolated without a rotation.
+    - Integers, such as labels, are never averaged. The value of a vertex is decided by a vote: each corner of
+      the nearest face votes with its barycentric weight. The value of a face is decided by a vote of its four
+      points. A row of several integers is one label. Labels are not smoothed, so a region that is thinner
+      than a face of Y may break up into single faces.
+    - Texture coordinates: the corners of each face of Y receive coordinates from one side of X's seams. This
+      is the side on which the face's centroid lies. Along seams, vertices of Y have several texture vertices.
+      If the nearest face of X has no texture, the face of Y has no texture either.
     - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertices of X; the
       smallest weights are left out. Each row sums to 1, unless all weights of the nearest face are 0.
     - Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and then
       interpolated.
     - Normals describe the shape of X, so they are not transferred.
 
-    Data of Y are kept where X has no data of the same name. Names of vertex data and face data are compared
-    together, because they share the names of labels.
+    Data of Y are kept where X has no data of the same name. Face data of X also replace vertex data of Y with
+    the same name, and vice versa. Otherwise, both arrays would share one list of label names.
 
     **Arguments:**
 
@@ -75,7 +77,7 @@ def transfer_attributes(
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
     which data of Y were replaced, and how many vertices of Y are farther from the registered mesh than 3 % of
-    the square root of Y's area. Such vertices have the values of the nearest point as well.
+    the square root of Y's area. These vertices also receive the values at the nearest point.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """
@@ -144,7 +146,7 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
 
 
 def _as_data(target: MeshData | Mesh) -> MeshData:
-    """Return the data of the target. A mesh alone has no faces besides its own."""
+    """Return the target as a `MeshData`. Faces that cleaning dropped from a `Mesh` are not included."""
     if isinstance(target, MeshData):
         return target
     return MeshData(replace(target, dropped_faces=np.empty(0, np.int64)), target.faces)
@@ -166,7 +168,7 @@ def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
     if len(data.faces) != len(numbers):
         numbers = data.mesh.face_numbers
     fits = len(numbers) == 0 or numbers[-1] < len(data.faces)
-    # Welding replaces vertices, but only by vertices at the same position.
+    # Welding can replace the vertices of a face, but not their positions.
     if not fits or not np.array_equal(mesh_x.vertices[data.faces[numbers]], mesh_x.vertices[data.mesh.faces]):
         raise InputError(
             f"{data.mesh.name}: the faces of the data are not those of their mesh: make the data with "
@@ -202,7 +204,7 @@ def _mixed(
 
 
 def _interpolated(values: Shaped[np.ndarray, "n ..."], corners: _Corners) -> Float64[np.ndarray, "p ..."]:
-    """Return weighted means of floats. Values that are not finite count only where they weigh most."""
+    """Return weighted means of floats; `transfer_attributes` explains values that are not finite."""
     matrix, values = corners.matrix(len(values)), values.astype(np.float64)
     finite = np.isfinite(values)
     if finite.all():

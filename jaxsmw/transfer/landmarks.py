@@ -55,8 +55,9 @@ def transfer_landmarks(
 
     **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y.
 
-    **Raises:** `InputError` if the landmarks lie off the surface of X, but on it in the other coordinate
-    system (`jaxsmw.io.check_frame`), or if there is not one expected error for each vertex of X.
+    **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
+    `InputError` is also raised if the landmarks lie off the surface of X, but would lie on it in the other
+    coordinate system (see `jaxsmw.io.check_frame`).
     """
     mesh_x, mesh_y = registered.mesh_x, registered.mesh_y
     if expected_error is not None and expected_error.shape != (len(mesh_x.vertices),):
@@ -87,13 +88,14 @@ def nearest_vertices(
     - `landmarks_x`, `landmarks_y`: l `Landmarks` on X and on Y with the same names in the same order.
     - `mesh_x`, `mesh_y`: the source X and the target Y.
 
-    **Returns:** For each landmark the corner of the nearest face that is nearest to it, as a 0-based
-    vertex of X and of Y (l, 2).
+    **Returns:** A vertex of X and a vertex of Y for each landmark (l, 2), 0-based. Each landmark is projected
+    onto the nearest face. The vertex is the corner of this face that is nearest to the projection.
 
     The function issues a `UserWarning` for each landmark that is far from its surface.
 
-    **Raises:** `InputError` if landmarks lie off their surface, but on it in the other coordinate system, or
-    if two landmarks have the same vertex of X, but different vertices of Y.
+    **Raises:** `InputError` if landmarks lie off their surface, but would lie on it in the other coordinate
+    system. `InputError` is also raised if two landmarks have the same vertex of X, but different vertices of
+    Y.
     """
     pairs = []
     for landmarks, mesh in ((landmarks_x, mesh_x), (landmarks_y, mesh_y)):

@@ -19,7 +19,8 @@ _WEIGHT_RANGE = 10.0
 # The scale of a neighbourhood is limited to the range from 1/_SCALE_RANGE to _SCALE_RANGE. Where a map
 # collapses a region to a point, the scale would otherwise be zero.
 _SCALE_RANGE = 5.0
-# A mesh is flat if the determinants of its moments are below this fraction of the cubed largest moments.
+# The rotations include a reflection only if the determinants of the moments are clearly negative. Their sum
+# must be below minus this fraction of the summed cubes of the largest singular values.
 _FLAT = 1e-12
 
 
@@ -42,7 +43,7 @@ class Similarities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Neighborhoods:
-    """The edges of a mesh in a given size, with positive weights.
+    """The edges of a mesh, which is scaled by the factor `size`, with positive weights.
 
     **Attributes:**
 
@@ -60,7 +61,7 @@ class Neighborhoods:
 
     @cached_property
     def vectors(self) -> Float64[np.ndarray, "e 3"]:
-        """The vector of each edge in the given size, from its second vertex to its first vertex."""
+        """The vector of each edge of the scaled mesh, from the edge's second vertex to its first vertex."""
         return self.size * self.differences(self.mesh.vertices)
 
     @cached_property
@@ -99,9 +100,9 @@ class Neighborhoods:
     def similarities(self, positions: Float64[np.ndarray, "n 3"], averagings: int) -> Similarities:
         """Fit a similarity transformation to each neighbourhood, from the mesh to other positions.
 
-        The neighbourhood of a vertex grows with the number of averagings. The fit is that of
-        as-rigid-as-possible deformation (Sorkine, Alexa 2007), with a scale. If most neighbourhoods are
-        reflected, all rotations include a reflection.
+        More averagings enlarge the neighbourhood of each vertex. The fit is that of as-rigid-as-possible
+        deformation (Sorkine, Alexa 2007), extended by a scale. If most neighbourhoods are reflected, all
+        rotations include a reflection.
         """
         vectors = self.vectors
         products = self.weights[:, None, None] * self.differences(positions)[:, :, None] * vectors[:, None, :]
@@ -111,7 +112,7 @@ class Neighborhoods:
             sums = self.averaging @ sums
         moments, lengths = sums[:, :9].reshape(-1, 3, 3), sums[:, 9]
         left, singular, right = np.linalg.svd(moments)
-        # A flat mesh has no hand: its determinants are rounding errors.
+        # The determinants of a flat mesh are rounding errors, so their signs mean nothing.
         hand = -1.0 if np.linalg.det(moments).sum() < -_FLAT * (singular[:, 0] ** 3).sum() else 1.0
         flip = np.where(np.linalg.det(left @ right) * hand < 0, -1.0, 1.0)
         left[:, :, 2] *= flip[:, None]

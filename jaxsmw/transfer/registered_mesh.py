@@ -22,10 +22,11 @@ DEFAULT_STIFFNESS = 0.003
 
 # The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
 _STIFFNESS_OF_MAPS = 0.01
-# The neighbourhoods whose similarity transformations the mesh follows are averaged this number of times. With
-# fewer averagings, the transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
+# The number of averagings that `Neighborhoods.similarities` makes. With fewer averagings, the similarity
+# transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
-# The transformations are fitted to the map, and once again to the result. (Entry R22)
+# The number of deformations: the first uses similarity transformations that are fitted to the map, the second
+# uses transformations that are fitted to the result of the first. (Entry R22)
 _FITS = 2
 # Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to
 # _REDUCTIONS times. (Entry R22)
@@ -81,8 +82,8 @@ class RegisteredMesh:
     def flipped_faces(self) -> Bool[np.ndarray, " f"]:
         """A mask (f,), True for faces that are turned over relative to their neighbourhoods.
 
-        The normal of such a face of the registered mesh opposes the normal of the face of X, rotated with its
-        neighbourhood.
+        The normal of such a face makes an angle of more than 90 degrees with its normal on X, after the
+        normal on X is rotated with the face's neighbourhood.
         """
         return _flipped_faces(self.mesh_x, self.vertices, self.similarities)
 
@@ -90,8 +91,8 @@ class RegisteredMesh:
     def area_ratios(self) -> Float64[np.ndarray, " f"]:
         """The area of each registered face divided by its area on X (f,), if both meshes have area 1.
 
-        The ratio is 1 where the map preserves area up to a common factor. The ratio of a face without area on
-        X is 1.
+        The ratio is 1 where the map preserves area up to a common factor. If a face has no area on X, its
+        ratio is 1.
         """
         own = self.mesh_x.face_areas / self.mesh_x.area
         return np.divide(self.mesh.face_areas / self.mesh.area, own, out=np.ones(len(own)), where=own > 0)
@@ -121,7 +122,7 @@ class RegisteredMesh:
     def points_of_target(self) -> SurfacePoints:
         """The point of X for each vertex of Y: n `SurfacePoints` on X, a map Y -> X.
 
-        The point of a vertex of Y is the nearest point of the registered mesh.
+        Each vertex of Y is projected onto the registered mesh, which has the faces of X.
         """
         return self._nearest_of_target[0]
 
@@ -160,18 +161,19 @@ def register_mesh(
 ) -> RegisteredMesh:
     """Deform X onto Y, so that its vertices follow a map and its triangles keep their shapes.
 
-    The positions minimise the squared distances to the points of the map, plus the squared stiffness times
-    the squared differences of edge vectors from rotated and scaled edge vectors of X. The rotations and
-    scales are those of neighbourhoods, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007), with a
-    scale. Where faces would flip, the map receives less weight.
+    The positions minimise a sum of two terms: the squared distances to the points of the map, and the squared
+    stiffness times the squared changes of edge vectors. Before the changes are measured, the edge vectors of
+    X are rotated and scaled with their neighbourhoods. The rotations are those of as-rigid-as-possible
+    deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map receives less
+    weight.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
     - `points`: the map X -> Y, as m `SurfacePoints` on Y; see `Correspondence.surface_points`.
-    - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with shorter
-      wavelengths is smoothed. The default is 0.003. With 0.03, a noisy map gives a smooth mesh that is
-      farther away from the target.
+    - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed if
+      its wavelength is shorter than the stiffness. The default is 0.003. A stiffness of 0.03 makes the
+      registered mesh of a noisy map smooth, but moves it farther away from the target.
     - `same_unit`: whether X and Y have the same unit of length, as partial shapes do. If False (the
       default), X is first scaled to the area of Y.
 
@@ -190,7 +192,7 @@ def register_mesh(
             "point for each vertex."
         )
     root = np.sqrt(mesh_y.area)
-    # Positions relative to the middle of Y keep the digits of meshes far from the origin.
+    # Positions are relative to the middle of Y, because large coordinates would lose digits.
     middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
     targets = points.positions(mesh_y) - middle
     around = Neighborhoods(mesh_x, 1.0 if same_unit else root / np.sqrt(mesh_x.area))
@@ -229,7 +231,8 @@ def points_of_map(
 ) -> SurfacePoints:
     """Convert a map to vertices into a map to points between the vertices.
 
-    X is first registered with a stiffness of several edge lengths, which removes the steps between vertices.
+    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The registration
+    smooths the map, whose matches jump from vertex to vertex.
 
     **Arguments:**
 
@@ -281,7 +284,7 @@ def _flipped_faces(
 
 
 def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:
-    """Return normals of the faces of a mesh whose vertices have other positions, in any length."""
+    """Return the face normals of a mesh at other vertex positions. The normals are not unit vectors."""
     corners = vertices[mesh.faces]
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 

@@ -15,8 +15,8 @@ from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, neares
 from jaxsmw.io.formats.data import Texture, texture_at_corners, texture_of_corners
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
-# Texture vertices of one vertex are the same if their coordinates round to the same multiple of this fraction
-# of the extent of all texture coordinates.
+# Texture vertices of one vertex are merged if their coordinates are equal after rounding to a grid. The
+# spacing of the grid is this fraction of the extent of all texture coordinates.
 _SAME = 1e-7
 # The number of points that walk over the mesh at the same time, which limits the memory.
 _BLOCK = 20_000
@@ -28,8 +28,9 @@ def transfer_texture(
     """Transfer texture coordinates from X to Y.
 
     The registered mesh is cut along the seams of the texture. The centroid of each face of Y lies on one side
-    of a seam. The corners of the face have the coordinates of their nearest points on the same side. Thus a
-    seam that does not separate two charts, such as the seam of a cylinder, is respected as well.
+    of a seam. Each corner of the face receives the texture coordinates at its nearest point on the same side
+    as the centroid. Thus a seam that does not separate two charts, such as the seam of a cylinder, is
+    respected as well.
 
     **Arguments:**
 
@@ -83,9 +84,11 @@ def _best_of_sides(
     near: Bool[np.ndarray, " f"],
     lengths: Float64[np.ndarray, " c"],
 ) -> Int64[np.ndarray, " c"]:
-    """Return for each corner (c = 3 f) the corner of the same vertex and side whose walk came nearest.
+    """Choose one corner for all corners that have the same vertex and lie on the same side of the seams.
 
-    Along a jagged seam, walks from different faces on one side can end at different points.
+    The chosen corner is the corner whose walk ended nearest to the vertex. The result contains, for each
+    corner, the chosen corner (c = 3 f). Without this choice, walks from different faces on one side of a
+    jagged seam could end at different points.
     """
     tail, head = np.arange(3 * len(faces)), np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, 1).ravel()
     vertex = faces.ravel()
@@ -123,7 +126,10 @@ class _CutSurface:
 
     @cached_property
     def neighbors(self) -> csr_array:
-        """The triangles that share a texture vertex, including each triangle itself (f, f)."""
+        """The adjacency matrix (f, f) of triangles that share a texture vertex.
+
+        Each triangle is adjacent to itself.
+        """
         f = len(self.faces)
         entries = np.ones(3 * f), self.faces.ravel(), 3 * np.arange(f + 1)
         corners = csr_array(entries, shape=(f, int(self.faces.max()) + 1))
@@ -132,7 +138,7 @@ class _CutSurface:
     def walk(
         self, goals: Float64[np.ndarray, "p 3"], start: Int64[np.ndarray, " p"]
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        """Walk from triangles to the nearest points of the goals, without crossing a seam.
+        """Walk from triangles towards goals without crossing a seam.
 
         Each step leads to the neighbour nearest to the goal. Return the last triangle (p,), the barycentric
         weights of its point nearest to the goal (p, 3), and the distance to this point (p,).
@@ -154,7 +160,10 @@ class _CutSurface:
     def _nearest_neighbor(
         self, goals: Float64[np.ndarray, "p 3"], triangles: Int64[np.ndarray, " p"]
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        """Return the neighbour of each triangle that is nearest to its goal, its weights and its distance."""
+        """Return the neighbour of each triangle that is nearest to the triangle's goal.
+
+        Also return the barycentric weights of the neighbour's nearest point, and the distance to this point.
+        """
         indptr = self.neighbors.indptr.astype(np.int64)
         first, counts = indptr[triangles], indptr[triangles + 1] - indptr[triangles]
         begin = np.cumsum(counts) - counts

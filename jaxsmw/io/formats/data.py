@@ -135,7 +135,7 @@ class MeshData:
             if not name or array.ndim not in (1, 2) or array.dtype.kind not in "biuf" or not array.shape[-1]:
                 raise self._fail(
                     f"the {what} {name!a} are {array.dtype.name} of shape {array.shape}: give each array a "
-                    "name, and one number or one row of numbers per row."
+                    f"name, and one number or one row of numbers for each {noun}."
                 )
             if len(array) != count:
                 raise self._fail(
@@ -198,7 +198,10 @@ def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
 
 
 def _canonical(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous copy in native byte order. Types that few formats know become wider types."""
+    """Return a contiguous copy in native byte order.
+
+    Booleans become uint8, float16 becomes float32, and extended precision becomes float64.
+    """
     kind = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
     wanted = kind.get(array.dtype.str[1:], kind.get(array.dtype.kind, array.dtype.newbyteorder("=")))
     return np.array(array, dtype=wanted, order="C")
@@ -226,12 +229,12 @@ class Written(NamedTuple):
 
 
 def always(name: str, values: Any) -> bool:
-    """A value for arguments of `omissions`: the format can hold everything of this kind."""
+    """An argument for `omissions` which says that the format can hold every element of an attribute."""
     return True
 
 
 def never(name: str, values: Any) -> bool:
-    """A value for arguments of `omissions`: the format can hold nothing of this kind."""
+    """An argument for `omissions` which says that the format can hold no element of an attribute."""
     return False
 
 
@@ -241,8 +244,9 @@ def omissions(data: MeshData, form: str, **holds: Callable[[str, Any], bool]) ->
     **Arguments:**
 
     - `form`: the name of the format.
-    - `holds`: a function for each attribute of `MeshData`. The function returns whether the format can hold
-      an element of the attribute with a given name and value. Missing functions mean `never`.
+    - `holds`: functions, named after attributes of `MeshData`. Each function receives the name and the value
+      of an element of its attribute. It returns whether the format can hold this element. Missing functions
+      mean `never`.
     """
     skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
     kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
@@ -308,7 +312,7 @@ def is_texture_of_vertices(data: MeshData) -> bool:
 
 def unique_name(name: str, taken: Collection[str]) -> str:
     """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
-    chosen, number = name, len(taken)  # a smaller first number would take long if many names are equal
+    chosen, number = name, len(taken)  # counting from 1 is slow for many equal names
     while chosen in taken:
         number += 1
         chosen = f"{name} ({number})"

@@ -14,7 +14,8 @@ from jaxsmw.geometry.mesh import count_of, first_equal_rows
 from jaxsmw.io.formats.data import COLORS, Polygons, Skin, unique_name, unique_names
 from jaxsmw.io.formats.gltf_accessors import COLUMNS, DAMAGED, Document, as_floats
 
-# The largest numbers of vertices, of corners, of vertices times blend shapes, and of vertices times joints.
+# The largest numbers of vertices, of corners, of displacements of blend shapes (one per vertex and blend
+# shape), and of weights of joints (one per vertex and joint).
 LARGEST_VERTICES, LARGEST_CORNERS, LARGEST_SHAPES, LARGEST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
 RECORD = "jaxsmw"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -27,7 +28,7 @@ def parse_gltf(data: bytes, folder: Path) -> Polygons:
 
 
 def parse_glb(data: bytes) -> Polygons:
-    """Parse a binary file with its own buffer."""
+    """Parse a binary file, which contains its buffer."""
     if data[:4] != b"glTF":
         raise InputError("does not begin with glTF: export the mesh again as a .glb file.")
     return _Scene(Document(data, None)).polygons()
@@ -35,7 +36,7 @@ def parse_glb(data: bytes) -> Polygons:
 
 @dataclass
 class _Part:
-    """The vertices of one or more primitives with the same attributes, with their data.
+    """Vertices and their data, from one primitive or from several primitives with the same attributes.
 
     `joints` contains the numbers of nodes (n, k), and `weights` their weights (n, k).
     """
@@ -197,7 +198,10 @@ class _Scene:
     def _skin(
         self, attributes: dict[str, Any], nodes: list[Any] | None, n: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers of the nodes that are joints of each vertex, and their weights (n, 4 sets)."""
+        """Return the joints of each vertex, as numbers of nodes, and their weights.
+
+        Both arrays have the shape (n, 4 s) for s sets of attributes JOINTS_i and WEIGHTS_i.
+        """
         document = self.document
         sets: list[tuple[np.ndarray, np.ndarray]] = []
         while nodes is not None and f"JOINTS_{len(sets)}" in attributes:
@@ -339,7 +343,7 @@ def _has_copies(vertices: np.ndarray) -> bool:
 
 
 def _without_copies(polygons: Polygons, record: dict[str, Any], document: Document) -> Polygons:
-    """Join the copies of vertices that `format_gltf` made along texture seams, and recorded."""
+    """Join the copies of vertices that `format_gltf` made along texture seams and listed in `record`."""
     n = len(polygons.vertices)
     original, texture = (
         document.view(record.get(key), 0, n, "i4", 1)[:, 0].astype(np.int64)

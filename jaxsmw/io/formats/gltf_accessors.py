@@ -124,7 +124,7 @@ class Document:
         items = self.list_of(self.json, key)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             number = index if isinstance(index, int) and abs(index) < 2**63 else excerpt(str(index)[:99])
-            raise InputError(f"uses number {number} of {len(items)} {key}, {DAMAGED}")
+            raise InputError(f"uses {key}[{number}], but the length of {key} is {len(items)}, {DAMAGED}")
         if not isinstance(items[index], dict):
             self.refuse(key)
         return items[index]
@@ -204,7 +204,9 @@ class Document:
     def accessor(
         self, index: Any, columns: tuple[int, ...], rows: int | None = None
     ) -> tuple[np.ndarray, bool]:
-        """Return the numbers of an accessor (rows, columns), and whether they are fractions of the largest.
+        """Return the numbers of an accessor (rows, columns), and whether they are fractions.
+
+        Fractions are integers that `as_floats` divides by the largest integer of their type.
 
         **Arguments:**
 
@@ -222,7 +224,7 @@ class Document:
         if "bufferView" in description:
             offset = self.integer(description, "byteOffset", 0)
             values = self.view(description["bufferView"], offset, count, kind, width)
-        elif rows is None:  # nothing limits the number of elements
+        elif rows is None:  # without data, the number of elements has no limit
             raise InputError(f"accessor {index} has no buffer view, {DAMAGED}")
         else:
             values = np.zeros((count, width), kind)
@@ -246,7 +248,10 @@ class Document:
 
 
 def as_floats(values: np.ndarray, is_fraction: bool) -> np.ndarray:
-    """Return numbers of an accessor as float64. Fractions are divided by the largest integer of the type."""
+    """Return numbers of an accessor as float64.
+
+    If the numbers are fractions, they are divided by the largest integer of their type.
+    """
     if not is_fraction:
         return values.astype(np.float64)
     return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)

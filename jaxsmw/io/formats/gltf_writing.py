@@ -97,7 +97,10 @@ class _File:
         return {"POSITION": self.accessor(_single(moves)[self.original], _VERTICES, limits=True)}
 
     def add_skin(self, attributes: dict[str, int]) -> None:
-        """Add a skin whose joints are nodes below one root. Each set of attributes has four joints."""
+        """Add a skin whose joints are nodes below one root.
+
+        Each pair of attributes JOINTS_i and WEIGHTS_i contains four joints per vertex.
+        """
         assert self.data.skin is not None
         names, weights = self.data.skin
         if len(names) > 65535:
@@ -125,7 +128,7 @@ class _File:
         identity = np.tile(np.eye(4, dtype=np.float32).ravel(), (len(names), 1))
         matrices = {"bufferView": self.view(identity), "componentType": _COMPONENTS["f4"]}
         self.json["accessors"].append(matrices | {"count": len(names), "type": "MAT4"})
-        # The matrices may be missing, but VTK 9.7 ends the process then.
+        # These matrices are optional in glTF, but VTK 9.7 ends the process if they are missing.
         self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
 
     def view(self, values: np.ndarray, target: int | None = None) -> int:

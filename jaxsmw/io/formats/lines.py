@@ -1,4 +1,4 @@
-"""Numbers in lines of text files."""
+"""Readers of the numbers in lines of text files."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def parse_obj(data: bytes) -> Polygons:
         raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
-    face_at = cache(lambda: [match.start() for match in face.finditer(content)])  # only if it is needed
+    face_at = cache(lambda: [match.start() for match in face.finditer(content)])  # found on demand
     corners = _counted_backward(corners, sizes, vertex, face_at, content)
     labels, names = _labels(content, face_at)
     return Polygons(
@@ -62,7 +62,7 @@ def _counted_backward(
     face_at: Callable[[], list[int]],
     content: str,
 ) -> np.ndarray:
-    """Replace negative indices, which count backward from the last element above their face."""
+    """Replace negative indices, where -1 is the last element that precedes the face."""
     if not (corners < 0).any():
         return corners
     element_at = [match.start() for match in pattern.finditer(content)]
@@ -129,7 +129,7 @@ def _labels(
 
 
 def _decoded(name: str) -> str:
-    """Decode a name that was decoded as Latin-1, if its bytes are UTF-8."""
+    """Return a name, which was decoded as Latin-1, as UTF-8 text if its bytes are valid UTF-8."""
     try:
         return name.encode("latin-1").decode("utf-8")
     except UnicodeDecodeError:

@@ -60,7 +60,7 @@ def _within(corners: np.ndarray, n: int) -> bool:
 def _vertex_data(lines: list[str], keyword: str) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
     """Return normals and colours, and texture coordinates, from the columns after the positions.
 
-    Lines may have fewer numbers than the keyword announces. Then the file has no such data.
+    If a line has fewer numbers than the keyword announces, all columns after the positions are ignored.
     """
     first = len(lines[0].split()) if keyword and lines else 0
     normals, coordinates = 3 * ("N" in keyword), 2 * ("ST" in keyword)

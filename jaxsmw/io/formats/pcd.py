@@ -73,7 +73,7 @@ def _header(data: bytes) -> tuple[_Header, bytes]:
     names = entries.get("FIELDS", entries.get("COLUMNS", []))
     counts = entries.get("COUNT", ["1"] * len(names))
     described = list(zip(names, entries.get("SIZE", []), entries.get("TYPE", []), counts, strict=False))
-    # A field without data would be named twice otherwise, for example the padding `_`.
+    # All padding fields have the name `_`, but the fields of a record type need different names.
     fields = [
         (name if name != _PADDING else f"{_PADDING}{at}", *rest) for at, (name, *rest) in enumerate(described)
     ]
@@ -153,9 +153,9 @@ def _decompress(body: bytes, header: _Header) -> bytes:
 def lzf_decompressed(packed: bytes, size: int) -> bytes:
     """Decompress data in the LZF format of Marc Lehmann's LibLZF.
 
-    A control byte below 32 precedes that number plus one of literal bytes. Any other control byte begins a
-    copy of earlier output: its upper three bits give the length, and its lower five bits and the next byte
-    give the distance.
+    After a control byte c below 32, c + 1 literal bytes follow. Any other control byte means a copy of
+    earlier output. Its upper three bits are the length minus 2; if they are all set, the next byte is added
+    to the length. Its lower five bits and the following byte are the distance minus 1.
 
     **Raises:** `InputError` if the data is damaged, or has another size.
     """
@@ -176,7 +176,7 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
             at += 1
             if start < 0 or len(out) > size:
                 raise IndexError
-            # A copy may overlap its own end, so it repeats the bytes from `start`.
+            # If a copy is longer than the output after `start`, the bytes after `start` are repeated.
             repeated = out[start : start + length + 2]
             out += (repeated * (length + 2))[: length + 2] if len(repeated) < length + 2 else repeated
     except IndexError:

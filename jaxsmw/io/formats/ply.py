@@ -38,7 +38,7 @@ class _Property(NamedTuple):
     """A property of a PLY element, which has one number or one list of numbers per row.
 
     `type` is the type of the numbers in the body, and `declared` is their type in the header. `length` is the
-    type of the lengths of the lists, or None for a property with one number per row.
+    type in which the lengths of the lists are stored, or None if each row has one number.
     """
 
     type: np.dtype
@@ -164,7 +164,7 @@ def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _texture(
     of_corners: _Column | None, faces: _Column, vertex_data: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the texture of the faces' lists `texcoord`, or of two properties of the vertices."""
+    """Return the texture from the face property `texcoord`, or from vertex properties such as `s`, `t`."""
     corners = faces.values
     if of_corners is not None and of_corners.sizes.any():
         given = of_corners.sizes > 0
@@ -265,9 +265,9 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """Return the span of each property in a row, and the offset of the row's end.
+    """Return the place of each property in a row, and the offset at which the row ends.
 
-    A span consists of the offset of the property's first value and the number of the property's values.
+    A place is a pair: the offset of the property's first value, and the number of the property's values.
 
     **Raises:** `EOFError` if the body ends within the row.
     """
@@ -334,8 +334,8 @@ def format_ply(data: MeshData) -> Written:
 def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[str, np.ndarray], set[str]]:
     """Return a dictionary from property names to columns, and the names of arrays that do not fit.
 
-    An array does not fit if its name is not a plain word or belongs to another property, or if an integer
-    needs more than 53 bits.
+    An array does not fit if its name contains blanks or characters outside ASCII, or if another property has
+    the same name. An array with an integer of more than 53 bits does not fit either.
     """
     columns: dict[str, np.ndarray] = {}
     lost = set()
@@ -354,7 +354,10 @@ def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[s
 
 
 def _storable(values: np.ndarray) -> np.ndarray | None:
-    """Return values in a type that PLY files know. Long integers become int32 or float64 if they fit."""
+    """Return values in a data type of PLY files, or None if their integers are too large.
+
+    Long integers become int32 or float64 if these types can represent them.
+    """
     if values.dtype.str[1:] in _TYPE_NAMES:
         return values
     for kind in (np.int32, np.float64):

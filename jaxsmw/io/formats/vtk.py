@@ -37,7 +37,7 @@ _NAMES = {
     **{"u4": "unsigned_int", "i8": "vtktypeint64", "u8": "vtktypeuint64", "f4": "float", "f8": "double"},
 }
 _KINDS = {"VERTICES": VERTEX, "LINES": LINE, "POLYGONS": POLYGON, "TRIANGLE_STRIPS": STRIP}
-# The number of columns of the attributes that do not declare it.
+# The numbers of columns of those attributes whose first line does not declare this number.
 _COLUMNS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1}
 _COLUMNS["EDGE_FLAGS"] = 1
 
@@ -130,7 +130,7 @@ class _File:
                 add_array(data, unquote(name), values)
             case ["COLOR_SCALARS", name, columns]:
                 values = self.take(self.rows, _count(columns), "unsigned_char" if self.binary else "float")
-                if not self.binary:  # text has floats from 0 to 1
+                if not self.binary:  # text files contain floats from 0 to 1
                     values = np.rint(255 * np.clip(np.nan_to_num(values), 0, 1)).astype(np.uint8)
                 add_array(data, unquote(name), values)
             case ["LOOKUP_TABLE", _, size]:
@@ -207,7 +207,7 @@ class _File:
         return np.frombuffer(self.data, ">" + kind, count, start).astype(kind)
 
     def take_words(self, count: int, kind: str) -> np.ndarray:
-        if 2 * count > len(self.data) - self.position + 1:  # a digit and a space per number
+        if 2 * count > len(self.data) - self.position + 1:  # a number takes at least a digit and a space
             self.truncated(count)
         words: list[str] = []
         while len(words) < count:
@@ -226,14 +226,14 @@ class _File:
         )
 
     def skip_strings(self, count: int) -> None:
-        """Skip strings: lines of text, or in a binary file strings with their lengths before them."""
+        """Skip strings. In a text file, each string is a line. In a binary file, its length precedes it."""
         for _ in range(count):
             if not self.binary:
                 if self.raw_line() is None:
                     self.truncated(count)
                 continue
             head = self.data[self.position : self.position + 8]
-            # The two highest bits determine the number of bytes of the length.
+            # The two highest bits determine how many bytes the length of the string takes.
             size = (8, 4, 2, 1)[head[0] >> 6] if head else 1
             length = int.from_bytes(head[:size], "big") & ((1 << (8 * size - 2)) - 1)
             self.position += size + length
@@ -299,7 +299,7 @@ def format_vtk(data: MeshData) -> Written:
 
 
 def _field(arrays: dict[str, np.ndarray]) -> list[bytes]:
-    """Return a FIELD with arrays."""
+    """Return the lines and bytes of a FIELD that contains the arrays."""
     parts = [f"FIELD FieldData {len(arrays)}\n".encode()] if arrays else []
     for name, values in arrays.items():
         columns = values.shape[1] if values.ndim == 2 else 1

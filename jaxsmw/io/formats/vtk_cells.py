@@ -52,7 +52,7 @@ def cells_of(kind: int, offsets: np.ndarray, corners: np.ndarray) -> Cells:
 
 
 def joined(groups: list[Cells]) -> Cells:
-    """Join groups of cells, in their order."""
+    """Concatenate groups of cells."""
     if not groups:
         return Cells(*(np.empty(0, np.int64) for _ in range(3)))
     return Cells(*(np.concatenate(parts) for parts in zip(*groups, strict=True)))
@@ -127,7 +127,10 @@ def _within(corners: np.ndarray, n: int) -> bool:
 
 
 def _without_strips(cells: Cells, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sizes and corners of the polygons and strip triangles, and the cell of each of them."""
+    """Split triangle strips into triangles, and drop the cells that are not used.
+
+    Return the size of each polygon, the corners of all polygons, and the cell from which each polygon comes.
+    """
     start = np.cumsum(cells.sizes) - cells.sizes
     strip = cells.kinds == STRIP
     if (cells.sizes[strip] < 3).any():
@@ -145,7 +148,10 @@ def _without_strips(cells: Cells, used: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> str:
-    """Add an array with one row per point or cell, and return its name, which may get a number."""
+    """Add an array with one row per point or cell, and return its name.
+
+    If the name is already taken, the array receives a name with a number.
+    """
     chosen = unique_name(name or "unnamed", data)
     data[chosen] = values[:, 0] if values.shape[1] == 1 else values
     return chosen

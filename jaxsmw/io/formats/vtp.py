@@ -38,7 +38,7 @@ _TYPES = {
     **{"Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8"},
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-# The groups of cells in the order in which the data of cells lists them.
+# The kinds of cells. The rows of cell data follow this order.
 _KINDS = {"Verts": VERTEX, "Lines": LINE, "Polys": POLYGON, "Strips": STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCompressor"}
 
@@ -142,7 +142,7 @@ class _File:
         return found, coordinates
 
     def cells(self, piece: ElementTree.Element, tag: str) -> Cells:
-        """Return the cells of a piece of one type."""
+        """Return the cells of one kind that a piece contains."""
         count = _integer(piece, f"NumberOf{tag}", 0)
         arrays = {one.get("Name"): one for one in piece.findall(f"{tag}/DataArray")}
         if not count:
@@ -183,7 +183,10 @@ class _File:
         return values.reshape(rows, columns)
 
     def decode(self, content: bytes, is_raw: bool, count: int, kind: str) -> np.ndarray:
-        """Return numbers from raw bytes or base64, which begin with their size and may be compressed."""
+        """Decode the numbers of an array from raw bytes or base64.
+
+        The data begins with its size, and can be compressed.
+        """
         expected = count * np.dtype(kind).itemsize
         if expected > self.budget:
             raise InputError(f"declares {count_of(count, 'number')}, more than the file contains, {DAMAGED}")
@@ -242,7 +245,7 @@ def _unpack_lz4(packed: bytes, size: int) -> bytes:
 
 
 class _Stream:
-    """Bytes that are stored as they are, or as several base64 texts, one after another."""
+    """A stream of raw bytes, or of bytes in several consecutive base64 texts."""
 
     def __init__(self, content: bytes, is_raw: bool) -> None:
         self.content, self.is_raw, self.position = content, is_raw, 0
@@ -254,7 +257,7 @@ class _Stream:
         return found
 
     def take(self, size: int) -> bytes:
-        """Return the next bytes. The next call begins at the end of their base64 text."""
+        """Return the next `size` bytes. Base64 is read to the end of its group of four characters."""
         length = size if self.is_raw else (size + 2) // 3 * 4
         part = self.content[self.position : self.position + length]
         self.position += length

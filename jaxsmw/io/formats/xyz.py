@@ -14,8 +14,8 @@ from jaxsmw.io.formats.lines import numbers, text
 from jaxsmw.io.formats.npz import check_header
 from jaxsmw.io.text import is_number
 
-# Columns 4 to 6 are normals if the lengths of all rows are within this distance of 1. Otherwise the columns
-# contain something else, such as colours.
+# Columns 4 to 6 are normals if all their vectors have a length that differs from 1 by at most this number.
+# Otherwise the columns contain something else, such as colours.
 _UNIT = 0.01
 
 
