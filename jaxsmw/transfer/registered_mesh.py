@@ -25,12 +25,12 @@ _STIFFNESS_OF_MAPS = 0.01
 # The number of averagings that `Neighborhoods.similarities` makes. With fewer averagings, the similarity
 # transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
-# The number of deformations: the first uses similarity transformations that are fitted to the map, the second
-# uses transformations that are fitted to the result of the first. (Entry R22)
-_FITS = 2
-# Each fit reduces the weights of the map at flipped faces and their neighbours by this factor, up to
-# _REDUCTIONS times. (Entry R22)
-_REDUCED, _REDUCTIONS = 0.2, 4
+# The mesh is deformed up to `_DEFORMATIONS` times. After each deformation, the weights of the map are
+# multiplied by `_REDUCED` at flipped faces and at vertices up to `_NEIGHBOURS` edges away. (Entry R22)
+_DEFORMATIONS, _REDUCED, _NEIGHBOURS = 9, 0.4, 2
+# Regions with reduced weights are then pulled to the target `_PULLS` times. `_PULL` is the weight of the
+# pull, relative to the weight of the map elsewhere. (Entry R22)
+_PULLS, _PULL = 3, 0.1
 # The relative residual at which the linear solver stops.
 _TOLERANCE = 1e-5
 
@@ -164,8 +164,8 @@ def register_mesh(
     The positions minimise a sum of two terms: the squared distances to the points of the map, and the squared
     stiffness times the squared changes of edge vectors. Before the changes are measured, the edge vectors of
     X are rotated and scaled with their neighbourhoods. The rotations are those of as-rigid-as-possible
-    deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map receives less
-    weight.
+    deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, vertices follow
+    the nearest points of Y instead.
 
     **Arguments:**
 
@@ -201,17 +201,31 @@ def register_mesh(
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
     positions, similarities = targets, around.similarities(targets, _AVERAGINGS)
     weights = areas.copy()
-    for _ in range(_FITS):
+
+    def deform() -> None:
+        nonlocal positions, similarities
         edge_vectors = around.transformed(similarities)
-        for reduction in range(_REDUCTIONS + 1):
-            positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
-            similarities = around.similarities(positions, _AVERAGINGS)
-            flipped = _flipped_faces(mesh_x, positions, similarities)
-            if reduction == _REDUCTIONS or not flipped.any():
-                break
-            corners = np.zeros(len(weights))
-            corners[mesh_x.faces[flipped]] = 1
-            weights = np.where(around.averaging @ corners > 0, _REDUCED * weights, weights)
+        positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
+        similarities = around.similarities(positions, _AVERAGINGS)
+
+    for number in range(_DEFORMATIONS):
+        deform()
+        flipped = _flipped_faces(mesh_x, positions, similarities)
+        # The first deformation uses transformations that are fitted to the map itself, which is noisy.
+        if number > 0 and not flipped.any():
+            break
+        near = np.zeros(len(weights))
+        near[mesh_x.faces[flipped]] = 1
+        for _ in range(_NEIGHBOURS):
+            near = around.averaging @ near
+        weights = np.where(near > 0, _REDUCED * weights, weights)
+    loose = weights < areas
+    if loose.any():
+        weights = np.where(loose, _PULL * areas, weights)
+        for _ in range(_PULLS):
+            nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
+            targets[loose] = nearest.positions(mesh_y) - middle
+            deform()
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
     return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
 
