@@ -349,19 +349,18 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"shot"`. If both shapes differ from their own mirror images, as teeth do,
-          and `partial` is False, then `"shot"` and `"aligned"` are both refined. The map with the smaller
-          mean `expected_error` is returned.
-        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to
-          the vertex of Y with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
+        - `"auto"` (the default): `"aligned"` if both shapes differ from their own mirror images, as teeth do,
+          and `partial` is False; otherwise `"shot"`.
+        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
+          with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative initial maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
           with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
           `"shot"` and has smaller errors. However, the refined map often has larger errors than with `"shot"`
           (docs/results.md).
-        - `"aligned"`: the initial map sends each vertex of X to the nearest vertex of Y in space, after X was
-          scaled to the area of Y and aligned rigidly. Use this map for shapes that differ little in pose,
-          such as teeth and bones.
+        - `"aligned"`: X is scaled to the area of Y and aligned rigidly. The initial map sends each vertex of
+          X to the vertex of Y with the most similar SHOT descriptor and position. Use this map for shapes
+          that differ little in pose, such as teeth and bones.
         - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
           0-based. The initial map then sends each vertex of X to the vertex of Y with the most similar
@@ -408,9 +407,9 @@ def match(
     of_one_hand = pair.mirrored() if mirror == "yes" else pair
     compiling = _compile_ahead(pair, chosen, history)
     automatic = isinstance(init, str) and init == "auto"
+    first_init = DEFAULT_INITIAL_MAP if automatic else init
     prepare_hand = functools.partial(
         prepare,
-        init=DEFAULT_INITIAL_MAP if automatic else init,
         laplacian=laplacian,
         eigensolver=eigensolver,
         number_of_eigenvectors=chosen.number_of_eigenvectors,
@@ -418,41 +417,29 @@ def match(
         number_of_samples=chosen.number_of_samples,
         descriptors_required=not adapts,
     )
-    prepared = prepare_hand(of_one_hand)
+    prepared = prepare_hand(of_one_hand, init=first_init)
     seconds = dict(prepared.seconds)
     decision = Decision(mirror == "yes")
     if (mirror == "auto" or automatic) and not partial:
         with timed("mirror test", seconds):
             decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide(mirror)
+        init = "aligned" if automatic and decision.asymmetric else first_init
+        again = None
         if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
-            prepared = prepare_hand(pair.mirrored())
-            seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
-    starts = [prepared]
-    if automatic and decision.asymmetric:
-        with timed("initial map", seconds):
-            starts.append(prepared.started_from("aligned"))
+            again = prepare_hand(pair.mirrored(), init=init)
+        elif automatic and decision.asymmetric:
+            again = prepared.started_from("aligned")
+        if again is not None:
+            prepared = again
+            seconds |= {step: seconds[step] + time for step, time in again.seconds.items()}
     if prepared.spectrum_x.descriptors is None:
         chosen = chosen.without_descriptors()
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
-        outcomes = [
-            refine_in_stages(start, chosen.stages, chosen.repair, history=history) for start in starts
-        ]
-        jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
-    # A failed outcome counts only if all outcomes failed.
-    candidates = [
-        (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
-    ] or [(prepared, outcomes[0])]
-    found = [
-        _correspondence(pair, start, chosen, outcome, seconds, decision) for start, outcome in candidates
-    ]
-    best = 0
-    if len(found) > 1:
-        with timed("expected error", seconds):
-            best = int(np.argmin([one.expected_error().mean() for one in found]))
-    _warn_if_suspicious(*candidates[best], chosen, decision)
-    return found[best]
+        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
+        jax.block_until_ready(outcome.refinements[-1])
+    return _correspondence(pair, prepared, chosen, outcome, seconds, decision)
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -477,7 +464,7 @@ def _correspondence(
     seconds: dict[str, float],
     decision: Decision,
 ) -> Correspondence:
-    """Make the result of `match`.
+    """Make the result of `match`, and issue a warning if the result is suspicious.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -485,6 +472,11 @@ def _correspondence(
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
+    if outcome.suspicious:
+        assert preset.repair is not None
+        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
+    if decision.doubtful:
+        warnings.warn(_doubt(pair, decision), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -504,14 +496,6 @@ def _correspondence(
         mirror_evidence=decision.evidence,
         seconds=seconds,
     )
-
-
-def _warn_if_suspicious(prepared: PreparedPair, outcome: Outcome, preset: Preset, decision: Decision) -> None:
-    if outcome.suspicious:
-        assert preset.repair is not None
-        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
-    if decision.doubtful:
-        warnings.warn(_doubt(prepared.pair, decision), stacklevel=3)
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:

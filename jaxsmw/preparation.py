@@ -66,12 +66,14 @@ class PreparedPair:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def started_from(self, init: InitialMap) -> PreparedPair:
-        """Return the prepared pair with the initial map of another name.
+        """Return the prepared pair with another initial map. Its `seconds` contain only this step.
 
-        **Raises:** As `jaxsmw.initial_map`.
+        **Raises:** `InputError` or `ArithmeticError` if `jaxsmw.initial_map` cannot compute the map.
         """
-        start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init)
-        return replace(self, init=init, initial_map=start)
+        seconds: dict[str, float] = {}
+        with timed("initial map", seconds):
+            start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init)
+        return replace(self, init=init, initial_map=start, seconds=seconds)
 
     @cached_property
     def padded(self) -> tuple[Spectrum, Spectrum]:

@@ -118,13 +118,13 @@ def test_the_hands_of_a_partial_pair_are_not_compared(lump):
 def test_decisions():
     settings = ChiralitySettings()
     clear, near = settings.mirrored_from + 1, settings.mirrored_from + settings.doubt / 2
-    assert decide(clear, 1.0) == (True, clear, False)
-    assert decide(-clear, 1.0) == (False, -clear, False)
-    assert decide(near, 1.0) == (True, near, True)
-    assert decide(near - settings.doubt, 1.0) == (False, near - settings.doubt, True)
+    assert decide(clear, 1.0) == (True, clear, False, True)
+    assert decide(-clear, 1.0) == (False, -clear, False, True)
+    assert decide(near, 1.0) == (True, near, True, True)
+    assert decide(near - settings.doubt, 1.0) == (False, near - settings.doubt, True, True)
     nearly_symmetric = settings.asymmetric_from - settings.asymmetry_doubt / 2
-    assert decide(clear, nearly_symmetric) == (False, clear, True)
-    assert decide(-clear, nearly_symmetric) == (False, -clear, False)
+    assert decide(clear, nearly_symmetric) == (False, clear, True, False)
+    assert decide(-clear, nearly_symmetric) == (False, -clear, False, False)
 
 
 def test_a_shape_that_is_its_own_mirror_image_has_no_asymmetry(lump):
@@ -146,7 +146,7 @@ def test_symmetric_shapes_are_not_compared(lump, monkeypatch):
     monkeypatch.setattr(Hands, "asymmetry", lambda self: 0.4)
     monkeypatch.setattr(Hands, "evidence", lambda self: pytest.fail("compared"))
     pair = Pair.make(lump, turned(lump))
-    assert Hands(pair, *paired_spectra(pair, 20)).decide() == (False, None, False)
+    assert Hands(pair, *paired_spectra(pair, 20)).decide() == (False, None, False, False)
 
 
 @pytest.mark.parametrize(("evidence", "mirrored"), [(0.03, False), (0.07, True)])

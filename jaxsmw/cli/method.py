@@ -63,13 +63,12 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
-        "%(default)s). auto is shot; for shapes that differ from their own mirror images, like teeth, auto "
-        "refines both shot and aligned, and keeps the map with the smaller expected error. With shot, wks, "
-        "hks and wavelet, each source vertex is matched to the target vertex with the most similar "
-        "descriptor. With aligned, each source vertex is matched to the nearest target vertex after a rigid "
-        "alignment. functional computes a functional map that preserves SHOT "
-        "descriptors. A landmarks file has a source and a target vertex per line. Two landmark "
-        "files contain named points on the source and on the target, in the formats of "
+        "%(default)s). auto is aligned for shapes that differ from their own mirror images, like teeth, and "
+        "shot for other shapes. With shot, wks, hks and wavelet, each source vertex is matched to the target "
+        "vertex with the most similar descriptor. aligned also compares positions after a rigid alignment. "
+        "functional computes a functional map that preserves SHOT descriptors. A landmarks file has a "
+        "source and a target vertex per line. Two landmark files contain named points on the source and on "
+        "the target, in the formats of "
         "transfer --landmarks. wks, hks and wavelet do not distinguish left from right",
     )
     group.add_argument(

@@ -5,20 +5,36 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jaxsmw.descriptors import SampledPair
+from jaxsmw.descriptors import SampledPair, paired_shot
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.sampling import poisson_disk_samples
 
 # The alignment uses about this number of evenly spread samples per shape.
 _SAMPLES = 2000
+# The weight of positions, in units of the square root of the area, relative to SHOT. (Entry R24)
+_POSITION_WEIGHT = 3.0
 
 
-def aligned_positions(sampled: SampledPair) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]:
-    """Align X with Y rigidly, in comparable units, and return the positions of the compared vertices.
+def aligned_features(sampled: SampledPair) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+    """Align X with Y rigidly, and return SHOT and weighted positions of the compared vertices.
 
     **Arguments:**
 
     - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+
+    **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex and d = 355.
+    The positions of X are those after the alignment.
+
+    **Raises:** `InputError` if a mesh is too coarse for SHOT.
+    """
+    return tuple(  # type: ignore[return-value]
+        np.hstack([shot, _POSITION_WEIGHT * positions])
+        for shot, positions in zip(paired_shot(sampled), _aligned_positions(sampled), strict=True)
+    )
+
+
+def _aligned_positions(sampled: SampledPair) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]:
+    """Align X with Y rigidly, in comparable units, and return the positions of the compared vertices.
 
     **Returns:** The positions of X after the alignment (m, 3) and of Y (n, 3), with one row per compared
     vertex, in the units of `Pair.units_of_length`.

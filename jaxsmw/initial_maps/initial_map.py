@@ -14,7 +14,7 @@ from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import extend_to_unreferenced
-from jaxsmw.initial_maps.alignment import aligned_positions
+from jaxsmw.initial_maps.alignment import aligned_features
 from jaxsmw.initial_maps.functional import functional_features
 from jaxsmw.initial_maps.landmarks import landmark_features
 from jaxsmw.initial_maps.nearest import nearest_map
@@ -48,8 +48,8 @@ def initial_map(
           signature or the wavelet signature, which do not distinguish left from right.
         - `"functional"`: a pointwise map computed from a functional map that preserves SHOT and commutes with
           the Laplacian.
-        - `"aligned"`: nearest neighbours in space, after X was scaled to the area of Y and aligned rigidly.
-          Use this map for rigid shapes such as teeth and bones.
+        - `"aligned"`: nearest neighbours in SHOT descriptors and in space, after X was scaled to the area of
+          Y and aligned rigidly. Use this map for rigid shapes such as teeth and bones.
         - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
         - m `SurfacePoints` on Y: a map to points on faces. Each point is replaced by the nearest corner of
           its face.
@@ -95,7 +95,7 @@ def _features(sampled: SampledPair, init: str) -> _Features:
     elif init == "functional":
         features = functional_features(sampled)
     elif init == "aligned":
-        features = aligned_positions(sampled)
+        features = aligned_features(sampled)
     else:
         raise InputError(
             f"{init!r} is not an initial map: choose {', '.join(INITIAL_MAPS)}, or give landmarks or a map."
