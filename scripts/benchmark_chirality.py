@@ -1,8 +1,8 @@
-"""Measure how often the comparison of hands is right.
+"""Measure how often `Hands` decides correctly whether X or the mirror image of X corresponds to Y.
 
-The first argument is a directory with meshes (.off). For shapes of two hands, such as the primate molars, the
-directory also contains `chirality.csv` with the columns `name` and `side`. Without this file, all shapes are
-of the same hand. The script prints one line per pair and a summary; docs/research_log.md shows a table.
+The first argument is a directory with meshes (.off). For left and right shapes, such as the primate molars,
+the directory also contains `chirality.csv` with the columns `name` and `side`. If this file is missing, the
+script assumes that no pair needs the mirror image. The script prints one line per pair and a summary.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from jaxsmw.repair.chirality import Hands
 
 
 def main() -> None:
-    """Compare the hands of random pairs and print the evidence, the decisions and the time."""
+    """Decide for random pairs whether to mirror X. Print each decision with its evidence and its time."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--pairs", type=int, default=100, help="number of random pairs (default: 100)")
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _sides(file: Path) -> dict[str, str]:
-    """Return the side of each shape, by name; empty if there is no file."""
+    """Return a dictionary from the name of each shape to its side; empty if the file does not exist."""
     if not file.exists():
         return {}
     with open(file) as rows:
@@ -50,7 +50,7 @@ def _sides(file: Path) -> dict[str, str]:
 
 
 def _side(sides: dict[str, str], file: Path) -> str | None:
-    """Return the side of a shape, whose file may have the suffix `_sas` of the molars."""
+    """Return the side of a shape. The file name may end in `_sas`, which the names in `sides` may lack."""
     return sides.get(file.stem, sides.get(file.stem.removesuffix("_sas")))
 
 

@@ -47,7 +47,7 @@ def main() -> None:
         errors = []
         for source, target in kinds:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # suspicious maps are part of the measurement
+                warnings.simplefilter("ignore")  # suspicious maps are measured too
                 found = match(source, target)
             errors.append(1e3 * geodesic_error(meshes[1], found.pointwise_map, truth).mean)
         rows.append(errors)
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def _cloud(mesh: Mesh, noise: float) -> Mesh:
-    """Return the surface of the vertices of a mesh, displaced by noise."""
+    """Displace the vertices of a mesh by noise, and triangulate the resulting points."""
     edge = np.median(np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1))
     displacements = np.random.default_rng(0).normal(size=mesh.vertices.shape)
     return triangulate_points(mesh.vertices + noise * edge * displacements, name=mesh.name)

@@ -131,7 +131,7 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table of each candidate's time, in seconds and divided by the time of the candidate `of`."""
+    """Return a table of the candidates' times, in seconds and as multiples of the time of candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
@@ -177,7 +177,7 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
         def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
 
             def once() -> Any:
-                with one_blas_thread():  # `match` also uses one BLAS thread
+                with one_blas_thread():  # `match` also limits BLAS to one thread
                     return jax.block_until_ready(
                         run(x, y, start, refiner=refiner, iterations=ITERATIONS, samples=sampled or None)
                     )
@@ -522,7 +522,7 @@ def matched_from_files(
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
-    """For the presets `paper` and `accurate`, yield times and memory at growing sizes."""
+    """Yield the times and the memory of the presets `paper` and `accurate` for shapes of several sizes."""
     large = () if options.quick else LARGE
     yield scaled(options, "paper", (10_000, 30_000, *large))
     yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
@@ -646,7 +646,10 @@ def ours_from_files(
 
 @cache
 def our_initial_map(*files: str) -> np.ndarray:
-    """Return the initial map of `match`, cached so that the times of other libraries exclude its time."""
+    """Return the initial map of `match`.
+
+    The map is cached, so the times of other libraries do not include its computation.
+    """
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
@@ -694,8 +697,8 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
 def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     """Refine our initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
 
-    The conversion from pointwise to functional maps uses vertex areas. The default conversion of geomfum
-    ignores areas, and is slower and less accurate.
+    The conversion from pointwise to functional maps uses vertex areas. geomfum's default conversion from
+    pointwise to functional maps ignores vertex areas. It is slower and less accurate.
     """
     from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
     from geomfum.laplacian import LaplacianSpectrumFinder
@@ -718,7 +721,10 @@ ZOOMOUT_STEPS = 16
 
 
 def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Plot time and memory against the number of vertices, for the parts that measure several sizes."""
+    """Plot the times of the parts `refinement`, `eigenbasis` and `scale` against the number of vertices.
+
+    The plot of `scale` also shows the peak memory.
+    """
     panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for part in ("refinement", "eigenbasis"):
         for measured in numbers.get(part, []):

@@ -4,14 +4,21 @@
     python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
     python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars --pairs 40 --init shot
 
-Pairs are drawn with seed 0; a pair is used in the other direction after all pairs were used in one. Each
-result is stored in `OUTPUT/DATA_SET.csv` when it is measured, and the same command continues where it was
-interrupted. Distances of landmarks are in thousandths of the diagonal of the target's bounding box.
+Pairs are drawn with seed 0. If `--pairs` exceeds the number of pairs, the script also matches pairs in the
+reverse direction. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured. After an interruption,
+the same command continues from the stored results. Distances of landmarks are in thousandths of the diagonal
+of the target's bounding box.
 
-Landmarks are carried by four methods: the registered mesh, the map alone, rigid alignment and the nearest
-point, and non-rigid coherent point drift (pycpd) after this alignment, with three settings (alpha and beta),
-which were the best of twelve on six pairs each of molars and of mandibles. Molars of opposite sides are
-matched with `mirror="yes"`, and all methods then use the mirror image of the source.
+Four methods carry landmarks from the source to the target:
+
+- the registered mesh;
+- the pointwise map alone;
+- rigid alignment, and then projection to the nearest point of the target;
+- rigid alignment, non-rigid coherent point drift (pycpd), and then the same projection.
+
+Coherent point drift runs with three settings of alpha and beta. These settings were the best of twelve on six
+pairs of molars and six pairs of mandibles. Molars of opposite sides are matched with `mirror="yes"`, and all
+methods then use the mirror image of the source.
 """
 
 from __future__ import annotations
@@ -90,7 +97,7 @@ def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
 
 
 def _measure_body(source: Path, target: Path) -> dict[str, Any]:
-    """Measure the registered mesh of a pair with ground truth."""
+    """Measure the errors of the map and of the registered mesh for a pair with ground truth."""
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
     truth_files = [source.parents[1] / "corres" / f"{file.stem}.vts" for file in (source, target)]
     truth = read_ground_truth(truth_files, mesh_x, mesh_y)
@@ -143,7 +150,7 @@ def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]
 
 
 def _landmarks(file: Path) -> Landmarks:
-    """Read the manual landmarks of a scan, from the file that its data set has."""
+    """Read the manual landmarks of a scan from `SCAN.mrk.json`, `SCAN.csv` or `landmarks.csv`."""
     markups = file.with_suffix(".mrk.json")
     if markups.exists():
         return read_landmark_file(markups)
@@ -157,7 +164,7 @@ def _landmarks(file: Path) -> Landmarks:
 
 
 def _side(file: Path) -> str:
-    """Return the side of a tooth, or an empty text for other scans."""
+    """Return the side of a tooth, or an empty string for scans without a side."""
     table = file.parent / "chirality.csv"
     if not table.exists():
         return ""
@@ -169,7 +176,7 @@ def _side(file: Path) -> str:
 def _aligned(
     mesh_x: Mesh, mesh_y: Mesh, marks: Float64[np.ndarray, "l 3"], hand: Float64[np.ndarray, " 3"]
 ) -> dict[str, Float64[np.ndarray, "l 3"]]:
-    """Carry landmarks by rigid alignment, and by coherent point drift after it."""
+    """Carry landmarks by rigid alignment alone, and by rigid alignment followed by coherent point drift."""
     samples_x = mesh_x.vertices[farthest_point_samples(mesh_x, _POINTS)] * hand
     samples_y = mesh_y.vertices[farthest_point_samples(mesh_y, _POINTS)]
     (middle_x, size_x), (middle_y, size_y) = map(_placement, (samples_x, samples_y))
@@ -189,9 +196,9 @@ def _placement(points: Float64[np.ndarray, "p 3"]) -> tuple[Float64[np.ndarray, 
 def _drifted(
     x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "p 3"], landmarks: Float64[np.ndarray, "l 3"]
 ) -> dict[str, Float64[np.ndarray, "l 3"]]:
-    """Return landmarks moved by coherent point drifts from x to y, with several settings.
+    """Move landmarks by coherent point drift from x to y, once for each of several settings.
 
-    The landmarks are further points of x, because pycpd moves only the points that it aligns.
+    pycpd moves only the points that it aligns, so the landmarks are appended to x.
     """
     from pycpd import DeformableRegistration
 

@@ -14,8 +14,8 @@ The script draws pairs at random from each data set (see `docs/datasets.md`) and
 - The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
   this table only for the preset `accurate`. The table covers only pairs of full shapes with a mirrored ground
   truth that maps vertices to vertices. To compute the mirrored map, the script starts from the mirrored
-  ground truth, and runs all stages except the first without repair. To compute the uncertainty of a map, the
-  script runs a feature regression with this map as its initial map.
+  ground truth, and skips the first stage and the repair. To compute the uncertainty of a map, the script runs
+  a feature regression with this map as its initial map.
 """
 
 from __future__ import annotations

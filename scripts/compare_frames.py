@@ -153,8 +153,8 @@ class Journals:
 def run(data: Path, journals: Journals, workers: int) -> None:
     """Measure the missing rows pair by pair in worker processes, and save the rows after each pair.
 
-    **Raises:** `InputError` if some pairs could not be measured. The error is raised after all other pairs
-    are measured.
+    **Raises:** `InputError` if some pairs could not be measured. All other pairs are measured before the
+    error is raised.
     """
     tasks = list(journals.missing())
     if not tasks:
@@ -187,7 +187,8 @@ def measured_times(
 ) -> list[Row]:
     """Return the time of each way to compute the functional map, from `times.csv` if this file exists.
 
-    If the file does not exist, one process measures the times while no other part of this study runs.
+    If the file does not exist, a single worker process measures the times. No other measurements run at
+    the same time.
     """
     path = output / "times.csv"
     key = [*PairName._fields, *Variant._fields]

@@ -4,9 +4,9 @@
     python scripts/draw_documentation.py [DATA_DIRECTORY]
 
 The script runs the code of the tutorial to draw the tutorial's pictures. The failure cases use procedural
-shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes: a
-pair of SHREC'16 topology (`shrec16_topology`) and a non-isometric pair of TOSCA (`tosca_nonisometric`). The
-script takes several minutes.
+shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes.
+One is a pair of SHREC'16 topology (`shrec16_topology`), and one is a non-isometric pair of TOSCA
+(`tosca_nonisometric`). The script takes several minutes.
 """
 
 import argparse
@@ -34,7 +34,8 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# For smoothly coloured bodies, 256 dithered colours are enough, and reduce the files to a third of the size.
+# A palette of 256 dithered colours suffices for smoothly coloured bodies. The files are then a third as large
+# as in full colour.
 COLORS = 256
 
 

@@ -1,4 +1,4 @@
-"""Draws the imports between the layers of the library, docs/pictures/imports.png.
+"""Draws the imports between the layers of the library as docs/pictures/imports.png.
 
     pip install -e ".[report]"
     python scripts/draw_imports.py
@@ -28,7 +28,7 @@ NAMESPACES = ("__main__", "banks", "functional_maps", "learning")
 def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
     """Return a dictionary from each module of the library to the set of library modules that it imports.
 
-    Names are dotted and relative to the library. A package has the name of its folder.
+    Names are dotted and relative to the library. For example, `core.banks` is the package in `core/banks/`.
     """
     modules = {".".join(p.relative_to(library).with_suffix("").parts): p for p in library.rglob("*.py")}
     names = {name.removesuffix(".__init__"): path for name, path in modules.items() if name != "__init__"}

@@ -58,7 +58,7 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # 256 dithered colours look the same as full colour, and halve the size of the file.
+        # A palette of 256 dithered colours looks the same as full colour, and halves the size of the file.
         picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 

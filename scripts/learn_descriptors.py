@@ -83,7 +83,7 @@ from jaxsmw.learning import WaveletPreservationLayer
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
-# In the loss `cycles`, this number is the weight of the terms that are not lengths.
+# The loss `cycles` multiplies the energies and the squared deviation from the identity by this weight.
 WEIGHT = 0.1
 WATCHED_PAIRS = 4
 
@@ -245,7 +245,7 @@ def described(mesh: Mesh) -> Spectrum:
 
 
 class Matched(NamedTuple):
-    """The maps between two shapes that follow from their descriptors.
+    """The soft maps and the functional map that `matched` computes from the descriptors of two shapes.
 
     **Attributes:**
 

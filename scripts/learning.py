@@ -44,8 +44,8 @@ class Data(NamedTuple):
 
     **Attributes:**
 
-    - `seen`: the pairs of the training people in the pair list of FAUST.
-    - `seen_further`: all other pairs of the training people that have ground truth.
+    - `seen`: the pairs in the pair list of FAUST that show only the first `TRAINING_PEOPLE` people.
+    - `seen_further`: all other pairs of these people that have ground truth.
     - `unseen`: the pairs of the other people in the pair list of FAUST, for evaluation.
     - `animals`: the pairs of TOSCA, for evaluation.
     """
@@ -169,9 +169,9 @@ def train(
     - `steps`: the number of training steps.
     - `seed`: the seed of the random draws.
     - `directory`: an existing directory for the saved state.
-    - `unit`: a function that takes a prepared pair and returns a number. Each recorded loss is divided by
-      this number, because losses vary more between pairs than between models. The default None records losses
-      without division.
+    - `unit`: a function that takes a prepared pair, and returns the number by which the pair's recorded loss
+      is divided. The division makes losses of different pairs comparable. If `unit` is None, `train` records
+      the losses undivided.
     - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence
       training.
 

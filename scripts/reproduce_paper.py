@@ -51,10 +51,11 @@ from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# `fig9` divides the number of pairs (`--pairs`, by default 40) by this number, and uses at least 2 pairs.
+# The number of pairs in `fig9` is `--pairs` (40 if not given) divided by this number, but at least 2.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
-# Unlike SHOT and "functional", which uses SHOT, these descriptors cannot distinguish left from right.
+# These initial maps come from descriptors that cannot distinguish left from right. The maps "shot" and
+# "functional" come from SHOT, which can.
 _MIRRORED = {"wks", "hks", "wavelet"}
 
 
@@ -154,7 +155,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # The name of a directory with results begins with the name of the directory with its initial maps.
+        # Results that other methods refined from maps/NAME are in a directory whose name begins with NAME.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -212,7 +213,7 @@ def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
 
 
 def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
-    """Returns all methods that suit the pairs. With `--quick`, returns only three fast methods."""
+    """Returns all methods that can match the pairs. With `--quick`, returns only three fast methods."""
     every = suited_methods(pairs)
     return {name: every[name] for name in ("initial", "mwp", "zoomout-sampled")} if options.quick else every
 
@@ -228,7 +229,7 @@ def published(data_set: DataSet) -> list[str]:
 
 
 def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
-    """Returns whether results from this initial map may also be compared with the mirrored ground truth."""
+    """Returns whether maps refined from `init` may also be compared with the mirrored ground truth."""
     ambiguous = init in _MIRRORED or "symm" in Path(init).name
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 

@@ -160,7 +160,7 @@ class Diagnosis(NamedTuple):
 
     - `energy`: the energy of equation (5) of the MWP paper in the area norm, for the last functional map and
       the last pointwise map.
-    - `energy_of_zero`: the same energy for the functional map C = 0 and the last pointwise map.
+    - `energy_of_zero`: the same energy for the last pointwise map, but with C = 0 as the functional map.
     - `condition_number`: the condition number of the first least-squares problem; NaN for updates that solve
       no least-squares problem.
     """
@@ -248,7 +248,8 @@ def measure_parameters(
 ) -> list[Row]:
     """Refine a pair by filtering with the Meyer frame, for several numbers of eigenvectors and filters.
 
-    **Returns:** A row of `parameters.csv` for each combination, with the error after each iteration.
+    **Returns:** One row of `parameters.csv` for each (eigenvectors, filters) in `wanted`. The row contains
+    the errors of the initial map and of the map after each iteration.
     """
     if not wanted:
         return []
@@ -325,7 +326,7 @@ def wavelets(
 
 @dataclass(frozen=True)
 class Task:
-    """The rows that are missing for one pair."""
+    """A pair, and the measurements that are still missing for this pair."""
 
     name: PairName
     variants: list[Variant]
@@ -364,7 +365,9 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 
 
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
-    """Measure the time of the second functional map of every variant, and of a nearest-neighbour search.
+    """Measure how long every variant takes to compute a functional map, and time a nearest-neighbour search.
+
+    The functional map is that of the second iteration.
 
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """

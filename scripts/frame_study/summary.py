@@ -342,7 +342,7 @@ def _tightening(study: Study) -> str:
         f"{kind}, {update} − {reference_kind or 'plain'}" + (f", {reference}" if reference != update else "")
         for kind, update, reference_kind, reference in contrasts
     ]
-    # The table has one row for each contrast and one column for each bank, because there are more contrasts
+    # The rows are differences between variants and the columns are banks, because there are more differences
     # than banks.
     return _table(["", *(row[0] for row in rows)], zip(header, *(row[1:] for row in rows), strict=True))
 

@@ -73,7 +73,7 @@ UPDATES: dict[str, Solution] = {
 def frames(number_of_filters: int) -> dict[str, FilterBank]:
     """Return a dictionary from the name of each compared filter bank to the bank.
 
-    If the number of filters of a bank can be chosen, it is `number_of_filters`.
+    All banks whose size can be chosen have `number_of_filters` filters.
     """
     not_tight = {
         "cubic spline": CubicSpline(number_of_filters),
@@ -112,9 +112,9 @@ QUICK_FRAMES = (
     "no filter",
 )
 
-# Each ablation is a frame with an update that is not in `UPDATES`. A gain is a factor by which C is
-# multiplied. This factor changes the matches, because C maps only one of the two point sets in the
-# nearest-neighbour search.
+# Each ablation combines a frame with an update that `UPDATES` does not contain. A gain is a factor by which C
+# is multiplied. The gain changes the matches, because C maps the queries or the targets of the
+# nearest-neighbour search, but not both.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -176,9 +176,9 @@ class BandMask(Filtering):
 
 
 class Scaled(FilterBank):
-    """A bank multiplied by a number that gives the frame function a mean of 1 over a shape's eigenvalues.
+    """A filter bank, scaled so that its frame function has a mean of 1 over a shape's eigenvalues.
 
-    Scaling and tightening both change the height of the bank. Only tightening changes the shapes of the
+    Scaling changes only the height of the filters. `tighten` changes both the height and the shapes of the
     filters.
     """
 
@@ -257,7 +257,7 @@ def tabulate(bank: FilterBank, spectrum: Spectrum, number_of_filters: int) -> Fl
 def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Float64[np.ndarray, " k"]:
     """Return the number of octaves from the edge of the Meyer scaling function to each eigenvalue.
 
-    Below the edge, the number is 0.
+    The number is 0 for eigenvalues below this edge.
     """
     edge = eigenvalues[-1] * 2.0 ** (1 - number_of_filters)
     return np.log2(np.maximum(eigenvalues.astype(float), edge) / edge)
@@ -269,8 +269,9 @@ def band_mask(
     """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
 
     The variable d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for
-    d <= 0.5, falls like a cosine from d = 0.5 to d = 1.5, and is 0 for d >= 1.5. Because of its flat top, the
-    mask is an indefinite matrix. The kernel `G^T G` of a filter bank is never indefinite.
+    d <= 0.5, falls like a cosine from d = 0.5 to d = 1.5, and is 0 for d >= 1.5. If both spectra are
+    equal, the mask has negative eigenvalues, because its top is flat. The kernel `G^T G` of a filter bank has
+    no negative eigenvalues.
     """
     distance = np.abs(octaves_out[:, None] - octaves_in[None, :])
     return 0.5 * (1 + np.cos(np.pi * np.clip(distance / half_width - 0.5, 0, 1)))
