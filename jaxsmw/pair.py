@@ -82,7 +82,7 @@ class Pair:
         return (max(roots),) * 2 if self.partial else roots
 
     def fewest_vertices(self) -> int:
-        """Return the smaller of the two meshes' numbers of referenced vertices.
+        """Count the referenced vertices of each mesh, and return the smaller count.
 
         **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which are too few for
         matching.

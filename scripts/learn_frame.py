@@ -139,7 +139,7 @@ def sampled(pair: DataPair) -> Sampled:
 def soft_map(
     frame: SoftmaxFrame, spectrum_x: Spectrum, spectrum_y: Spectrum, initial: Int[Array, " s"]
 ) -> SoftMap | SparseSoftMap:
-    """Return the soft map that `refine_softly` computes with the frame from an initial map."""
+    """Refine an initial map by `refine_softly` with the frame, and return the soft map."""
     # Eigenvectors restricted to samples are not orthonormal, so they need a least-squares pseudo-inverse.
     refiner = WaveletPreservation(bank_of(frame), Filtering("least_squares"))
     recovery: Recovery = Softmax(TEMPERATURE)

@@ -31,7 +31,7 @@ def order_of(mesh: Mesh, *, seed: int = 0) -> np.ndarray:
 
 
 def share_right(found: np.ndarray, mesh: Mesh) -> float:
-    """The share of vertices whose match is near the vertex of which it is the image."""
+    """The share of vertices whose match is near the right match on the turned mesh."""
     order = order_of(mesh)
     back = np.argsort(order)[found]
     apart = np.linalg.norm(mesh.vertices[back] - mesh.vertices, axis=1)

@@ -138,7 +138,7 @@ def test_nearest_descriptors_are_vertices_of_the_target(network, creatures, spec
 
 
 class InterruptedPreparation:
-    """Returns the prepared pair `left` times, and raises KeyboardInterrupt in the next call."""
+    """In its first `left` calls, returns the prepared pair; the next call raises KeyboardInterrupt."""
 
     def __init__(self, pair, left):
         self.pair, self.left = pair, left

@@ -175,9 +175,10 @@ class QuadraticEnergy(eqx.Module):
 
     Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
     `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
-    energy of C (k_out, k_in) as an array of shape (). `energy.minimizer()` returns the C of least energy, if
-    `gram` is non-singular (`is_regular`). `energy + other` adds two energies, and `weight * energy`
-    multiplies an energy by an array of shape ().
+    energy of C (k_out, k_in) as an array of shape (). `energy.minimizer()` returns the C of least energy,
+    (k_out, k_in). If `gram` is singular, the returned matrix is NaN or meaningless, and `energy.is_regular()`
+    is False. `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of
+    shape ().
 
     **Attributes:**
 

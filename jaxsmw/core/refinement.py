@@ -36,7 +36,8 @@ class History(eqx.Module):
       from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
       equation (5) of the MWP paper.
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
-      and from the pointwise map that was recovered from this state.
+      and from the pointwise map that was recovered from this state. This is the mean squared distance between
+      matched points of the embeddings, in which lower is better.
     - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. The entries of
       skipped iterations repeat the final map. After a failure, all entries of `pointwise_maps` are -1.
       `pointwise_maps` is None if the refinement uses samples, because the iterations then map only the

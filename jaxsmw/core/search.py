@@ -408,8 +408,8 @@ def _bounds(
 
     **Returns:** Two arrays (p, block) and a list. The first array contains the squared distances from the
     queries to the boxes around the patches. The second array contains lower bounds on the distances from the
-    queries to the points of the patches. Entry i of the list, an array (p, block), contains the coordinates
-    of the queries along axis i of each patch, relative to the centre of the patch.
+    queries to the points of the patches. Entry i of the list is an array (p, block). It contains
+    coordinate i of each query, relative to the centre of the patch.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)

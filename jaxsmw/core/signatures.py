@@ -26,7 +26,7 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     **Arguments:**
 
     - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of times, at least 1, by default 100.
+    - `dimensions`: the number of diffusion times, at least 1, by default 100.
 
     **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
     the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.

@@ -384,8 +384,8 @@ def sinkhorn(
     The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
     transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
     minimises the mean squared distance minus `temperature` times the entropy of the plan. A nearest-neighbour
-    map can send many queries to one row and no query to another row. With the returned plan, every row
-    receives an area equal to its own area, up to the tolerance.
+    map can send many queries to one row and no query to another row. In the returned plan, the area that
+    each row receives from all queries equals the row's own area, up to the tolerance.
 
     The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
     distances in blocks of queries, so no array of size m x n is stored. Derivatives through all iterations
@@ -525,7 +525,7 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Returns the scaled inputs of a recovery, from a temperature in the unit that `sinkhorn` describes.
+    """Scales the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
 
     The centre of the database becomes the origin, because distances between points far from the origin have
     large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A

@@ -210,14 +210,17 @@ class FrameDistances(NamedTuple):
 
 
 def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
-    """Measure how far landmarks are from a surface, as they are and in the other coordinate system.
+    """Measure how far landmarks are from a surface, as they are and with reversed signs of x and y.
+
+    A change between the coordinate systems LPS and RAS reverses these signs.
 
     **Arguments:**
 
     - `landmarks`: `Landmarks` in the unit of the mesh.
     - `mesh`: the `Mesh` to which the landmarks belong.
 
-    **Returns:** `FrameDistances` with the attributes `as_read` and `flipped`, in the unit of the mesh.
+    **Returns:** `FrameDistances` with the attributes `as_read` and `flipped`. Each is the mean distance from
+    the landmarks to the nearest points of the surface, a float in the unit of the mesh.
     """
     as_read, flipped = (
         float(distances_to_surface(points.positions, mesh).mean())

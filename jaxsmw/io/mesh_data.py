@@ -91,8 +91,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.npz`: arrays with the names of the attributes of a `MeshData`.
     - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
       Further columns are ignored.
-    - `.pcd`: a file of the Point Cloud Library, text, binary or compressed: all fields. The fields
-      `normal_x`, `normal_y` and `normal_z` become `normals`.
+    - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
+      fields `normal_x`, `normal_y` and `normal_z` become `normals`.
     - `.npy`: an array with one row per point, like the columns of an `.xyz` file.
 
     If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
@@ -111,8 +111,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
     **Returns:**
 
-    A `MeshData` with n vertices and f triangles. Polygons with more than three corners and triangle strips
-    are split into triangles, which all have the data of their polygon.
+    A `MeshData` with n vertices and f triangles. Its attributes `mesh`, `faces` (f, 3), `vertex_data`,
+    `face_data` and `texture` contain the mesh, its triangles and its data, in the units of the file.
+    Triangle strips, and polygons with more than three corners, are split into triangles. Each triangle has
+    the data of its strip or polygon.
 
     **Raises:**
 

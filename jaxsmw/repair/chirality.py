@@ -255,9 +255,9 @@ class Decision(NamedTuple):
     - `mirrored`: whether the mirror image of X corresponds to Y.
     - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
       example because the shapes are their own mirror images.
-    - `doubtful`: whether the decision is uncertain. If the shapes are asymmetric, True means that the
-      evidence is near its threshold. If the asymmetry is slightly below its threshold, True means that the
-      evidence supports the mirror image.
+    - `doubtful`: whether the decision is uncertain. A decision for asymmetric shapes is uncertain if the
+      evidence is near its threshold. If the asymmetry is below its threshold by at most `asymmetry_doubt`,
+      the decision is uncertain if the evidence supports the mirror image.
     - `asymmetric`: whether the mean asymmetry of X and Y reaches its threshold.
     """
 

@@ -205,8 +205,8 @@ class _Repairer:
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
         """Run rounds of repair and return the best outcome.
 
-        In each round, the vertices with one fault of the previous map have weight zero. If `finish` is True,
-        each round also runs all stages after the repeated stage.
+        Each round chooses one kind of fault of the previous map. Vertices with this fault have weight
+        zero. If `finish` is True, each round also runs all stages after the repeated stage.
         """
         (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)

@@ -70,7 +70,7 @@ class ExtremitySettings:
 
     **Attributes:**
 
-    - `samples`: the number of evenly spread samples from which mean distances to the surface are computed.
+    - `samples`: the number of evenly spread samples. The distances from a vertex to the samples are averaged.
     - `distance`: the smallest allowed distance between two extremities.
     - `most`: the largest number of extremities. The number of pairings grows very fast with the number of
       extremities.

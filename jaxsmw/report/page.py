@@ -112,7 +112,8 @@ def write_page(
     """Writes a web page that shows both bodies in 3D and colours them by one map at a time.
 
     On the page, a user can place landmarks, and load and save landmark files in the coordinates of the mesh
-    files. If a map has errors named `EXPECTED_ERROR`, the page suggests places for landmarks.
+    files. If the values of a map include expected errors (`EXPECTED_ERROR`), the page suggests places for
+    landmarks.
 
     The page also shows the match of the point under the pointer. If spectra are given, the page can show the
     wavelets of a refiner's filter bank. The wavelet of scale l around a vertex y is the function

@@ -22,8 +22,8 @@ ELEVATION = np.radians(8)
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# `_SUPERSAMPLING` is the number of samples per pixel in each direction. Faces are drawn in chunks, whose
-# bounding boxes contain about `_CHUNK` samples in total.
+# `_SUPERSAMPLING` is the number of samples per pixel in each direction. Faces are drawn in chunks.
+# The bounding boxes of the faces of a chunk together contain about `_CHUNK` samples.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 

@@ -188,8 +188,8 @@ class MeshData:
                 for array in arrays
             ):
                 raise self._fail(
-                    f"the labels {name!a} are not integers from 0 to {len(names) - 1}: give an array of "
-                    "labels with this name, and one name for each label."
+                    f"the array of labels {name!a} must contain integers from 0 to {len(names) - 1}, one for "
+                    "each label name: correct the array or the names."
                 )
 
 

@@ -311,7 +311,7 @@ def format_vtp(data: MeshData) -> Written:
 
 
 def _fits(name: str, _: np.ndarray) -> bool:
-    """Return whether XML can contain a name."""
+    """Return whether XML allows every character of a name."""
     return name.isprintable()
 
 
