@@ -13,10 +13,13 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 # The tests spend most of their time compiling small programs that run once. XLA's older loop emitters reduce
-# the compilation time to a third. The flag is set only for versions of JAX that have it, because XLA ends the
+# the compilation time to a third. The flags are set only for versions of JAX that have them, because XLA ends the
 # process at an unknown flag.
 if jax.__version_info__[:2] == (0, 10):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+    # By default, XLA splits each program into up to 32 parts and compiles the parts in several threads. One part
+    # takes a quarter less CPU time, and the parallel workers of the tests occupy all cores anyway.
+    flags = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
 jax.config.update("jax_disable_most_optimizations", True)
 # Without this setting, JAX records the call stack of every operation, which takes 10 % of the test time.
 jax.config.update("jax_include_full_tracebacks_in_locations", False)

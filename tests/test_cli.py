@@ -8,6 +8,8 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -23,6 +25,7 @@ import jaxsmw
 import jaxsmw.matching
 from jaxsmw.banks import CubicSpline, Itersine, Meyer, SpectralDistribution, Warped
 from jaxsmw.cli.banks import BANKS, bounds_unless_tight, make_bank
+from jaxsmw.cli.run import run_command
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.evaluation.ground_truth import read_ground_truth
@@ -163,9 +166,9 @@ def test_quiet_prints_nothing_on_standard_error(run, pair, tmp_path):
     assert outcome.code == 0 and outcome.errors == ""
 
 
-@pytest.fixture
-def calls(monkeypatch):
-    """A list with one dictionary of settings for each call of `match`."""
+@contextmanager
+def recorded_calls() -> Iterator[list[dict]]:
+    """Yield a list, which gets one dictionary of settings for each call of `match`."""
     calls, match = [], jaxsmw.matching.match
 
     def recorded(*meshes, preset, **settings):
@@ -179,8 +182,29 @@ def calls(monkeypatch):
         calls.append(settings)
         return found
 
-    monkeypatch.setattr(jaxsmw.matching, "match", recorded)
-    return calls
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxsmw.matching, "match", recorded)
+        yield calls
+
+
+@pytest.fixture
+def calls():
+    with recorded_calls() as calls:
+        yield calls
+
+
+def call_of_match(pair: Path, directory: Path) -> list[object]:
+    return ["match", pair / "x.off", pair / "y.ply", "--output", directory / "map.txt", *SMALL]
+
+
+@pytest.fixture(scope="module")
+def usual_settings(pair, tmp_path_factory) -> dict:
+    """The settings of `match` without further options."""
+    with recorded_calls() as calls:
+        call = call_of_match(pair, tmp_path_factory.mktemp("usual"))
+        assert run_command([*map(str, call), "--quiet"]) == 0
+    (settings,) = calls
+    return settings
 
 
 @pytest.mark.parametrize(
@@ -206,21 +230,18 @@ def calls(monkeypatch):
     ],
 )
 def test_an_option_changes_the_setting_that_it_names_and_no_other(
-    run, pair, tmp_path, calls, options, changed
+    run, pair, tmp_path, calls, usual_settings, options, changed
 ):
-    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
-    assert run(*call).code == 0
-    assert run(*call, *options.split()).code == 0
-    before, after = calls
+    assert run(*call_of_match(pair, tmp_path), *options.split()).code == 0
+    (settings,) = calls
     with jax.enable_x64(False):  # as in the command
-        assert {name: value for name, value in after.items() if value != before[name]} == changed()
+        assert {name: value for name, value in settings.items() if value != usual_settings[name]} == changed()
 
 
 @pytest.mark.parametrize("kind", ["landmarks", "map"])
 def test_initial_maps_are_read_from_files(run, pair, tmp_path, calls, kind):
     file = pair / {"landmarks": "landmarks.txt", "map": "truth.txt"}[kind]
-    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
-    assert run(*call, "--init", f"{kind}:{file}").code == 0
+    assert run(*call_of_match(pair, tmp_path), "--init", f"{kind}:{file}").code == 0
     (settings,) = calls
     np.testing.assert_array_equal(settings["init"], np.loadtxt(file, dtype=int))
 
