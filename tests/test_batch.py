@@ -231,12 +231,17 @@ def run_processes(output, count: int) -> None:
             process.kill()
 
 
+@pytest.fixture(scope="module")
+def one():
+    """The results of all pairs on one device."""
+    spectra, starts = make_problem()
+    return dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 @pytest.mark.cluster
-def test_four_devices_give_the_results_of_one(tmp_path, processes):
+def test_four_devices_give_the_results_of_one(one, tmp_path, processes):
     """The devices belong to one process, or to two processes that communicate over the network."""
-    spectra, starts = make_problem()
-    one = dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))
     run_processes(tmp_path / "results", processes)
     for process in range(processes):
         with np.load(tmp_path / f"results-{process}.npz") as found:
