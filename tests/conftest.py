@@ -28,13 +28,15 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# The traces of JAX are many objects that live long. The default thresholds of the garbage collector search these
-# objects again and again, which takes 5 % of the test time.
-gc.set_threshold(50_000, 20, 50)
-
 # A Hypothesis example may compile a program, which can take longer than Hypothesis's default deadline.
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
+
+
+def pytest_collection_finish() -> None:
+    """Exempt all objects that exist before the first test from garbage collection, which saves test time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

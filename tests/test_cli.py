@@ -199,11 +199,12 @@ def call_of_match(pair: Path, directory: Path) -> list[object]:
 
 @pytest.fixture(scope="module")
 def usual_settings(pair, tmp_path_factory) -> dict:
-    """The settings of `match` without further options."""
+    """The settings of `match` in `call_of_match` without further options."""
     with recorded_calls() as calls:
         call = call_of_match(pair, tmp_path_factory.mktemp("usual"))
         assert run_command([*map(str, call), "--quiet"]) == 0
     (settings,) = calls
+    assert settings["mirror"] == "no"
     return settings
 
 
@@ -224,7 +225,7 @@ def usual_settings(pair, tmp_path_factory) -> dict:
         ("--solution regularized", lambda: {"solution": RegularizedLeastSquares()}),
         ("--laplacian robust", lambda: {"laplacian": "robust"}),
         ("--mirror yes", lambda: {"mirror": "yes"}),
-        ("--mirror no", lambda: {"mirror": "no"}),
+        ("--mirror auto", lambda: {"mirror": "auto"}),
         ("--precision float64", lambda: {"float type": np.float64}),
         ("--stop-when-unchanged", lambda: {"stop_when_unchanged": True}),
     ],
@@ -349,8 +350,8 @@ def test_spectrum_writes_an_orthonormal_eigenbasis(run, pair, tmp_path):
     )  # fmt: skip
     assert outcome.code == 0, outcome.errors
     assert "642 vertices" in outcome.output and "cotangent" in outcome.output
-    saved = np.load(tmp_path / "s.npz")
-    gram = saved["eigenvectors"].T @ (saved["vertex_areas"][:, None] * saved["eigenvectors"])
+    with np.load(tmp_path / "s.npz") as saved:
+        gram = saved["eigenvectors"].T @ (saved["vertex_areas"][:, None] * saved["eigenvectors"])
     np.testing.assert_allclose(gram, np.eye(12), atol=1e-8)
     assert (tmp_path / "s.png").stat().st_size > 1000
 
@@ -567,7 +568,7 @@ def files_in(directory: Path) -> set[str]:
 def test_the_times_account_for_the_whole_run_and_all_files_are_named(run, pair, tmp_path):
     began = time.perf_counter()
     outcome = run(
-        "match", pair / "x.off", pair / "y.ply", *SMALL, "--output", tmp_path / "m.txt", "--surface-points",
+        "match", pair / "x.off", pair / "y.ply", *SMALL, "--mirror", "auto", "--output", tmp_path / "m.txt", "--surface-points",
         tmp_path / "p.baryc_gt", "--expected-error", tmp_path / "e.txt", "--one-to-one", tmp_path / "o.txt",
         "--texture", tmp_path / "t", "--report", tmp_path / "r", "--ground-truth", pair / "truth.txt",
     )  # fmt: skip
