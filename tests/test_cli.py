@@ -81,9 +81,9 @@ def test_the_help_states_the_defaults_of_the_library(run):
     assert f"(default: {defaults['preset']}, or paper if" in words["match"]
     assert f"map:FILE (default: {defaults['init']})" in words["match"]
     assert f"X_Y.map (default: {Settings().init})" in words["benchmark"]
-    assert words["match"].count("(default: auto)") == 4
-    automatic = [defaults[name] for name in ("laplacian", "eigensolver", "mirror")]
-    assert [*automatic, WaveletPreservation().search] == ["auto"] * 4
+    assert words["match"].count("(default: auto)") == 5
+    automatic = [defaults[name] for name in ("init", "laplacian", "eigensolver", "mirror")]
+    assert [*automatic, WaveletPreservation().search] == ["auto"] * 5
     eigenvectors = inspect.signature(compute_spectrum).parameters["number_of_eigenvectors"].default
     assert f"number of eigenvectors (default: {eigenvectors})" in words["spectrum"]
     assert f"eigenvectors per shape (default: {Stage().number_of_eigenvectors})" in words["match"]
@@ -117,6 +117,8 @@ def test_evaluate_confirms_the_error_that_match_prints(run, pair, tmp_path):
         "--output",
         output,
         *SMALL,
+        "--init",
+        "shot",
         "--ground-truth",
         pair / "truth.txt",
     )
@@ -424,7 +426,7 @@ def test_demo_writes_a_pair_and_a_better_map(run, tmp_path):
 
 def test_surface_points_are_written_and_measured(run, pair, tmp_path):
     x, y, points = pair / "x.off", pair / "y.ply", tmp_path / "points.baryc_gt"
-    call = ["match", x, y, "--output", tmp_path / "map.txt", *SMALL]
+    call = ["match", x, y, "--output", tmp_path / "map.txt", *SMALL, "--init", "shot"]
     truth = ["--ground-truth", pair / "truth.txt"]
     outcome = run(*call, "--surface-points", points, *truth)
     assert outcome.code == 0, outcome.errors

@@ -220,7 +220,10 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --iterations 0", "at least 1"),
         ("match {x} {y} --output {t}/m --samples 5", "cannot distinguish"),
         ("match {x} {y} --output {t}/m --samples 5000 --eigenvectors 20", "from 642 referenced vertices"),
-        ("match {x} {y} --output {t}/m --init shout", "'shout' is not an initial map: choose from shot, wks"),
+        (
+            "match {x} {y} --output {t}/m --init shout",
+            "'shout' is not an initial map: choose from auto, shot, wks",
+        ),
         ("match {x} {y} --output {t}/m --init map:", "map:"),
         ("match {x} {y} --output {t}/m --init map:{t}/missing.txt", "missing.txt"),
         ("match {x} {y} --output {t}/m --init landmarks:{x}", "x.off"),

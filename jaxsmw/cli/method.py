@@ -12,6 +12,7 @@ from jaxsmw.choices import (
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
     IndexBase,
+    MatchInit,
     Mirror,
     PresetName,
     Search,
