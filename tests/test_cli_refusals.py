@@ -279,6 +279,39 @@ def test_hostile_arguments_are_refused(run, pair, tmp_path, arguments, fault):
 
 
 @pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("match x.off y.off --outptu m.txt", "unknown option '--outptu': did you mean --output?"),
+        ("match x.off y.off --outptu=m.txt", "unknown option '--outptu': did you mean --output?"),
+        ("match x.off y.off -output m.txt", "unknown option '-output': did you mean --output?"),
+        ("match x.off y.off -o m.txt", "unknown option '-o' (see"),
+        ("match x.off y.off --output m.txt --xyzzy", "unknown option '--xyzzy' (see"),
+        (
+            "transfer x.off y.off --registred r.off",
+            "unknown option '--registred': did you mean --registered?",
+        ),
+        ("evaluate x.off y.off m.txt --groundtruth t.txt", "did you mean --ground-truth?"),
+        ("benchmark data --method MWP", "did you mean --methods?"),
+        ("spectrum x.off --eigenvectros 5", "did you mean --eigenvectors?"),
+        ("render x.off --ouput p.png", "did you mean --output?"),
+        ("demo --vertex 500", "did you mean --vertices?"),
+        ("--verson", "jaxsmw: unknown option '--verson': did you mean --version?"),
+        # These words are values, or options without their value.
+        ("match x.off y.off --output m.txt --report r --up -z", "argument --up: expected one argument"),
+        ("match x.off y.off --output m.txt --iterations -3", "at least 1"),
+        ("match -- x.off --outptu", "--output"),
+    ],
+)
+def test_a_mistyped_option_is_named_with_the_nearest_option(run, arguments, message):
+    outcome = run(*arguments.split())
+    assert_refused(outcome, naming=message)
+
+
+def test_help_is_printed_beside_a_mistyped_option(run):
+    assert run("match", "--outptu", "m.txt", "--help").output.startswith("usage: jaxsmw match")
+
+
+@pytest.mark.parametrize(
     "outputs",
     [
         "--output {t}/z.png --figure {t}/z.png",

@@ -27,11 +27,11 @@ def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int
         try:
             value = int(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{_shortened(text)!r} is not a whole number") from None
+            raise argparse.ArgumentTypeError(f"{shortened(text)!r} is not a whole number") from None
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
         if value > most:
-            raise argparse.ArgumentTypeError(f"{_shortened(text)} is too large: give at most {most}")
+            raise argparse.ArgumentTypeError(f"{shortened(text)} is too large: give at most {most}")
         return value
 
     return convert
@@ -51,12 +51,12 @@ def path(text: str) -> str:
     except (OSError, ValueError) as error:
         fault = getattr(error, "strerror", None) or error
         raise argparse.ArgumentTypeError(
-            f"{_shortened(text)!r} cannot be used ({fault}): choose another name"
+            f"{shortened(text)!r} cannot be used ({fault}): choose another name"
         ) from None
     return text
 
 
-def _shortened(text: str) -> str:
+def shortened(text: str) -> str:
     """Return the beginning of a long text, for a message."""
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 

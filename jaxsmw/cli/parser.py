@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum, transfer
-from jaxsmw.cli.arguments import add_quiet
+from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import say, show
 
 # The help lists the commands in this order.
@@ -30,6 +31,38 @@ class Parser(argparse.ArgumentParser):
         # Abbreviated options are not allowed, because a new option with the same beginning would make an
         # abbreviation ambiguous.
         super().__init__(allow_abbrev=False, **settings)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse the words of a command line like argparse, but first refuse unknown options.
+
+        argparse would first report the missing options, for example `--output` if the user wrote `--outptu`.
+        """
+        words = sys.argv[1:] if args is None else list(args)
+        if (unknown := self._unknown_option(words)) is not None:
+            import difflib
+
+            nearest = difflib.get_close_matches(unknown, self._option_string_actions, n=1)
+            cure = f": did you mean {nearest[0]}?" if nearest else ""
+            self.error(f"unknown option {shortened(unknown)!r}{cure}")
+        return super().parse_known_args(words, namespace)
+
+    def _unknown_option(self, words: Sequence[str]) -> str | None:
+        """Return the first word that looks like an option but is none, without the value after `=`."""
+        known = self._option_string_actions
+        if not {"-h", "--help"}.isdisjoint(words):
+            return None
+        for i, word in enumerate(words):
+            if word == "--" or (self._subparsers and not word.startswith("-")):
+                # Only positional arguments follow `--`. The options of a command follow its name.
+                return None
+            name = word.partition("=")[0]
+            # Like argparse, treat negative numbers and words with blanks as values.
+            if name in known or " " in word or not re.match(r"-(?!\.?\d).", word):
+                continue
+            # For a value such as `-z` after `--up`, argparse reports that the value of `--up` is missing.
+            if len(word) > 2 or i == 0 or words[i - 1] not in known or known[words[i - 1]].nargs == 0:
+                return name
+        return None
 
     def print_help(self, file: Any = None) -> None:
         """Print the help on standard output.
