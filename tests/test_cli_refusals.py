@@ -86,8 +86,9 @@ def test_an_impossible_one_to_one_map_is_refused_before_the_work(run, pair, tmp_
 
 
 def test_outputs_with_the_same_name_are_refused(run, pair, tmp_path):
-    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "source.obj", *SMALL]
-    assert_refused(run(*call, "--one-to-one", tmp_path / "source.obj"), naming="two outputs have this name")
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
+    assert_refused(run(*call, "--one-to-one", tmp_path / "map.txt"), naming="two outputs have this name")
+    call += ["--expected-error", tmp_path / "source.obj"]
     assert_refused(run(*call, "--texture", tmp_path), naming="two outputs have this name")
     (tmp_path / "target.obj").write_text("v 0 0 0\n")
     call = ["match", pair / "x.off", tmp_path / "target.obj", "--output", tmp_path / "map.txt", *SMALL]
@@ -166,7 +167,10 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         pytest.skip("two columns are a legal form of ground truth")
     path = tmp_path / "hostile.txt"
     path.write_text(HOSTILE_MAPS[name])
-    meshes, output = (pair / "x.off", pair / "y.ply"), tmp_path / "out.png"
+    meshes, output = (
+        (pair / "x.off", pair / "y.ply"),
+        tmp_path / ("out.png" if use in ("evaluate", "render") else "out"),
+    )
     truth = ["--ground-truth", pair / "truth.txt"]
     outcome = {
         "init": lambda: run("match", *meshes, "--init", f"map:{path}", "--output", output, "--quiet"),
@@ -199,6 +203,9 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("match {x} {y} --output {t}/m --seed 3", "--seed: has no effect without --evaluation-samples"),
         ("match {x} {y} --output {t}/m.npz", "m.npz: maps are written"),
         ("match {x} {y} --output {t}/m --one-to-one {t}/o.baryc_gt", "o.baryc_gt: maps are written"),
+        ("match {x} {y} --output {t}/o.png", "not as .png: choose a name with another suffix, such as .txt"),
+        ("match {x} {y} --output {t}/o.HTML", "o.HTML: maps are written as text"),
+        ("match {x} {y} --output {t}/m --one-to-one {t}/o.ply", "o.ply: maps are written as text"),
         (
             "evaluate {x} {y} {t}/m --ground-truth {t}/m --seed 3",
             "--seed: has no effect without --evaluation-samples",

@@ -113,6 +113,21 @@ class TestReading:
         assert read_pointwise_map(path, X, Y, index_base=1).tolist() == [8, 0, 0, 1]
         assert [entry.name for entry in tmp_path.iterdir()] == ["a.map"]
 
+    @pytest.mark.parametrize(
+        "suffix", [".png", ".JPG", ".svg", ".pdf", ".html", ".json", ".ply", ".off", ".glb"]
+    )
+    def test_names_of_other_kinds_of_files_are_refused(self, tmp_path, suffix):
+        with pytest.raises(
+            InputError, match=f"not as {suffix.lower()}: choose a name with another suffix, such"
+        ):
+            write_pointwise_map(tmp_path / f"a{suffix}", [8, 0, 0, 3])
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("name", ["a.txt", "a.csv", "a.map", "a.npy", "a.mat", "a", "a.corr", "a.v2"])
+    def test_maps_have_any_other_suffix(self, tmp_path, name):
+        write_pointwise_map(tmp_path / name, [8, 0, 0, 3])
+        assert read_pointwise_map(tmp_path / name, X, Y).tolist() == [8, 0, 0, 3]
+
     @given(st.lists(st.integers(0, 8), min_size=4, max_size=4))
     def test_any_map_survives_the_round_trip(self, tmp_path_factory, values):
         path = tmp_path_factory.getbasetemp() / "any.map"

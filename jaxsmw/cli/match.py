@@ -133,15 +133,15 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(
             f"{expected}: expected errors are written as text: choose another suffix, such as .txt."
         )
-    from jaxsmw.io.map_files import check_map_name
-
-    for file in filter(None, (options.output, options.one_to_one)):
-        check_map_name(file)
     check_outputs(
         [options.source, options.target, *init_files, *(options.ground_truth or ())],
         files=[options.output, points, options.one_to_one, expected],
         directories=_directories(options),
     )
+    from jaxsmw.io.map_files import check_map_name
+
+    for file in filter(None, (options.output, options.one_to_one)):
+        check_map_name(file)
     import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
 
 

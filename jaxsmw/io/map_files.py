@@ -24,6 +24,15 @@ from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_v
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
+# Suffixes of other kinds of files, whose programs cannot open a map. The suffixes `.mat`
+# and `.npy` are missing here, because maps are also written in these formats.
+_NOT_MAPS = {
+    *(".npz", ".baryc_gt", ".vts", ".json"),
+    *(".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".svg", ".pdf", ".eps", ".ps"),
+    *(".html", ".htm", ".xhtml"),
+    *(".off", ".obj", ".ply", ".stl", ".vtk", ".vtp", ".gltf", ".glb", ".xyz", ".pcd"),
+}
+
 
 def read_pointwise_map(
     path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
@@ -87,7 +96,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     - `pointwise_map`: the target vertex of each source vertex (m,), 0-based integers.
 
     **Raises:** `InputError` if the array is not a list of non-negative integers, or the file cannot be
-    written. `InputError` is also raised for the suffixes `.npz`, `.baryc_gt`, `.vts` and `.json`.
+    written. `InputError` is also raised for the suffixes that `check_map_name` refuses, such as `.ply`.
     """
     check_map_name(path)
     targets = np.asarray(pointwise_map)
@@ -109,19 +118,20 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 def check_map_name(path: str | os.PathLike[str]) -> None:
     """Check that a pointwise map can be written under a file name.
 
-    Suffixes that belong to other kinds of files are refused.
+    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, and the formats `.npz`,
+    `.baryc_gt`, `.vts` and `.json`. All other names are accepted.
 
     **Arguments:**
 
     - `path`: the name of a file, which need not exist.
 
-    **Raises:** `InputError` for the suffixes `.npz`, `.baryc_gt`, `.vts` and `.json`.
+    **Raises:** `InputError` for the suffix of another kind of file.
     """
     suffix = Path(path).suffix.lower()
-    if suffix in (".npz", ".baryc_gt", ".vts", ".json"):
+    if suffix in _NOT_MAPS:
         raise InputError(
             f"{path}: maps are written as text, .npy or .mat, not as {suffix}: choose a name with another "
-            "suffix."
+            "suffix, such as .txt."
         )
 
 
