@@ -144,6 +144,30 @@ def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        ("match {m} --output m --init landmarks:a.csv,b.off", "b.off: the suffix '.off' is not supported"),
+        ("match {m} --output m --init landmarks:a.png,b.csv", "a.png: the suffix '.png' is not supported"),
+        (
+            "match {m} --output m --init landmarks:a.mrk.json",
+            "a.mrk.json: contains landmarks of one mesh only",
+        ),
+        ("transfer {m} --registered r.off --init landmarks:a.csv,b.off", "b.off: the suffix '.off'"),
+        (
+            "transfer {m} --landmarks a.off --landmarks-output b.csv",
+            "a.off: the suffix '.off' is not supported",
+        ),
+        ("demo --output {t}/d --init landmarks:a.fcsv", "a.fcsv: contains landmarks of one mesh only"),
+    ],
+)
+def test_suffixes_of_landmark_files_are_checked_before_the_meshes_are_read(run, tmp_path, arguments, fault):
+    # Both meshes are missing, so a command that reads them first names a mesh.
+    outcome = run(*arguments.format(m="missing_x.off missing_y.off", t=tmp_path).split(), "--quiet")
+    assert_refused(outcome, naming=fault)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_landmarks_without_a_common_name_are_refused(run, pair, tmp_path):
     other = json.loads((pair / "x.mrk.json").read_text())
     for point in other["markups"][0]["controlPoints"]:

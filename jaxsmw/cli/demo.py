@@ -7,7 +7,7 @@ import argparse
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import initial_map_files
+from jaxsmw.cli.inputs import check_initial_map, initial_map_files
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 
@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         check_preset(options)
+        check_initial_map(options.init)
         _check_output(options)
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
         from jaxsmw.geometry.creature import creature_pair

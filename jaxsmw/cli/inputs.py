@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from jaxsmw.choices import IndexBase, MatchInit
 from jaxsmw.cli.arguments import path
 from jaxsmw.cli.console import report_progress, say
+from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,6 +100,32 @@ def initial_map_files(init: str) -> list[str]:
     if kind == "landmarks" and source and target and not os.path.lexists(file):
         return [source, target]
     return [file] if file else []
+
+
+def check_initial_map(init: str) -> None:
+    """Check the suffixes of landmark files in a value of `--init`, before any file is read.
+
+    **Raises:** `InputError` if a file contains landmarks of one mesh, but the value does not name the file of
+    the other mesh. `InputError` is also raised if the landmarks of a mesh are not in a known format.
+    """
+    files = initial_map_files(init)
+    if not init.startswith("landmarks:"):
+        return
+    from jaxsmw.io.landmark_files import check_readable_suffix
+
+    if len(files) > 1:
+        for file in files:
+            check_readable_suffix(file)
+    elif files[0].lower().endswith(_LANDMARKS_OF_ONE_MESH):
+        raise InputError(
+            f"{files[0]}: contains landmarks of one mesh only: give the landmarks of both meshes, as --init "
+            "landmarks:SOURCE_FILE,TARGET_FILE."
+        )
+
+
+# Files with these suffixes contain positions of named points. Files of `landmarks:FILE` contain a source and a
+# target vertex per line, and can have any other suffix.
+_LANDMARKS_OF_ONE_MESH = (".mrk.json", ".fcsv", ".pp", ".mps")
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:

@@ -17,7 +17,7 @@ from jaxsmw.cli.arguments import (
 )
 from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress
-from jaxsmw.cli.inputs import initial_map_files, read_mesh_file, read_truth
+from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
@@ -120,6 +120,7 @@ def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
     init_files = initial_map_files(options.init)
     check_preset(options)
+    check_initial_map(options.init)
     check_evaluation(options)
     refuse_without(options, "--report", bool(options.report), "up")
     reads_indices = bool(options.ground_truth or init_files)

@@ -17,7 +17,7 @@ from jaxsmw.cli.arguments import (
     refuse_without,
 )
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import describe_mesh, initial_map_files, read_maps
+from jaxsmw.cli.inputs import check_initial_map, describe_mesh, initial_map_files, read_maps
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 from jaxsmw.errors import InputError
@@ -150,12 +150,15 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
     init_files = initial_map_files(options.init)
     check_preset(options)
+    check_initial_map(options.init)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
-    from jaxsmw.io.landmark_files import check_landmark_suffix
+    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.mesh_data import check_mesh_suffix
 
     for file in filter(None, (options.registered, options.attributes)):
         check_mesh_suffix(file)
+    if options.landmarks:
+        check_readable_suffix(options.landmarks)
     if options.landmarks_output:
         check_landmark_suffix(options.landmarks_output)
     check_outputs(

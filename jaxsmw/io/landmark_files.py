@@ -67,7 +67,7 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     than 128 MiB (`.mrk.json`: 32 MiB), or contains no landmarks or more than 2²⁰. `InputError` is also raised
     if a coordinate is not finite, or if two landmarks have the same name.
     """
-    suffix = _suffix(path, list(_PARSERS))
+    suffix = check_readable_suffix(path)
     _check_size(path, size_of_file(path), suffix)
     data = read_bytes(path)
     try:
@@ -110,6 +110,14 @@ def check_landmark_suffix(path: str | os.PathLike[str]) -> str:
     **Raises:** `InputError` if landmarks cannot be written in the format of the suffix.
     """
     return _suffix(path, list(_WRITERS))
+
+
+def check_readable_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a landmark file to be read, in lower case.
+
+    **Raises:** `InputError` if landmarks cannot be read in the format of the suffix.
+    """
+    return _suffix(path, list(_PARSERS))
 
 
 def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
