@@ -26,6 +26,9 @@ def pair(tmp_path_factory):
     write_landmark_file(
         directory / "x.mrk.json", Landmarks(("a", "b"), mesh.vertices[[3, 400]], coordinates="LPS")
     )
+    markups = json.loads((directory / "x.mrk.json").read_text())
+    markups["markups"][0]["coordinateUnits"] = "um"
+    (directory / "x.mrk.json").write_text(json.dumps(markups))
     write_landmark_file(directory / "x.csv", Landmarks(("a", "b"), mesh.vertices[[3, 400]]))
     return directory
 
@@ -70,6 +73,16 @@ def test_a_map_replaces_the_match(run, pair, tmp_path):
     truth = np.loadtxt(pair / "truth.txt", dtype=int)
     apart = np.linalg.norm(jaxsmw.read_mesh(tmp_path / "r.off").vertices - target.vertices[truth], axis=1)
     assert np.quantile(apart, 0.99) < 0.02 * np.sqrt(target.area)
+
+
+def test_the_unit_of_the_landmarks_is_kept(run, pair, tmp_path):
+    outcome = run(
+        "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt",
+        "--landmarks", pair / "x.mrk.json", "--landmarks-output", tmp_path / "l.mrk.json",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    assert read_landmark_file(tmp_path / "l.mrk.json").unit == "um"
+    assert "the unit is 'um'; the target is assumed to have the same unit" in outcome.errors
 
 
 def test_a_stiffer_mesh_is_farther_away(run, pair, tmp_path):

@@ -59,6 +59,25 @@ def test_extreme_numbers_keep_all_digits(tmp_path):
         )
 
 
+def test_markups_files_keep_the_unit(tmp_path):
+    read, written = tmp_path / "a.mrk.json", tmp_path / "b.mrk.json"
+    write_landmark_file(read, Landmarks(("a",), np.array([[1.0, 2, 3]]), "LPS"))
+    assert read_landmark_file(read).unit is None
+    document = json.loads(read.read_text("utf-8"))
+    for unit in ("mm", "um", "µm \ud800"):
+        document["markups"][0]["coordinateUnits"] = unit
+        read.write_text(json.dumps(document))
+        landmarks = read_landmark_file(read)
+        write_landmark_file(written, landmarks.in_coordinates("RAS").select(["a"]))
+        assert landmarks.unit == read_landmark_file(written).unit == unit
+        assert json.loads(written.read_text("utf-8"))["markups"][0]["coordinateUnits"] == unit
+    for unit in (3, ["mm"], {"mm": 1}, False):
+        document["markups"][0]["coordinateUnits"] = unit
+        read.write_text(json.dumps(document))
+        landmarks = read_landmark_file(read)
+        assert landmarks.unit is None and "not text" in landmarks.notes[0]
+
+
 def test_markups_files_have_the_fields_of_the_schema(tmp_path):
     path = tmp_path / "p.mrk.json"
     write_landmark_file(path, Landmarks(("a", "b"), np.array([[1.0, 2, 3], [4, 5, 6]]), "LPS"))

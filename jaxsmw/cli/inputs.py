@@ -123,8 +123,8 @@ def check_initial_map(init: str) -> None:
         )
 
 
-# Files with these suffixes contain positions of named points. Files of `landmarks:FILE` contain a source and a
-# target vertex per line, and can have any other suffix.
+# Files with these suffixes contain named points of one mesh. A file of `landmarks:FILE` instead contains a
+# source and a target vertex per line, and can have any other suffix.
 _LANDMARKS_OF_ONE_MESH = (".mrk.json", ".fcsv", ".pp", ".mps")
 
 

@@ -185,6 +185,11 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
             f"{options.landmarks}: the landmarks are in {landmarks.coordinates} coordinates; the meshes are "
             "assumed to be in the same coordinates."
         )
+    if landmarks.unit is not None:
+        report_progress(
+            f"{options.landmarks}: the unit is {landmarks.unit[:40]!a}; the target is assumed to have the "
+            "same unit."
+        )
     # Both checks precede the long computation.
     check_known_system(options.landmarks_output, landmarks)
     check_frame(landmarks, source.mesh)

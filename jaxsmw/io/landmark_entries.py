@@ -37,6 +37,7 @@ class Entries(NamedTuple):
     numbers: Sequence[int]
     coordinates: CoordinateSystem | None = None
     notes: tuple[str, ...] = ()
+    unit: str | None = None
 
     def landmarks(self, path: str) -> Landmarks:
         """Check names and coordinates, and return the landmarks of the file `path`."""
@@ -56,7 +57,7 @@ class Entries(NamedTuple):
                 f"{self._place(faulty.earlier)} and {place} have the same name "
                 f"{self.names[faulty.row][:40]!a}: give each landmark its own name."
             )
-        return Landmarks(tuple(self.names), self.positions, self.coordinates, path, self.notes)
+        return Landmarks(tuple(self.names), self.positions, self.coordinates, path, self.notes, self.unit)
 
     def _place(self, i: int) -> str:
         return f"{self.noun} {self.numbers[i]}"

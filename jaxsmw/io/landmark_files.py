@@ -60,8 +60,9 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
           or blanks separate the columns. The first line may name the columns, and then their order is free.
 
     **Returns:** `Landmarks` whose `name` is the path, with l names, positions (l, 3) as in the file, and the
-    coordinate system `"LPS"`, `"RAS"` or None. The `notes` report points that were left out, because Slicer
-    has no defined position for them or because they are not active in MeshLab.
+    coordinate system `"LPS"`, `"RAS"` or None. The `unit` is the unit that a `.mrk.json` file states, or
+    None. The `notes` report points that were left out, because Slicer has no defined position for them or
+    because they are not active in MeshLab.
 
     **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, is larger
     than 128 MiB (`.mrk.json`: 32 MiB), or contains no landmarks or more than 2²⁰. `InputError` is also raised
@@ -85,8 +86,9 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
 
     - `path`: the file to create or to replace. The suffix determines the format: `.mrk.json` or `.fcsv` for
       3D Slicer, `.pp` for MeshLab, `.csv` for a table with commas, or `.txt` for a table with tabs.
-    - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files in the other formats
-      cannot state a coordinate system, so readers must know it.
+    - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files of the format `.mrk.json`
+      also state their unit if it is known. Files in the other formats cannot state a coordinate system, so
+      readers must know it.
 
     **Raises:** `InputError` for another suffix, for a file that cannot be written, or for more landmarks or
     bytes than `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the

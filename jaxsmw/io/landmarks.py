@@ -36,6 +36,8 @@ class Landmarks:
     - `coordinates`: the coordinate system, `"LPS"` or `"RAS"`, or None if the file does not state one.
     - `name`: the name of the landmarks in messages. The name of landmarks from a file is the file's path.
     - `notes`: a tuple of sentences about points that were left out, and about what the file does not state.
+    - `unit`: the unit of length that the file states, such as `"mm"`, or None if the file does not state one.
+      Only `.mrk.json` files state a unit. No method converts positions to another unit.
 
     **Raises:** `InputError` if there are no landmarks, a name is empty, repeated or not one line of text, the
     positions are not an array (l, 3), or a coordinate is not finite or above 1e60.
@@ -46,6 +48,7 @@ class Landmarks:
     coordinates: CoordinateSystem | None = None
     name: str = "landmarks"
     notes: tuple[str, ...] = ()
+    unit: str | None = None
 
     def __post_init__(self) -> None:
         if not self.names:

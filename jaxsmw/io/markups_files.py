@@ -28,6 +28,8 @@ def parse_markups(text: str) -> Entries:
     """Parse the control points of a Markups file. The file must contain a single list of points."""
     markup = _single_list(_parse_json(text))
     coordinates, notes = _coordinate_system(markup)
+    unit, ignored = _unit(markup)
+    notes += ignored
     points = markup.get("controlPoints", [])
     if not isinstance(points, list):
         raise InputError("controlPoints is not a list: export the markups again.")
@@ -52,7 +54,7 @@ def parse_markups(text: str) -> Entries:
         names.append(label.strip() or str(number))
     notes += left_out(undefined, len(points), "Slicer has no defined position for them")
     table = np.array(positions, dtype=np.float64).reshape(-1, 3)
-    return Entries(names, table, "control point", numbers, coordinates, notes)
+    return Entries(names, table, "control point", numbers, coordinates, notes, unit)
 
 
 def _parse_json(text: str) -> Any:
@@ -109,6 +111,14 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
     return SYSTEMS[stated], ()
 
 
+def _unit(markup: dict[str, Any]) -> tuple[str | None, tuple[str, ...]]:
+    """Return the unit of length that a markup states, or None, and a note if the unit is not text."""
+    stated = markup.get("coordinateUnits")
+    if stated is None or isinstance(stated, str):
+        return stated, ()
+    return None, ("The unit of the coordinates was ignored, because it is not text.",)
+
+
 def _is_defined(point: dict[str, Any], number: int) -> bool:
     """Return whether the position of a control point is defined. A point without a status is defined."""
     status = point.get("positionStatus", "defined")
@@ -129,7 +139,7 @@ def _refuse(number: int, fault: str) -> NoReturn:
 def format_markups(landmarks: Landmarks) -> str:
     """Return landmarks as a Markups file with one point per line. The coordinate system must be known.
 
-    The file states no unit, because the unit of landmarks is not known; Slicer then assumes mm.
+    The file states a unit only if the unit of the landmarks is known. Otherwise, Slicer assumes mm.
     """
     # In Slicer's RAS axes, the orientation is the identity.
     sign = -1.0 if landmarks.coordinates == "LPS" else 1.0
@@ -153,6 +163,7 @@ def format_markups(landmarks: Landmarks) -> str:
     markup: dict[str, Any] = {
         "type": "Fiducial",
         "coordinateSystem": landmarks.coordinates,
+        **({} if landmarks.unit is None else {"coordinateUnits": landmarks.unit}),
         "locked": False,
         "fixedNumberOfControlPoints": False,
         "labelFormat": "%N-%d",

@@ -53,7 +53,8 @@ def transfer_landmarks(
     - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
       see `Correspondence.expected_error`.
 
-    **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y.
+    **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y. The
+    coordinate system and the unit are those of the given landmarks, so both meshes should have them.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
     `InputError` is also raised if the landmarks lie off the surface of X, but would lie on it in the other
