@@ -389,6 +389,27 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
     assert outcome.code == 0 and mean_error(outcome.output) == 0 and not outcome.errors
 
 
+def test_a_mesh_with_many_defects_has_one_line_of_each_kind(run, tmp_path):
+    vertices, faces = grid_mesh(12, 12)
+    faces = np.concatenate([faces, faces[:2], [[0, 1, 1], faces[0][::-1], [0, 14, 100]]])
+    raw = tmp_path / "raw.off"
+    lines = [f"OFF\n{len(vertices) + 3} {len(faces)} 0"]
+    lines += [f"{x} {y} {z}" for x, y, z in np.concatenate([vertices, np.zeros((3, 3))])]
+    raw.write_text("\n".join(lines + [f"3 {a} {b} {c}" for a, b, c in faces]))
+    outcome = run("render", raw, "--output", tmp_path / "m.png")
+    assert outcome.code == 0, outcome.errors
+    size, notes, unusual, written = outcome.errors.splitlines()
+    assert size.startswith(f"{raw}: 147 vertices, 243 faces, 1 connected component, open.")
+    for number in (
+        "1 face dropped because of a repeated vertex",
+        "3 faces dropped",
+        "3 unreferenced vertices",
+    ):
+        assert number in notes
+    assert unusual.startswith(f"{raw}: Unusual elements: ") and "3 non-manifold vertices" in unusual
+    assert written.startswith("wrote")
+
+
 def test_seams_are_reported_and_welded(run, tmp_path):
     vertices, faces = grid_mesh(12, 12)
     soup = make_mesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))

@@ -318,6 +318,19 @@ def test_each_finding_has_one_sentence():
         assert sentence.startswith(part) and sentence.endswith(".") and "\n" not in sentence
 
 
+def test_brief_sentences_contain_all_numbers_that_the_notes_do_not():
+    vertices = np.concatenate([POINTS, [POINTS[0] * 0.5 + POINTS[1] * 0.5]])
+    faces = [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 7], [5, 6, 8], [5, 9, 10], [0, 1, 12]]
+    mesh = make_mesh(vertices, faces)
+    assert diagnose(mesh).brief_sentences() == (
+        "13 vertices, 7 faces, 2 connected components, open.",
+        "Unusual elements: 15 boundary edges in 2 loops, 1 non-manifold edge (more than two faces), 1 non-manifold "
+        "vertex, 1 edge between faces of opposite orientation, 1 degenerate triangle without area.",
+    )
+    assert "1 unreferenced vertex (in no face) among 13 vertices." in mesh.notes
+    assert diagnose(OCTAHEDRON).brief_sentences() == diagnose(OCTAHEDRON).sentences()
+
+
 def test_degenerate_faces_are_found_at_any_scale():
     heights = np.array([0, 1e-14, 1e-11, 1e-9, 1e-3])
     for scale in (1e-55, 1e-6, 1, 1e6, 1e55):

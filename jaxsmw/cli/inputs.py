@@ -21,16 +21,24 @@ if TYPE_CHECKING:
 
 
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
-    """Read a mesh, and print its description on standard error unless `--quiet` is given.
+    """Read a mesh, and print a summary of it on standard error unless `--quiet` is given.
 
     **Raises:** `InputError` if `jaxsmw.read_mesh` refuses the file.
     """
     from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(file, weld=weld)
-    for sentence in describe_mesh(mesh):
-        report_progress(f"{file}: {sentence}")
+    report_mesh(file, mesh)
     return mesh
+
+
+def report_mesh(file: str, mesh: Mesh) -> None:
+    """Print the size, the notes and the unusual elements of a mesh as progress messages, each in one line."""
+    from jaxsmw.geometry.mesh import diagnose
+
+    size, *unusual = diagnose(mesh).brief_sentences()
+    for line in filter(None, (size, " ".join(mesh.notes), *unusual)):
+        report_progress(f"{file}: {line}")
 
 
 def describe_mesh(mesh: Mesh) -> list[str]:

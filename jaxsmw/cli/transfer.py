@@ -17,7 +17,7 @@ from jaxsmw.cli.arguments import (
     refuse_without,
 )
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_initial_map, describe_mesh, initial_map_files, read_maps
+from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_maps, report_mesh
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 from jaxsmw.errors import InputError
@@ -113,8 +113,7 @@ def run(options: argparse.Namespace) -> None:
             read_mesh_data(file, weld=options.weld) for file in (options.source, options.target)
         )
         for file, data in ((options.source, source), (options.target, target)):
-            for sentence in describe_mesh(data.mesh):
-                report_progress(f"{file}: {sentence}")
+            report_mesh(file, data.mesh)
         landmarks = _read_landmarks(options, source) if options.landmarks else None
     correspondence, registered = _register(options, source, target, stopwatch)
     for sentence in registered.sentences():

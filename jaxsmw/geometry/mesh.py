@@ -244,42 +244,62 @@ class Diagnosis:
 
     def sentences(self) -> tuple[str, ...]:
         """Return a sentence about the size of the mesh, and one for each kind of unusual element."""
-        shape = "open" if self.boundary_edges else "closed"
-        found = [
+        return self._size(), *(f"{number}: {meaning}." for number, meaning in self._unusual().values())
+
+    def brief_sentences(self) -> tuple[str, ...]:
+        """Return a sentence about the size of the mesh, and one with the numbers of all unusual elements.
+
+        The second sentence leaves out unreferenced vertices, because the notes of a mesh report them. Without
+        other unusual elements, there is only the first sentence.
+        """
+        unusual = self._unusual()
+        unusual.pop("unreferenced vertices", None)
+        numbers = ", ".join(number for number, _ in unusual.values())
+        return (self._size(), f"Unusual elements: {numbers}.") if numbers else (self._size(),)
+
+    def _size(self) -> str:
+        return (
             f"{count_of(self.vertices, 'vertex')}, {count_of(self.faces, 'face')}, "
-            f"{count_of(self.components, 'connected component')}, {shape}."
-        ]
-        if self.unreferenced_vertices:
-            found.append(
-                f"{count_of(self.unreferenced_vertices, 'unreferenced vertex')} (in no face): never chosen "
-                "as a match."
-            )
-        if self.boundary_edges:
-            found.append(
-                f"{count_of(self.boundary_edges, 'boundary edge')} in "
-                f"{count_of(self.boundary_loops, 'loop')}: the surface ends there."
-            )
-        if self.nonmanifold_edges:
-            found.append(
-                f"{count_of(self.nonmanifold_edges, 'non-manifold edge')} (more than two faces): "
-                "sheets of surface meet there."
-            )
-        if self.nonmanifold_vertices:
-            found.append(
-                f"{count_of(self.nonmanifold_vertices, 'non-manifold vertex')}: "
-                "sheets of surface touch in a single point there."
-            )
-        if self.misoriented_edges:
-            found.append(
-                f"{count_of(self.misoriented_edges, 'edge')} between faces of opposite orientation: "
-                "normals are unreliable there."
-            )
-        if self.degenerate_faces:
-            found.append(
-                f"{count_of(self.degenerate_faces, 'degenerate triangle')} without area: corners coincide or "
-                "lie on a line."
-            )
-        return tuple(found)
+            f"{count_of(self.components, 'connected component')}, "
+            f"{'open' if self.boundary_edges else 'closed'}."
+        )
+
+    def _unusual(self) -> dict[str, tuple[str, str]]:
+        """Return the number of each kind of unusual element that exists, and its meaning, both as text."""
+        loops = count_of(self.boundary_loops, "loop")
+        found = {
+            "unreferenced vertices": (
+                self.unreferenced_vertices,
+                f"{count_of(self.unreferenced_vertices, 'unreferenced vertex')} (in no face)",
+                "never chosen as a match",
+            ),
+            "boundary edges": (
+                self.boundary_edges,
+                f"{count_of(self.boundary_edges, 'boundary edge')} in {loops}",
+                "the surface ends there",
+            ),
+            "non-manifold edges": (
+                self.nonmanifold_edges,
+                f"{count_of(self.nonmanifold_edges, 'non-manifold edge')} (more than two faces)",
+                "sheets of surface meet there",
+            ),
+            "non-manifold vertices": (
+                self.nonmanifold_vertices,
+                count_of(self.nonmanifold_vertices, "non-manifold vertex"),
+                "sheets of surface touch in a single point there",
+            ),
+            "misoriented edges": (
+                self.misoriented_edges,
+                f"{count_of(self.misoriented_edges, 'edge')} between faces of opposite orientation",
+                "normals are unreliable there",
+            ),
+            "degenerate triangles": (
+                self.degenerate_faces,
+                f"{count_of(self.degenerate_faces, 'degenerate triangle')} without area",
+                "corners coincide or lie on a line",
+            ),
+        }
+        return {kind: (number, meaning) for kind, (count, number, meaning) in found.items() if count}
 
     def __str__(self) -> str:
         return "\n".join(self.sentences())
