@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import jax
@@ -461,6 +461,51 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
     matched = mesh_y.vertices[np.loadtxt(tmp_path / "map.txt", dtype=int)]
     apart = np.linalg.norm(written.positions(mesh_y) - matched, axis=1)
     assert 0 < np.median(apart) < 0.05 * mesh_y.area**0.5
+
+
+QUALITY = re.compile(r"quality:     (.*)\n")
+
+
+def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
+    computed, expected_error = [], jaxsmw.Correspondence.expected_error
+
+    def recorded(found):
+        computed.append(expected_error(found))
+        return computed[-1]
+
+    call = [
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        tmp_path / "m",
+        "--init",
+        "shot",
+        "--mirror",
+        "no",
+    ]
+    monkeypatch.setattr(jaxsmw.Correspondence, "expected_error", recorded)
+    # The paper's method computes no distortion.
+    assert not QUALITY.search(run(*call, *SMALL).output) and not computed
+    output = run(*call, "--report", tmp_path / "r", "--expected-error", tmp_path / "e.txt", *SMALL).output
+    assert (
+        QUALITY.search(output)[1] == f"mean expected error {1e3 * computed[0].mean():.2f} x 10^-3 sqrt(area)"
+    )
+    assert len(computed) == 1
+    summary = json.loads((tmp_path / "r" / "summary.json").read_text())
+    assert summary["result"]["expected error, mean"] == f"{np.loadtxt(tmp_path / 'e.txt').mean():.4f} √area"
+
+    # The accurate preset computes a distortion. Here its settings are those of the paper's method.
+    match = jaxsmw.matching.match
+    for distortion, suspicious, text in (
+        (1.2345, False, "distortion 1.234 (1 for isometries)"),
+        (2.5, True, "distortion 2.500 (1 for isometries), the map is suspicious"),
+        (None, True, "the map is suspicious"),
+    ):
+        judged = {"distortion": distortion, "suspicious": suspicious}
+        monkeypatch.setattr(jaxsmw.matching, "match", lambda *a, j=judged, **k: replace(match(*a, **k), **j))
+        for command in (call, ["transfer", *call[1:3], "--registered", tmp_path / "r.off", *call[5:]]):
+            assert QUALITY.search(run(*command, *SMALL).output)[1] == text
 
 
 def test_the_expected_error_is_written(run, pair, tmp_path):

@@ -1,4 +1,4 @@
-"""The final steps of `match` and `demo`: measure errors, write the report and print the times."""
+"""The final steps of `match`, `transfer` and `demo`: errors, the report, and lines on quality and times."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from jaxsmw.cli.method import preset_name
 from jaxsmw.cli.outputs import report_written
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.matching import Correspondence
@@ -48,10 +51,37 @@ def measure_match(
         return measure_errors(correspondence.mesh_y, maps, truth, settings)
 
 
+def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Float[np.ndarray, " m"]:
+    """Return the expected error of each match (m,), as a fraction of sqrt(area of Y)."""
+    report_progress("expected error ...")
+    with stopwatch.step("expected error"):
+        return correspondence.expected_error()
+
+
+def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarray, " m"] | None) -> None:
+    """Print one line with the quality of a match. Nothing is printed if nothing is known.
+
+    **Arguments:**
+
+    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y);
+      None if it was not computed.
+    """
+    parts = []
+    if correspondence.distortion is not None:
+        parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
+    if expected_error is not None:
+        parts.append(f"mean expected error {1e3 * expected_error.mean():.2f} x 10^-3 sqrt(area)")
+    if correspondence.suspicious:
+        parts.append("the map is suspicious")
+    if parts:
+        show(f"quality:     {', '.join(parts)}")
+
+
 def write_match_report(
     directory: str,
     correspondence: Correspondence,
     errors: Mapping[str, GeodesicError],
+    expected_error: Float[np.ndarray, " m"],
     options: argparse.Namespace,
     stopwatch: Stopwatch,
     *,
@@ -62,6 +92,7 @@ def write_match_report(
     **Arguments:**
 
     - `errors`: the dictionary that `measure_match` returns.
+    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     """
     from jaxsmw.report.summary import write_report
@@ -74,6 +105,7 @@ def write_match_report(
             directory,
             correspondence,
             errors=errors,
+            expected_error=expected_error,
             settings=settings,
             seconds=stopwatch.steps(),
             up=up,
@@ -81,8 +113,18 @@ def write_match_report(
     report_written(*written)
 
 
-def show_match(errors: Mapping[str, GeodesicError], stopwatch: Stopwatch) -> None:
-    """Print the errors of all maps and the times of all steps on standard output."""
+def show_match(
+    correspondence: Correspondence,
+    errors: Mapping[str, GeodesicError],
+    expected_error: Float[np.ndarray, " m"] | None,
+    stopwatch: Stopwatch,
+) -> None:
+    """Print the quality of a match, the errors of all maps and the times of all steps on standard output.
+
+    `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
+    or None if it was not computed.
+    """
+    show_quality(correspondence, expected_error)
     for name, error in errors.items():
         show(f"{name + ' map:':12} {error}")
     show(f"time:        {stopwatch.summary()} (compilation included)")

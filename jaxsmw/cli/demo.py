@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from jaxsmw.cli.arguments import path, whole_number
-from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
+from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
@@ -75,8 +75,9 @@ def run(options: argparse.Namespace) -> None:
         write_pointwise_map(found_map, correspondence.pointwise_map)
     report_written(source, target, true_points, found_map)
     errors = measure_match(correspondence, truth, {}, stopwatch, {})
-    write_match_report(options.output, correspondence, errors, options, stopwatch, up="y")
-    show_match(errors, stopwatch)
+    expected = estimate_error(correspondence, stopwatch)
+    write_match_report(options.output, correspondence, errors, expected, options, stopwatch, up="y")
+    show_match(correspondence, errors, expected, stopwatch)
     show(f"Open {directory / 'report.html'} or {directory / 'correspondence.png'} to see the result.")
 
 

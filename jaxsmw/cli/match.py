@@ -15,7 +15,7 @@ from jaxsmw.cli.arguments import (
     path,
     refuse_without,
 )
-from jaxsmw.cli.conclusion import measure_match, show_match, write_match_report
+from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes, write the requested files, and print errors and times.
+    """Match two meshes, write the requested files, and print the quality, the errors and the times.
 
     **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
     """
@@ -109,11 +109,20 @@ def run(options: argparse.Namespace) -> None:
         options, mesh_x, mesh_y, stopwatch, partial=options.partial, index_base=options.index_base
     )
     others = _write_files(options, correspondence, stopwatch)
+    expected = None
+    if options.expected_error or options.report:
+        expected = estimate_error(correspondence, stopwatch)
+    if options.expected_error:
+        with stopwatch.step("writing"):
+            _write_numbers(options.expected_error, expected)
+        report_written(options.expected_error)
     settings = evaluation_settings(options)
     errors = measure_match(correspondence, truth, settings, stopwatch, others)
-    if options.report:
-        write_match_report(options.report, correspondence, errors, options, stopwatch, up=options.up)
-    show_match(errors, stopwatch)
+    if expected is not None and options.report:
+        write_match_report(
+            options.report, correspondence, errors, expected, options, stopwatch, up=options.up
+        )
+    show_match(correspondence, errors, expected, stopwatch)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -167,7 +176,7 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Any]:
-    """Write all files except the report.
+    """Write all files except the expected errors and the report.
 
     **Returns:** A dictionary from names to the requested maps. The names are `one-to-one` (a pointwise map)
     and `surface` (points on the surface of Y).
@@ -192,11 +201,6 @@ def _write_files(
             _write_points(options, correspondence, points)
         if options.surface_points:
             others["surface"] = points
-    if options.expected_error:
-        report_progress("expected error ...")
-        with stopwatch.step("expected error"):
-            _write_numbers(options.expected_error, correspondence.expected_error())
-        report_written(options.expected_error)
     return others
 
 

@@ -16,6 +16,7 @@ from jaxsmw.cli.arguments import (
     path,
     refuse_without,
 )
+from jaxsmw.cli.conclusion import estimate_error, show_quality
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_maps, report_mesh
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
@@ -23,6 +24,9 @@ from jaxsmw.cli.outputs import check_outputs, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.io.mesh_data import MeshData
     from jaxsmw.matching import Correspondence
@@ -116,6 +120,11 @@ def run(options: argparse.Namespace) -> None:
             report_mesh(file, data.mesh)
         landmarks = _read_landmarks(options, source) if options.landmarks else None
     correspondence, registered = _register(options, source, target, stopwatch)
+    expected = None
+    if correspondence is not None:
+        if landmarks:
+            expected = estimate_error(correspondence, stopwatch)
+        show_quality(correspondence, expected)
     for sentence in registered.sentences():
         show(sentence)
     if options.registered:
@@ -132,7 +141,7 @@ def run(options: argparse.Namespace) -> None:
             say(f"note: {note}")
         _write(options.attributes, carried, stopwatch)
     if landmarks:
-        _transfer_landmarks(options, landmarks, correspondence, registered, stopwatch)
+        _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
     show(f"time: {stopwatch.summary()} (compilation included)")
 
 
@@ -220,21 +229,20 @@ def _register(
 def _transfer_landmarks(
     options: argparse.Namespace,
     landmarks: Landmarks,
-    correspondence: Correspondence | None,
+    expected_error: Float[np.ndarray, " m"] | None,
     registered: RegisteredMesh,
     stopwatch: Stopwatch,
 ) -> None:
-    """Transfer the landmarks, write them, and print their expected errors."""
+    """Transfer the landmarks, write them, and print their expected errors.
+
+    `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
+    or None if a map was given.
+    """
     from jaxsmw.io.landmark_files import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
-    expected = None
-    if correspondence is not None:
-        report_progress("expected error ...")
-        with stopwatch.step("expected error"):
-            expected = correspondence.expected_error()
     with stopwatch.step("landmarks"):
-        found = transfer_landmarks(landmarks, registered, expected_error=expected)
+        found = transfer_landmarks(landmarks, registered, expected_error=expected_error)
     for note in found.notes:
         say(f"note: {note}")
     _show_landmarks(found)

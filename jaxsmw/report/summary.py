@@ -76,14 +76,14 @@ def write_report(
     correspondence: Correspondence,
     *,
     errors: Mapping[str, GeodesicError] | None = None,
+    expected_error: Float[np.ndarray, " m"] | None = None,
     settings: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
 ) -> list[Path]:
     """Writes pictures of a match, an interactive page and a summary to a directory.
 
-    The report contains the expected error (`Correspondence.expected_error`), and the measured errors if
-    given.
+    The report contains the expected error, and the measured errors if given.
 
     **Arguments:**
 
@@ -95,6 +95,8 @@ def write_report(
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
+    - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
+      default, `Correspondence.expected_error` computes it.
     - `settings`: a dictionary of settings to include in `summary.json`, serialisable as JSON.
     - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
       default `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and
@@ -110,8 +112,10 @@ def write_report(
     directory = make_directory(directory)
     errors = errors or {}
     steps = dict(correspondence.seconds if seconds is None else seconds)
-    with timed("expected error", steps):
-        expected = correspondence.expected_error()
+    expected = expected_error
+    if expected is None:
+        with timed("expected error", steps):
+            expected = correspondence.expected_error()
     shown = _shown_maps(correspondence, errors, expected)
     with timed("pictures", steps):
         pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
