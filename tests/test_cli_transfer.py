@@ -53,7 +53,10 @@ def test_all_files_are_written(run, pair, tmp_path):
     carried = read_landmark_file(tmp_path / "l.csv")
     assert carried.names == ("a", "b")
     assert np.linalg.norm(carried.positions - target.vertices[truth[[3, 400]]], axis=1).max() < 0.2 * root
-    assert "distance to the target" in outcome.output and "landmark b: expected error" in outcome.output
+    assert (
+        "distance to the target" in outcome.output
+        and "expected errors of landmarks, in the unit of the target:\n  a: 0." in outcome.output
+    )
     assert "are in LPS coordinates" in outcome.errors
 
 
@@ -73,6 +76,28 @@ def test_a_map_replaces_the_match(run, pair, tmp_path):
     truth = np.loadtxt(pair / "truth.txt", dtype=int)
     apart = np.linalg.norm(jaxsmw.read_mesh(tmp_path / "r.off").vertices - target.vertices[truth], axis=1)
     assert np.quantile(apart, 0.99) < 0.02 * np.sqrt(target.area)
+
+
+def test_landmarks_with_large_expected_errors_are_marked(run, pair, tmp_path, monkeypatch):
+    expected = np.full(642, 0.01)
+    expected[[3, 400]] = 0.015, 0.021
+    monkeypatch.setattr(jaxsmw.Correspondence, "expected_error", lambda self: expected)
+    vertices = jaxsmw.read_mesh(pair / "x.off").vertices
+    names = ("a", "b", "c", "d", "e")
+    write_landmark_file(tmp_path / "l.csv", Landmarks(names, vertices[[3, 400, 100, 200, 300]]))
+    outcome = run(
+        "transfer", pair / "x.off", pair / "y.ply", *SMALL, "--init", "shot",
+        "--landmarks", tmp_path / "l.csv", "--landmarks-output", tmp_path / "t.csv",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    unit = np.sqrt(jaxsmw.read_mesh(pair / "y.ply").area)
+    lines = outcome.output.splitlines()
+    first = lines.index("expected errors of landmarks, in the unit of the target:") + 1
+    assert lines[first : first + 5] == [
+        f"  a: {0.015 * unit:.3g}",
+        f"  b: {0.021 * unit:.3g} (more than twice the median: check this landmark)",
+        *(f"  {name}: {0.01 * unit:.3g}" for name in names[2:]),
+    ]
 
 
 def test_the_unit_of_the_landmarks_is_kept(run, pair, tmp_path):

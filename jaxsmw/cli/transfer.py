@@ -251,11 +251,21 @@ def _transfer_landmarks(
 
 
 def _show_landmarks(found: TransferredLandmarks) -> None:
-    """Print the expected error of each landmark, in the unit of the target."""
+    """Print the expected error of each landmark, in the unit of the target, and mark large errors."""
     if found.expected_errors is None:
         return
-    for name, error in zip(found.landmarks.names, found.expected_errors, strict=True):
-        show(f"landmark {name}: expected error {error:.3g}")
+    import numpy as np
+
+    show("expected errors of landmarks, in the unit of the target:")
+    large = found.expected_errors > _LARGE * np.median(found.expected_errors)
+    for name, error, is_large in zip(found.landmarks.names, found.expected_errors, large, strict=True):
+        show(
+            f"  {name}: {error:.3g}{' (more than twice the median: check this landmark)' if is_large else ''}"
+        )
+
+
+# Landmarks are marked if their expected error exceeds this multiple of the median of all landmarks.
+_LARGE = 2
 
 
 def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
