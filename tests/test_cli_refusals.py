@@ -40,6 +40,7 @@ def test_a_missing_matplotlib_is_reported_before_the_work(run, pair, tmp_path, m
     meshes, truth = [pair / "x.off", pair / "y.ply"], pair / "truth.txt"
     for arguments in (
         ["match", *meshes, "--output", tmp_path / "m", "--report", tmp_path / "r"],
+        ["transfer", *meshes, "--report", tmp_path / "r"],
         ["demo", "--output", tmp_path / "demo"],
         ["spectrum", pair / "x.off", "--figure", tmp_path / "s.png"],
         ["evaluate", *meshes, truth, "--ground-truth", truth, "--page", tmp_path / "p.html"],

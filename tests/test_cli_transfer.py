@@ -78,6 +78,29 @@ def test_a_map_replaces_the_match(run, pair, tmp_path):
     assert np.quantile(apart, 0.99) < 0.02 * np.sqrt(target.area)
 
 
+def test_the_report_shows_a_registered_mesh_that_is_computed_once(run, pair, tmp_path, monkeypatch):
+    calls = []
+    for name in ("surface_points", "registered_mesh"):
+        method = getattr(jaxsmw.Correspondence, name)
+
+        def counted(self, *, name=name, method=method, **settings):
+            calls.append(name)
+            return method(self, **settings)
+
+        monkeypatch.setattr(jaxsmw.Correspondence, name, counted)
+    outcome = run(
+        "transfer", pair / "x.off", pair / "y.ply", *SMALL, "--report", tmp_path / "report", "--up", "z",
+        "--landmarks", pair / "x.csv", "--landmarks-output", tmp_path / "l.csv",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    assert "report.html" in outcome.errors and "mean expected error" in outcome.output
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert '"registered"' in page and "x.off to y.ply" in page
+    summary = json.loads((tmp_path / "report" / "summary.json").read_text())
+    assert summary["settings"]["preset"] == "paper" and "registered mesh" in summary["seconds"]
+    assert sorted(calls) == ["registered_mesh", "surface_points"]
+
+
 def test_landmarks_with_large_expected_errors_are_marked(run, pair, tmp_path, monkeypatch):
     expected = np.full(642, 0.01)
     expected[[3, 400]] = 0.015, 0.021
@@ -163,6 +186,10 @@ def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
         ("--registered {t}/r.off --map {t}/missing.txt", "missing.txt"),
         ("--registered {t}/r.off --map {p}/truth.txt --preset fast", "--preset has no effect with --map"),
         ("--registered {t}/r.off --map {p}/truth.txt --init wks", "--init has no effect with --map"),
+        ("--report {t}/r --map {p}/truth.txt", "--report: describes a match, but --map gives a map"),
+        ("--registered {t}/r.off --up z", "--up: has no effect without --report"),
+        ("--report {p}/x.off", "is an input"),
+        ("--registered {t}/r/report.html --report {t}/r", "meshes cannot be written"),
         ("--registered {t}/r.off --index-base 1", "--index-base: has no effect without --map"),
         ("--landmarks {p}/x.mrk.json --landmarks-output {t}/l.mps", "l.mps"),
         ("--landmarks {p}/x.off --landmarks-output {t}/l.csv", "x.off"),

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.matching import Correspondence
+    from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 
 def measure_match(
@@ -86,6 +87,7 @@ def write_match_report(
     stopwatch: Stopwatch,
     *,
     up: Any,
+    registered: RegisteredMesh | None = None,
 ) -> None:
     """Write the report of a match to a directory. The report's summary contains the options of the command.
 
@@ -94,6 +96,7 @@ def write_match_report(
     - `errors`: the dictionary that `measure_match` returns.
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
+    - `registered`: the registered mesh, if it was already computed.
     """
     from jaxsmw.report.summary import write_report
 
@@ -109,6 +112,7 @@ def write_match_report(
             settings=settings,
             seconds=stopwatch.steps(),
             up=up,
+            registered=registered,
         )
     report_written(*written)
 

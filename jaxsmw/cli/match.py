@@ -20,7 +20,7 @@ from jaxsmw.cli.console import Stopwatch, report_progress
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -158,19 +158,14 @@ def _check(options: argparse.Namespace) -> None:
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
     """Return each requested directory with the names of the files that the command writes to it."""
     directories: list[tuple[str, tuple[str, ...]]] = []
-    if options.report or options.texture:
+    if options.texture:
         from jaxsmw.report.figures import check_drawable
 
         check_drawable()
-    if options.texture:
         from jaxsmw.report.texture import TEXTURE_FILES
 
         directories.append((options.texture, TEXTURE_FILES))
-    if options.report:
-        from jaxsmw.report.summary import REPORT_FILES
-
-        directories.append((options.report, REPORT_FILES))
-    return directories
+    return directories + report_directories(options.report)
 
 
 def _write_files(

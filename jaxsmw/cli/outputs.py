@@ -81,6 +81,23 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
         raise InputError(f"{path}: two outputs have this name: choose another name for one of the outputs.")
 
 
+def report_directories(directory: str | None) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the directory of a report with the names of its files, for `check_outputs`.
+
+    The list is empty if `directory` is None.
+
+    **Raises:** `InputError` if a report is requested, but matplotlib is missing.
+    """
+    if directory is None:
+        return []
+    from jaxsmw.report.figures import check_drawable
+
+    check_drawable()
+    from jaxsmw.report.summary import REPORT_FILES
+
+    return [(directory, REPORT_FILES)]
+
+
 def is_page(path: str) -> bool:
     """Return whether a file name has the suffix of an HTML page, `.html` or `.htm`."""
     return Path(path).suffix.lower() in (".html", ".htm")

@@ -12,15 +12,16 @@ from jaxsmw.cli.arguments import (
     add_index_base,
     add_partial,
     add_source_and_target,
+    add_up,
     add_weld,
     path,
     refuse_without,
 )
-from jaxsmw.cli.conclusion import estimate_error, show_quality
+from jaxsmw.cli.conclusion import estimate_error, show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_maps, report_mesh
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -86,6 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.003)",
     )
+    parser.add_argument(
+        "--report",
+        metavar="DIR",
+        type=path,
+        help="write pictures, an interactive 3D page and a summary to this directory, like match --report",
+    )
+    add_up(parser)
     add_partial(parser)
     add_method(parser)
     add_weld(parser)
@@ -122,7 +130,7 @@ def run(options: argparse.Namespace) -> None:
     correspondence, registered = _register(options, source, target, stopwatch)
     expected = None
     if correspondence is not None:
-        if landmarks:
+        if landmarks or options.report:
             expected = estimate_error(correspondence, stopwatch)
         show_quality(correspondence, expected)
     for sentence in registered.sentences():
@@ -142,20 +150,34 @@ def run(options: argparse.Namespace) -> None:
         _write(options.attributes, carried, stopwatch)
     if landmarks:
         _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
+    if correspondence is not None and expected is not None and options.report:
+        write_match_report(
+            options.report,
+            correspondence,
+            {},
+            expected,
+            options,
+            stopwatch,
+            up=options.up,
+            registered=registered,
+        )
     show(f"time: {stopwatch.summary()} (compilation included)")
 
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    if not (options.registered or options.landmarks_output or options.attributes):
+    if not (options.registered or options.landmarks_output or options.attributes or options.report):
         raise InputError(
-            "nothing to write: give --registered FILE, --attributes FILE, or --landmarks FILE with "
-            "--landmarks-output FILE."
+            "nothing to write: give --registered FILE, --attributes FILE, --report DIR, or --landmarks FILE "
+            "with --landmarks-output FILE."
         )
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
     refuse_without(options, "--landmarks-output", bool(options.landmarks_output), "landmarks")
     if options.map and (given := given_method(options)):
         raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
+    if options.map and options.report:
+        raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
+    refuse_without(options, "--report", bool(options.report), "up")
     init_files = initial_map_files(options.init)
     check_preset(options)
     check_initial_map(options.init)
@@ -172,6 +194,7 @@ def _check(options: argparse.Namespace) -> None:
     check_outputs(
         [options.source, options.target, options.map, options.landmarks, *init_files],
         files=[options.registered, options.attributes, options.landmarks_output],
+        directories=report_directories(options.report),
     )
     import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
 

@@ -40,6 +40,7 @@ from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
+from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,6 +81,7 @@ def write_report(
     settings: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
+    registered: RegisteredMesh | None = None,
 ) -> list[Path]:
     """Writes pictures of a match, an interactive page and a summary to a directory.
 
@@ -103,6 +105,8 @@ def write_report(
       prints the sum as the total time.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
+    - `registered`: the registered mesh that the page shows. By default, the page shows the result of
+      `Correspondence.registered_mesh`.
 
     **Returns:** The files that were written.
 
@@ -134,7 +138,7 @@ def write_report(
         error_meanings=_ERROR_MEANINGS,
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
-        registered=correspondence.registered_mesh().vertices,
+        registered=(registered or correspondence.registered_mesh()).vertices,
     )
     summary = {
         "settings": dict(settings or {}),
