@@ -79,3 +79,23 @@ def test_symmetric_and_partial_shapes_are_not_aligned():
 
 def _turned(mesh):
     return make_mesh(Rotation.random(random_state=3).apply(mesh.vertices), mesh.faces)
+
+
+def test_tangent_planes_bring_a_nearly_round_copy_into_its_exact_place():
+    """Samples of both surfaces differ, so closest points alone stop at a wrong rotation."""
+    mesh = bumpy_mesh(4)
+    generator = np.random.default_rng(0)
+    turn = Rotation.random(random_state=5)
+    x, y = (generator.permutation(len(mesh.vertices))[:1000] for _ in range(2))
+    points = turn.apply(mesh.vertices[y])
+    coarse = align_rigidly(mesh.vertices[x], points)
+    fine = align_rigidly(mesh.vertices[x], points, turn.apply(mesh.vertex_normals[y]))
+    off = [(Rotation.from_matrix(motion.rotation) * turn.inv()).magnitude() for motion in (coarse, fine)]
+    assert off[1] < 0.01 < off[0]
+
+
+def test_tangent_planes_are_not_used_for_shapes_that_only_resemble_each_other():
+    other = make_mesh(LUMP.vertices * (1 + 0.1 * np.sin(5 * LUMP.vertices)), LUMP.faces)
+    plain = align_rigidly(LUMP.vertices, other.vertices)
+    with_normals = align_rigidly(LUMP.vertices, other.vertices, other.vertex_normals)
+    np.testing.assert_array_equal(with_normals.rotation, plain.rotation)

@@ -491,9 +491,9 @@ INCONSISTENT = {
     "short skin": ({"skin": (("a",), np.zeros((2, 1)))}, "needs numbers of shape (3, 1)"),
     "equal joints": ({"skin": (("a", "a"), np.zeros((3, 2)))}, "not distinct"),
     "skin of nan": ({"skin": (("a",), np.full((3, 1), np.nan))}, "not finite"),
-    "labels without data": ({"label_names": {"a": ("x",)}}, "the labels 'a'"),
+    "labels without data": ({"label_names": {"a": ("x",)}}, "the array of labels 'a'"),
     "labels out of range": ({"face_data": {"a": [1]}, "label_names": {"a": ("x",)}}, "from 0 to 0"),
-    "labels of floats": ({"face_data": {"a": [0.0]}, "label_names": {"a": ("x",)}}, "are not integers"),
+    "labels of floats": ({"face_data": {"a": [0.0]}, "label_names": {"a": ("x",)}}, "must contain integers"),
 }  # fmt: skip
 
 

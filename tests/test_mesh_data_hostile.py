@@ -204,7 +204,7 @@ HOSTILE = {
     "single number.npz": (npz(**NPZ, **{"face_data/a": np.array(1.0)}), "shape ()"),
     "short shape.npz": (npz(**NPZ, **{"blend_shapes/a": np.ones((2, 3))}), "the blend shape 'a'"),
     "short skin.npz": (npz(**NPZ, skin_joints=np.array(["a"]), skin_weights=np.ones((2, 1))), "the skin"),
-    "labels.npz": (npz(**NPZ, **{"face_data/a": np.array([1]), "label_names/a": np.array(["x"])}), "the labels 'a'"),
+    "labels.npz": (npz(**NPZ, **{"face_data/a": np.array([1]), "label_names/a": np.array(["x"])}), "the array of labels 'a'"),
     "texture without vt.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\n", "uses texture vertex 1, but the file has 0 vt lines"),
     "texture out of range.obj": (OBJ + "f 1/1 2/2 3/3\n", "uses texture vertex 3, but the file has 2 vt lines"),
     "texture zero.obj": (OBJ + "f 1/1 2/2 3/0\n", "uses texture vertex 0"),
@@ -223,7 +223,7 @@ HOSTILE = {
     "short data.mat": (mat(vertex_data={"a": np.ones((2, 1))}), "'a' have 2 rows, but need 3"),
     "words as data.mat": (mat(vertex_data={"a": "xyz"}), "the vertex data 'a'"),
     "skin without weights.mat": (mat(skin={"joints": "a"}), "the skin"),
-    "labels.mat": (mat(label_names={"a": "x"}), "the labels 'a'"),
+    "labels.mat": (mat(label_names={"a": "x"}), "the array of labels 'a'"),
 }  # fmt: skip
 
 

@@ -39,11 +39,12 @@ def _aligned_positions(sampled: SampledPair) -> tuple[Float[np.ndarray, "m 3"], 
     **Returns:** The positions of X after the alignment (m, 3) and of Y (n, 3), with one row per compared
     vertex, in the units of `Pair.units_of_length`.
     """
-    positions, samples = [], []
+    positions, samples, normals = [], [], []
     for side, unit in zip(sampled.sides, sampled.pair.units_of_length, strict=True):
         scaled = side.mesh.vertices / unit
         spread = poisson_disk_samples(side.mesh, _SAMPLES)
         samples.append(scaled[spread.vertices])
+        normals.append(side.mesh.vertex_normals[spread.vertices])
         positions.append(scaled if side.samples is None else scaled[side.samples.vertices])
-    motion = align_rigidly(*samples)
+    motion = align_rigidly(samples[0], samples[1], normals[1])
     return motion.apply(positions[0]), positions[1]

@@ -30,7 +30,7 @@ _AVERAGINGS = 8
 _DEFORMATIONS, _REDUCED, _NEIGHBOURS = 9, 0.4, 2
 # Regions with reduced weights are then pulled to the target `_PULLS` times. `_PULL` is the weight of the
 # pull, relative to the weight of the map elsewhere. (Entry R22)
-_PULLS, _PULL = 3, 0.1
+_PULLS, _PULL = 4, 0.2
 # The relative residual at which the linear solver stops.
 _TOLERANCE = 1e-5
 
@@ -208,17 +208,21 @@ def register_mesh(
         positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
         similarities = around.similarities(positions, _AVERAGINGS)
 
-    for number in range(_DEFORMATIONS):
-        deform()
+    def reduce_weights_at_flips() -> bool:
+        nonlocal weights
         flipped = _flipped_faces(mesh_x, positions, similarities)
-        # The first deformation uses transformations that are fitted to the map itself, which is noisy.
-        if number > 0 and not flipped.any():
-            break
         near = np.zeros(len(weights))
         near[mesh_x.faces[flipped]] = 1
         for _ in range(_NEIGHBOURS):
             near = around.averaging @ near
         weights = np.where(near > 0, _REDUCED * weights, weights)
+        return bool(flipped.any())
+
+    for number in range(_DEFORMATIONS):
+        deform()
+        # The first deformation uses transformations that are fitted to the map itself, which is noisy.
+        if not reduce_weights_at_flips() and number > 0:
+            break
     loose = weights < areas
     if loose.any():
         weights = np.where(loose, _PULL * areas, weights)
@@ -226,6 +230,7 @@ def register_mesh(
             nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
             targets[loose] = nearest.positions(mesh_y) - middle
             deform()
+            reduce_weights_at_flips()
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
     return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
 
