@@ -349,8 +349,9 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"aligned"` if both shapes differ from their own mirror images, as teeth do,
-          and `partial` is False; otherwise `"shot"`.
+        - `"auto"` (the default): `"shot"`. If both shapes differ from their own mirror images, as teeth do,
+          `partial` is False and the preset has repair, then `"aligned"` is refined as well, and the map with
+          the smaller expected error is returned.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative initial maps.
@@ -423,23 +424,41 @@ def match(
     if (mirror == "auto" or automatic) and not partial:
         with timed("mirror test", seconds):
             decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide(mirror)
-        init = "aligned" if automatic and decision.asymmetric else first_init
-        again = None
         if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
-            again = prepare_hand(pair.mirrored(), init=init)
-        elif automatic and decision.asymmetric:
-            again = prepared.started_from("aligned")
-        if again is not None:
-            prepared = again
-            seconds |= {step: seconds[step] + time for step, time in again.seconds.items()}
+            prepared = prepare_hand(pair.mirrored(), init=first_init)
+            _add_seconds(prepared, seconds)
+    starts = [prepared]
+    if automatic and decision.asymmetric and chosen.repair is not None:
+        starts.append(prepared.started_from("aligned"))
+        _add_seconds(starts[-1], seconds)
     if prepared.spectrum_x.descriptors is None:
         chosen = chosen.without_descriptors()
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
-        outcome = refine_in_stages(prepared, chosen.stages, chosen.repair, history=history)
-        jax.block_until_ready(outcome.refinements[-1])
-    return _correspondence(pair, prepared, chosen, outcome, seconds, decision)
+        outcomes = [
+            refine_in_stages(start, chosen.stages, chosen.repair, history=history) for start in starts
+        ]
+        jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
+    candidates = [
+        (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
+    ] or [(prepared, outcomes[0])]
+    found = [
+        _correspondence(pair, start, chosen, outcome, seconds, decision) for start, outcome in candidates
+    ]
+    best = 0
+    if len(found) > 1:
+        assert chosen.repair is not None
+        with timed("expected error", seconds):
+            from_shot, from_aligned = (float(one.expected_error().mean()) for one in found)
+        best = int(from_shot >= chosen.repair.aligned_preference * from_aligned)
+    _warn_if_suspicious(*candidates[best], chosen, decision)
+    return found[best]
+
+
+def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
+    """Add the times of a further preparation."""
+    seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
@@ -464,7 +483,7 @@ def _correspondence(
     seconds: dict[str, float],
     decision: Decision,
 ) -> Correspondence:
-    """Make the result of `match`, and issue a warning if the result is suspicious.
+    """Make the result of `match`.
 
     **Raises:** `ArithmeticError` if refinement failed.
     """
@@ -472,11 +491,6 @@ def _correspondence(
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
-    if outcome.suspicious:
-        assert preset.repair is not None
-        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
-    if decision.doubtful:
-        warnings.warn(_doubt(pair, decision), stacklevel=3)
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -496,6 +510,14 @@ def _correspondence(
         mirror_evidence=decision.evidence,
         seconds=seconds,
     )
+
+
+def _warn_if_suspicious(prepared: PreparedPair, outcome: Outcome, preset: Preset, decision: Decision) -> None:
+    if outcome.suspicious:
+        assert preset.repair is not None
+        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
+    if decision.doubtful:
+        warnings.warn(_doubt(prepared.pair, decision), stacklevel=3)
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:

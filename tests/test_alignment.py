@@ -1,11 +1,13 @@
 """Rigid alignment, and the initial map that uses it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw import Pair, creature_pair, initial_map, make_mesh, match, paired_spectra
+from jaxsmw import PRESETS, Pair, RepairSettings, creature_pair, initial_map, make_mesh, match, paired_spectra
 from jaxsmw.geometry.alignment import align_rigidly
 
 LUMP = bumpy_mesh(3)
@@ -55,26 +57,48 @@ def test_mirrored_shapes_are_aligned_as_their_mirror_images():
     np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
 
 
+def _expected(found):
+    return float(found.expected_error().mean())
+
+
 @pytest.mark.parametrize("mirror", ["auto", "no"])
-def test_asymmetric_shapes_are_aligned(mirror):
-    """The lump differs from its mirror image, so `match` aligns the shapes."""
-    found = match(LUMP, _turned(LUMP), preset="paper", mirror=mirror)
-    aligned = match(LUMP, _turned(LUMP), preset="paper", mirror="no", init="aligned")
-    assert found.init == aligned.init == "aligned"
-    np.testing.assert_array_equal(found.initial_map, aligned.initial_map)
-    np.testing.assert_array_equal(found.pointwise_map, aligned.pointwise_map)
+def test_asymmetric_shapes_are_matched_from_both_initial_maps(mirror):
+    """The lump differs from its mirror image, so `match` keeps the better of two maps."""
+    noise = 0.004 * np.random.default_rng(1).normal(size=LUMP.vertices.shape)
+    target = make_mesh(Rotation.random(random_state=3).apply(LUMP.vertices + noise), LUMP.faces)
+    found = match(LUMP, target, mirror=mirror)
+    each = {init: match(LUMP, target, init=init, mirror="no") for init in ("shot", "aligned")}
+    from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
+    best = each["shot" if from_shot else "aligned"]
+    assert found.init == best.init
+    np.testing.assert_array_equal(found.pointwise_map, best.pointwise_map)
+    assert {"mirror test", "expected error"} <= found.seconds.keys()
+
+
+def test_a_bent_shape_is_matched_from_descriptors():
+    """No rigid motion brings a bent shape into place, so the map from SHOT is better."""
+    straight = bumpy_mesh(4).vertices * [1, 1, 3]
+    angle, radius = straight[:, 2] / 3, 3 + straight[:, 1]
+    bent = np.stack([straight[:, 0], radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    faces = bumpy_mesh(4).faces
+    target = make_mesh(Rotation.random(random_state=4).apply(bent), faces)
+    found = match(make_mesh(straight, faces), target)
+    apart = np.linalg.norm(target.vertices[found.pointwise_map] - target.vertices, axis=1)
+    assert found.init == "shot" and apart.mean() < 0.02 * target.area**0.5
 
 
 def test_a_mirrored_asymmetric_shape_is_aligned_as_its_mirror_image():
-    found = match(LUMP, _turned(LUMP.mirrored()), preset="paper")
+    settings = replace(PRESETS["accurate"], repair=RepairSettings(aligned_preference=0.0))
+    found = match(LUMP, _turned(LUMP.mirrored()), preset=settings)
     assert found.mirrored and found.init == "aligned"
     np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
 
 
-def test_symmetric_and_partial_shapes_are_not_aligned():
+def test_symmetric_and_partial_shapes_and_presets_without_repair_start_from_descriptors():
     pair = creature_pair(vertices=700)
-    assert match(pair.source, pair.target, preset="paper").init == "shot"
-    assert match(LUMP, _turned(LUMP), preset="paper", partial=True).init == "shot"
+    assert match(pair.source, pair.target).init == "shot"
+    assert match(LUMP, _turned(LUMP), preset="paper").init == "shot"
+    assert match(LUMP, _turned(LUMP), partial=True).init == "shot"
 
 
 def _turned(mesh):

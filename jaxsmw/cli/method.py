@@ -64,9 +64,10 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
-        "%(default)s). auto is aligned for shapes that differ from their own mirror images, like teeth, and "
-        "shot for other shapes. With shot, wks, hks and wavelet, each source vertex is matched to the target "
-        "vertex with the most similar descriptor. aligned also compares positions after a rigid alignment. "
+        "%(default)s). auto is shot; with --preset accurate, shapes that differ from their own mirror "
+        "images, like teeth, are also matched from aligned, and the better map is kept. With shot, wks, hks "
+        "and wavelet, each source vertex is matched to the target vertex with the most similar descriptor. "
+        "aligned also compares positions after a rigid alignment. "
         "functional computes a functional map that preserves SHOT descriptors. A landmarks file has a "
         "source and a target vertex per line. Two landmark files contain named points on the source and on "
         "the target, in the formats of "

@@ -120,6 +120,9 @@ class RepairSettings:
     - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
       worse by less than this value (at least 0). The scores of two correct maps mostly differ by less than
       this value. The scores of a correct map and an upside-down map differ by more than this value.
+    - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
+      from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is returned if its mean expected
+      error is below this multiple of the other map's mean expected error.
     - `alternatives` (Table R13): a tuple with one entry for each alternative initial map from functional
       maps. Each entry is a pair: a tuple of SHOT radii, and a weight w from 0 to 1. The radii are positive
       integers, in units of 0.06 times the square root of the area. A nearest-neighbour search in SHOT from X
@@ -151,6 +154,7 @@ class RepairSettings:
     agreeing: int = 3
     uncertainty_weight: float = 10.0
     score_tolerance: float = 0.25
+    aligned_preference: float = 0.98
     alternatives: tuple[tuple[tuple[int, ...], float], ...] = (((1, 2, 4), 0.5), ((1,), 1.0), ((1,), 0.5))
     alternative_eigenvectors: int = 100
     extremity_levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
