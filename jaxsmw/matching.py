@@ -421,7 +421,8 @@ def match(
     prepared = prepare_hand(of_one_hand, init=first_init)
     seconds = dict(prepared.seconds)
     decision = Decision(mirror == "yes")
-    if (mirror == "auto" or automatic) and not partial:
+    aligns = automatic and chosen.repair is not None  # if the shapes are asymmetric
+    if (mirror == "auto" or aligns) and not partial:
         with timed("mirror test", seconds):
             decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide(mirror)
         if decision.mirrored and mirror == "auto":
@@ -429,7 +430,7 @@ def match(
             prepared = prepare_hand(pair.mirrored(), init=first_init)
             _add_seconds(prepared, seconds)
     starts = [prepared]
-    if automatic and decision.asymmetric and chosen.repair is not None:
+    if aligns and decision.asymmetric:
         starts.append(prepared.started_from("aligned"))
         _add_seconds(starts[-1], seconds)
     if prepared.spectrum_x.descriptors is None:
