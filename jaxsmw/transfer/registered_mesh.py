@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -25,12 +26,30 @@ _STIFFNESS_OF_MAPS = 0.01
 # The number of averagings that `Neighborhoods.similarities` makes. With fewer averagings, the similarity
 # transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
-# The mesh is deformed up to `_DEFORMATIONS` times. After each deformation, the weights of the map are
-# multiplied by `_REDUCED` at flipped faces and at vertices up to `_NEIGHBOURS` edges away. (Entry R22)
-_DEFORMATIONS, _REDUCED, _NEIGHBOURS = 9, 0.4, 2
-# Regions with reduced weights are then pulled to the target `_PULLS` times. `_PULL` is the weight of the
-# pull, relative to the weight of the map elsewhere. (Entry R22)
-_PULLS, _PULL = 4, 0.2
+
+
+class _Round(NamedTuple):
+    """Successive deformations, each followed by a reduction of weights where faces are flipped.
+
+    **Attributes:**
+
+    - `deformations`: the largest number of deformations. Unless the round pulls, the round ends when no face
+      is flipped.
+    - `factor`: the factor of the weights at flipped faces and at their neighbours.
+    - `neighbors`: the largest distance to these neighbours, in edges.
+    - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target.
+      The number is the weight of these points, relative to the weight of the map elsewhere.
+    """
+
+    deformations: int
+    factor: float
+    neighbors: int
+    pull: float = 0.0
+
+
+# The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
+# target, and folds that come back are removed. (Entry R22)
+_ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.2), _Round(6, 0.4, 1))
 # The relative residual at which the linear solver stops.
 _TOLERANCE = 1e-5
 
@@ -200,37 +219,30 @@ def register_mesh(
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
     positions, similarities = targets, around.similarities(targets, _AVERAGINGS)
-    weights = areas.copy()
-
-    def deform() -> None:
-        nonlocal positions, similarities
-        edge_vectors = around.transformed(similarities)
-        positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
-        similarities = around.similarities(positions, _AVERAGINGS)
-
-    def reduce_weights_at_flips() -> bool:
-        nonlocal weights
-        flipped = _flipped_faces(mesh_x, positions, similarities)
-        near = np.zeros(len(weights))
-        near[mesh_x.faces[flipped]] = 1
-        for _ in range(_NEIGHBOURS):
-            near = around.averaging @ near
-        weights = np.where(near > 0, _REDUCED * weights, weights)
-        return bool(flipped.any())
-
-    for number in range(_DEFORMATIONS):
-        deform()
-        # The first deformation uses transformations that are fitted to the map itself, which is noisy.
-        if not reduce_weights_at_flips() and number > 0:
+    weights, number = areas.copy(), 0
+    for of_round in _ROUNDS:
+        loose = weights < areas
+        if of_round.pull:
+            weights = np.where(loose, of_round.pull * areas, weights)
+        for _ in range(of_round.deformations):
+            if of_round.pull and loose.any():
+                nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
+                targets[loose] = nearest.positions(mesh_y) - middle
+            edge_vectors = around.transformed(similarities)
+            positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
+            similarities = around.similarities(positions, _AVERAGINGS)
+            number += 1
+            flipped = _flipped_faces(mesh_x, positions, similarities)
+            # The first deformation uses transformations that are fitted to the map itself, which is noisy.
+            if not (of_round.pull or flipped.any()) and number > 1:
+                break
+            near = np.zeros(len(weights))
+            near[mesh_x.faces[flipped]] = 1
+            for _ in range(of_round.neighbors):
+                near = around.averaging @ near
+            weights = np.where(near > 0, of_round.factor * weights, weights)
+        if not (weights < areas).any():
             break
-    loose = weights < areas
-    if loose.any():
-        weights = np.where(loose, _PULL * areas, weights)
-        for _ in range(_PULLS):
-            nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
-            targets[loose] = nearest.positions(mesh_y) - middle
-            deform()
-            reduce_weights_at_flips()
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
     return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
 
