@@ -225,7 +225,7 @@ def register_mesh(
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
         for _ in range(of_round.deformations):
-            if of_round.pull and loose.any():
+            if of_round.pull:
                 nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
                 targets[loose] = nearest.positions(mesh_y) - middle
             edge_vectors = around.transformed(similarities)
