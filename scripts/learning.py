@@ -21,9 +21,9 @@ from tqdm import tqdm
 from jaxsmw import InputError, Mesh, Spectrum, WaveletPreservation, geodesic_error, refine
 from jaxsmw.evaluation.datasets import DataPair, open_data_set
 from jaxsmw.evaluation.intervals import mean_interval
-from jaxsmw.evaluation.journal import Journal, claimed_directory
 from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.journal import Journal, claimed_directory
 from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, measured_code, versions
 
 EIGENVECTORS, ITERATIONS = 100, 3
@@ -397,7 +397,7 @@ class Run(NamedTuple):
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
     """Read the arguments, open the data, and reserve the output directory for this process.
 
-    `jaxsmw.evaluation.journal.claimed_directory` writes the provenance of the results to `provenance.json` in
+    `jaxsmw.runtime.journal.claimed_directory` writes the provenance of the results to `provenance.json` in
     the output directory. Bad input and interruptions end the process with a message of one sentence.
 
     **Arguments:**

@@ -44,11 +44,11 @@ from jaxsmw.evaluation.measurement import Settings
 from jaxsmw.evaluation.opponents.base import Method
 from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
 from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
-from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.workers import open_executor
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
 # The number of pairs in `fig9` is `--pairs` (40 if not given) divided by this number, but at least 2.

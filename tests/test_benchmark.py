@@ -35,11 +35,11 @@ from jaxsmw.evaluation.measurement import CURVE, FIGURES, Settings
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
-from jaxsmw.evaluation.workers import open_executor
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
 from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
 from jaxsmw.runtime.provenance import measured_code
+from jaxsmw.runtime.workers import open_executor
 
 
 @pytest.fixture(scope="module")
@@ -411,7 +411,7 @@ def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
 
 
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
+    monkeypatch.setattr("jaxsmw.runtime.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
     call = ["benchmark", str(scape), "--methods", "initial", "--pairs", "1", "--output", str(tmp_path)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 0
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
@@ -449,7 +449,7 @@ def test_tables_are_written_although_a_shape_cannot_be_read(scape, tmp_path, mon
     data, output = tmp_path / "data", tmp_path / "output"
     shutil.copytree(scape, data)
     (data / "mesh002.off").write_text("OFF\n1")
-    monkeypatch.setattr("jaxsmw.evaluation.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
+    monkeypatch.setattr("jaxsmw.runtime.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
     call = ["benchmark", str(data), "--methods", "initial", "--output", str(output)]
     assert run_command([*call, "--evaluation-samples", "50"]) == 2
     printed = capsys.readouterr()

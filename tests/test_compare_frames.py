@@ -30,9 +30,9 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
-from jaxsmw.evaluation.journal import Journal, claimed_directory
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
+from jaxsmw.runtime.journal import Journal, claimed_directory
 from jaxsmw.runtime.provenance import code_digest
 
 pytestmark = pytest.mark.study

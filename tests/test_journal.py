@@ -5,7 +5,7 @@ import json
 import pytest
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.journal import Journal, claimed_directory
+from jaxsmw.runtime.journal import Journal, claimed_directory
 
 COLUMNS = {"name": str, "value": float}
 

@@ -11,15 +11,15 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxsmw.evaluation.workers import Workers
 from jaxsmw.runtime import compilation
+from jaxsmw.runtime.workers import Workers
 
 # NumPy and JAX are imported, and an array is made, before the worker runs any function of the library.
 PROGRAM = """
 import collections, os
 from pathlib import Path
 import jax, numpy
-from jaxsmw.evaluation.workers import Workers
+from jaxsmw.runtime.workers import Workers
 
 ones = jax.numpy.ones((500, 500)) @ jax.numpy.ones((500, 500))
 

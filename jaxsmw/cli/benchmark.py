@@ -107,9 +107,9 @@ def run(options: argparse.Namespace) -> None:
         ) from error
     from jaxsmw.evaluation.datasets import open_data_set
     from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
-    from jaxsmw.evaluation.workers import open_executor
     from jaxsmw.report.tables import markdown_table, write_tables
     from jaxsmw.runtime.files import make_directory
+    from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)
     pairs = choose_pairs(data_set, options.pairs, options.seed)

@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair, DataSet
-from jaxsmw.evaluation.journal import Journal, Row, claimed_directory
 from jaxsmw.evaluation.measurement import (
     RESULT_COLUMNS,
     SHAPE_COLUMNS,
@@ -29,8 +28,9 @@ from jaxsmw.evaluation.measurement import (
 )
 from jaxsmw.evaluation.opponents.base import Method
 from jaxsmw.evaluation.opponents.registry import MOST_EIGENVECTORS
-from jaxsmw.evaluation.workers import run_tasks
+from jaxsmw.runtime.journal import Journal, Row, claimed_directory
 from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versions
+from jaxsmw.runtime.workers import run_tasks
 
 
 class Results(NamedTuple):
@@ -105,7 +105,7 @@ def run_benchmark(
       written to the column `method` of `results.csv`.
     - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
       measured with the same settings.
-    - `executor`: the executor that runs the tasks; see `jaxsmw.evaluation.workers.open_executor`.
+    - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`.
 
     **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured,
     `Results.failures` contains the error message. No error is raised until `Results.check` is called.

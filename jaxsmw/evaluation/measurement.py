@@ -18,7 +18,6 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
@@ -29,6 +28,7 @@ from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps import INITIAL_MAPS
 from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.journal import Row
 from jaxsmw.runtime.provenance import machine
 from jaxsmw.runtime.threads import one_blas_thread
 

@@ -12,11 +12,11 @@ from jaxtyping import Float64
 from jaxsmw.evaluation.benchmark import Results
 from jaxsmw.evaluation.datasets import DataSet
 from jaxsmw.evaluation.intervals import CONFIDENCE, Interval, mean_interval
-from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.measurement import CURVE, RESULT_COLUMNS, Settings
 from jaxsmw.evaluation.opponents.base import Method
 from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.journal import Row
 
 REFERENCE = "mwp"
 """The name of the reference method, with which tables compare all other methods."""

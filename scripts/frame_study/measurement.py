@@ -33,13 +33,13 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
-from jaxsmw.evaluation.journal import Row
 from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
+from jaxsmw.runtime.journal import Row
 
 DATA_SETS = ("faust_r", "tosca_r")
 # Shapes are padded to a multiple of this number of vertices. All shapes of a data set then share one compiled

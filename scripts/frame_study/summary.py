@@ -13,7 +13,7 @@ from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, S
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.evaluation.intervals import CONFIDENCE, RESAMPLES, Interval, mean_interval
-from jaxsmw.evaluation.journal import Row
+from jaxsmw.runtime.journal import Row
 
 SETTLED = 0.05
 """A map settles in the first iteration that moves less than this share of the matches."""
