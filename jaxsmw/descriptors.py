@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from typing import NamedTuple
 
 import jax
@@ -106,7 +107,7 @@ def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Sampl
 
     **Raises:** `InputError` if a spectrum has another number of vertices than its mesh.
     """
-    samples_x, samples_y = side_by_side(_samples, *pair.meshes)
+    samples_x, samples_y = side_by_side(compared_samples, *pair.meshes)
     return SampledPair(
         pair,
         SampledShape.make(pair.mesh_x, samples_x, spectrum_x),
@@ -114,7 +115,8 @@ def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Sampl
     )
 
 
-def _samples(mesh: Mesh) -> SurfaceSamples | None:
+def compared_samples(mesh: Mesh) -> SurfaceSamples | None:
+    """Return the samples at which descriptors are compared, or None for all vertices; see `sample_pair`."""
     return poisson_disk_samples(mesh, _COMPARED) if len(mesh.vertices) > _COMPARED_FROM else None
 
 
@@ -151,13 +153,94 @@ def describe(
     areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sampled.sides]
     weight = np.concatenate([a / a.sum() / 2 for a in areas]).astype(dtype)
     components = principal_components(shot, weight, number_of_descriptors)
-    described = []
-    both = np.split(components, [len(areas[0])])
-    for spectrum, side, found in zip((spectrum_x, spectrum_y), sampled.sides, both, strict=True):
-        everywhere = found if side.samples is None else found[side.samples.nearest]
-        everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
-        described.append(spectrum.with_descriptors(jax.device_put(everywhere)))
-    return described[0], described[1]
+    of_x, of_y = np.split(components, [len(areas[0])])
+    return _at_all_vertices(sampled.x, spectrum_x, of_x), _at_all_vertices(sampled.y, spectrum_y, of_y)
+
+
+def _at_all_vertices(
+    shape: SampledShape, spectrum: Spectrum, components: Float[np.ndarray, "a d"]
+) -> Spectrum:
+    """Return the spectrum at all vertices, with descriptors that are given at the compared vertices."""
+    everywhere = components if shape.samples is None else components[shape.samples.nearest]
+    everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
+    return spectrum.with_descriptors(jax.device_put(everywhere))
+
+
+class DescriptorAxes(NamedTuple):
+    """The axes along which the SHOT descriptors of all shapes of a collection are described.
+
+    Descriptors along the same axes are comparable between any two shapes of the collection. For a pair of
+    shapes, `describe` computes axes for this pair alone.
+
+    **Attributes:**
+
+    - `radii`: the radii of SHOT, in units of the square root of the area.
+    - `principal`: the `PrincipalAxes` of SHOT at all radii, in which all shapes have equal weights.
+    """
+
+    radii: tuple[float, ...]
+    principal: PrincipalAxes
+
+    @classmethod
+    def of(cls, shapes: Sequence[SampledShape], number_of_descriptors: int) -> DescriptorAxes:
+        """Compute the axes of largest variance.
+
+        SHOT has the same radii as in `describe`: the smaller radius is used if all shapes allow it.
+
+        **Arguments:**
+
+        - `shapes`: the shapes of the collection.
+        - `number_of_descriptors`: the number d of axes, from 1 to 352.
+
+        **Raises:** `InputError` if a mesh is too coarse for SHOT.
+        """
+        for radii in ((SHOT_RADIUS, _FINE_RADIUS), (SHOT_RADIUS,)):
+            if len(radii) > 1 and min(len(shape.mesh.vertices) for shape in shapes) < _FINE:
+                continue
+            with suppress(InputError) if len(radii) > 1 else nullcontext():
+                return cls(radii, PrincipalAxes.of(_Blocks(shapes, radii), number_of_descriptors))
+        raise AssertionError("the usual radius returns axes or raises an error")
+
+    def describe(self, shape: SampledShape, spectrum: Spectrum) -> Spectrum:
+        """Return the spectrum of a shape (n vertices) with descriptors (n, d).
+
+        **Arguments:**
+
+        - `shape`: the shape with its compared vertices.
+        - `spectrum`: the spectrum at all vertices.
+
+        **Raises:** `InputError` if the mesh is too coarse for SHOT.
+        """
+        dtype = spectrum.eigenvectors.dtype
+        return _at_all_vertices(
+            shape, spectrum, self.principal.components(_shot_rows(shape, self.radii).astype(dtype))
+        )
+
+
+def _shot_rows(shape: SampledShape, radii: Sequence[float]) -> Float[np.ndarray, "a c"]:
+    with warnings.catch_warnings():
+        if len(radii) > 1:
+            warnings.simplefilter("ignore")
+        return np.hstack(
+            [shot_descriptors(shape.mesh, radius=radius, samples=shape.samples) for radius in radii]
+        )
+
+
+class _Blocks:
+    """The SHOT descriptors and weights of the shapes of a collection, one block per shape.
+
+    Descriptors are computed or read from the cache in every pass, because the descriptors of a large
+    collection may not fit into memory.
+    """
+
+    def __init__(self, shapes: Sequence[SampledShape], radii: Sequence[float]):
+        self._shapes, self._radii = shapes, radii
+
+    def __iter__(self) -> Iterator[tuple[Float[np.ndarray, "a c"], Float[np.ndarray, " a"]]]:
+        for shape in self._shapes:
+            areas = np.asarray(shape.spectrum.vertex_areas, np.float64)
+            shot = _shot_rows(shape, self._radii)
+            yield shot, (areas / areas.sum() / len(self._shapes)).astype(shot.dtype)
 
 
 def _shot_at_all_radii(
@@ -186,12 +269,49 @@ def principal_components(
 
     **Returns:** The components of the rows (n, d), those of largest variance first.
     """
-    centered = values - weight @ values
-    covariance = centered.T @ (weight[:, None] * centered)
-    variances, directions = np.linalg.eigh(covariance.astype(np.float64))
-    first = slice(None, -number - 1, -1)
-    scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
-    return centered @ (directions[:, first] / scale).astype(values.dtype)
+    return PrincipalAxes.of([(values, weight)], number).components(values)
+
+
+class PrincipalAxes(NamedTuple):
+    """The principal axes of weighted rows.
+
+    **Attributes:**
+
+    - `mean`: the weighted mean of the rows (c,).
+    - `axes`: the axes (c, d), those of largest variance first. Each axis is divided by the standard deviation
+      of the rows along the axis.
+    """
+
+    mean: Float[np.ndarray, " c"]
+    axes: Float[np.ndarray, "c d"]
+
+    @classmethod
+    def of(
+        cls,
+        blocks: Iterable[tuple[Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]],
+        number: int,
+    ) -> PrincipalAxes:
+        """Compute the first principal axes of rows that are given in blocks.
+
+        **Arguments:**
+
+        - `blocks`: tuples of rows (n, c) and their weights (n,). All weights together sum to 1. The
+          iterable is read twice.
+        - `number`: the number d of axes.
+        """
+        mean = sum(weight @ values for values, weight in blocks)
+        covariance = 0
+        for values, weight in blocks:
+            centered = values - mean
+            covariance = covariance + centered.T @ (weight[:, None] * centered)
+        variances, directions = np.linalg.eigh(np.asarray(covariance, np.float64))
+        first = slice(None, -number - 1, -1)
+        scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
+        return cls(np.asarray(mean), directions[:, first] / scale)
+
+    def components(self, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d"]:
+        """Return the principal components of rows (n, c), in the type of the rows."""
+        return (values - self.mean) @ self.axes.astype(values.dtype)
 
 
 def paired_shot(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -147,16 +148,49 @@ class Correspondence:
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
+        return self._points_near(self.pair, self.pointwise_map, *self._embeddings())
+
+    def reverse_surface_points(self) -> SurfacePoints:
+        """Compute the match of every vertex of Y as a point on a triangle of X.
+
+        The map Y -> X comes from the same embeddings as `surface_points`, and needs no second match.
+
+        **Returns:** n `SurfacePoints` on X, one for each vertex of Y. An unreferenced vertex of Y receives
+        the point of the nearest referenced vertex.
+        """
+        embedded_x, embedded_y = self._embeddings()
+        queries = extend_to_unreferenced(self.mesh_y, embedded_y)
+        return self._points_near(self.pair.reversed(), self.reverse_map(), queries, embedded_x)
+
+    def reverse_map(self) -> Int64[np.ndarray, " n"]:
+        """Compute the map Y -> X from the embeddings of the last stage, without a second match.
+
+        **Returns:** The match of every vertex of Y (n,), as a 0-based vertex of X. An unreferenced vertex of
+        Y receives the match of the nearest referenced vertex.
+        """
         with self._precision():
-            rows, candidates = self.mesh_y.faces_around(self.pointwise_map)
-            queries, database = self._embeddings()
+            found = compiled(_reverse_map)(*self._last_stage())
+        found = np.asarray(found)[: len(self.mesh_y.vertices)].astype(np.int64)
+        return extend_to_unreferenced(self.mesh_y, found)
+
+    def _points_near(
+        self,
+        pair: Pair,
+        matches: Int64[np.ndarray, " m"],
+        queries: Float[np.ndarray, "m d"],
+        database: Float[np.ndarray, "n d"],
+    ) -> SurfacePoints:
+        """Return the nearest point to each embedded source vertex, on the target triangles at its match."""
+        mesh_x, mesh_y = pair.meshes
+        with self._precision():
+            rows, candidates = mesh_y.faces_around(matches)
             # Padding lets pairs of similar sizes share compiled programs.
             padding = padded_size(len(rows)) - len(rows)
             rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
             padded = (
-                pad_rows(queries, program_size(self.mesh_x)),
-                pad_rows(database, program_size(self.mesh_y)),
-                pad_rows(self.mesh_y.faces, padded_size(len(self.mesh_y.faces))),
+                pad_rows(queries, program_size(mesh_x)),
+                pad_rows(database, program_size(mesh_y)),
+                pad_rows(mesh_y.faces, padded_size(len(mesh_y.faces))),
                 rows,
                 candidates,
             )
@@ -266,12 +300,10 @@ class Correspondence:
         **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
         the square root of Y's area.
         """
-        with self._precision():
-            reverse_map = compiled(_reverse_map)(*self._last_stage())
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,
-            np.asarray(reverse_map)[: len(self.mesh_y.vertices)].astype(np.int64),
+            self.reverse_map(),
             self.spectrum_x,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
@@ -433,28 +465,98 @@ def match(
     if aligns and decision.asymmetric:
         starts.append(prepared.started_from("aligned"))
         _add_seconds(starts[-1], seconds)
-    if prepared.spectrum_x.descriptors is None:
-        chosen = chosen.without_descriptors()
+    found = match_prepared(
+        pair, starts, chosen, decision, history=history, seconds=seconds, compiling=compiling
+    )
+    found.warn_if_suspicious()
+    return found.correspondence
+
+
+class Match(NamedTuple):
+    """A correspondence, and the data from which its warnings are made.
+
+    **Attributes:**
+
+    - `correspondence`: the `Correspondence`.
+    - `prepared`: the prepared pair from which the map was refined. If the mirror image of X was matched, the
+      prepared pair contains the mirror image.
+    - `outcome`: the `Outcome` of refinement and repair.
+    - `decision`: the `Decision` between X and its mirror image.
+    """
+
+    correspondence: Correspondence
+    prepared: PreparedPair
+    outcome: Outcome
+    decision: Decision
+
+    def warn_if_suspicious(self) -> None:
+        """Issue a `UserWarning` if the map looks wrong, or if the hand of X is doubtful."""
+        if self.outcome.suspicious:
+            assert self.correspondence.preset.repair is not None
+            warning = _warning(self.prepared, self.correspondence.preset.repair, self.outcome)
+            warnings.warn(warning, stacklevel=3)
+        if self.decision.doubtful:
+            warnings.warn(_doubt(self.prepared.pair, self.decision), stacklevel=3)
+
+
+def match_prepared(
+    pair: Pair,
+    starts: Sequence[PreparedPair],
+    preset: Preset,
+    decision: Decision = Decision(False),  # noqa: B008 (immutable)
+    *,
+    history: bool = False,
+    seconds: dict[str, float] | None = None,
+    compiling: Sequence[Future[object]] = (),
+    alternatives: bool = True,
+) -> Match:
+    """Refine the initial maps of a prepared pair, and return the match with the smallest expected error.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `starts`: the same prepared pair with one initial map, or with `"shot"` and `"aligned"` in this order.
+      If `decision.mirrored` is True, X is replaced by its mirror image.
+    - `preset`: the stages and the repair.
+    - `decision`: the decision between X and its mirror image.
+    - `history`: whether to record a `History` of the last stage.
+    - `seconds`: a dictionary to which the times of the steps are added.
+    - `compiling`: compilations in the background, which refinement waits for.
+    - `alternatives`: whether repair tries alternative initial maps.
+
+    **Returns:** The `Match`.
+
+    **Raises:** `ArithmeticError` if refinement fails numerically from every initial map.
+    """
+    seconds = {} if seconds is None else seconds
+    if starts[0].spectrum_x.descriptors is None:
+        preset = preset.without_descriptors()
     with timed("refinement", seconds), one_blas_thread():
         wait(compiling)
         outcomes = [
-            refine_in_stages(start, chosen.stages, chosen.repair, history=history) for start in starts
+            refine_in_stages(
+                start,
+                preset.stages,
+                preset.repair,
+                alternatives=None if alternatives else (),
+                history=history,
+            )
+            for start in starts
         ]
         jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
     candidates = [
         (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
-    ] or [(prepared, outcomes[0])]
+    ] or [(starts[0], outcomes[0])]
     found = [
-        _correspondence(pair, start, chosen, outcome, seconds, decision) for start, outcome in candidates
+        Match(_correspondence(pair, start, preset, outcome, seconds, decision), start, outcome, decision)
+        for start, outcome in candidates
     ]
-    best = 0
-    if len(found) > 1:
-        assert chosen.repair is not None
-        with timed("expected error", seconds):
-            from_shot, from_aligned = (float(one.expected_error().mean()) for one in found)
-        best = int(from_shot >= chosen.repair.aligned_preference * from_aligned)
-    _warn_if_suspicious(*candidates[best], chosen, decision)
-    return found[best]
+    if len(found) == 1:
+        return found[0]
+    assert preset.repair is not None
+    with timed("expected error", seconds):
+        from_shot, from_aligned = (float(one.correspondence.expected_error().mean()) for one in found)
+    return found[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
 
 
 def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
@@ -511,14 +613,6 @@ def _correspondence(
         mirror_evidence=decision.evidence,
         seconds=seconds,
     )
-
-
-def _warn_if_suspicious(prepared: PreparedPair, outcome: Outcome, preset: Preset, decision: Decision) -> None:
-    if outcome.suspicious:
-        assert preset.repair is not None
-        warnings.warn(_warning(prepared, preset.repair, outcome), stacklevel=3)
-    if decision.doubtful:
-        warnings.warn(_doubt(prepared.pair, decision), stacklevel=3)
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:
