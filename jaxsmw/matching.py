@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Array, Float, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import (
@@ -28,7 +28,7 @@ from jaxsmw.choices import (
     Mirror,
 )
 from jaxsmw.core.refinement import Refinement
-from jaxsmw.core.refiner import Problem, Refiner, State
+from jaxsmw.core.refiner import Problem, Refiner, State, reverse_map
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
@@ -169,7 +169,7 @@ class Correspondence:
         Y receives the match of the nearest referenced vertex.
         """
         with self._precision():
-            found = compiled(_reverse_map)(*self._last_stage())
+            found = compiled(reverse_map)(*self._last_stage())
         found = np.asarray(found)[: len(self.mesh_y.vertices)].astype(np.int64)
         return extend_to_unreferenced(self.mesh_y, found)
 
@@ -339,10 +339,6 @@ def _embeddings(
     refiner: Refiner, problem: Problem, state: State
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     return refiner.embeddings(refiner.prepare(problem), state)
-
-
-def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int[Array, " n"]:
-    return refiner.recover_reverse(refiner.prepare(problem), state)
 
 
 def match(

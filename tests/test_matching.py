@@ -13,11 +13,11 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from jaxsmw import descriptors, matching
+from jaxsmw import descriptors
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.refinement import refine
-from jaxsmw.core.refiner import State
+from jaxsmw.core.refiner import State, reverse_map
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -37,6 +37,7 @@ from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime import threads as threads_module
+from jaxsmw.runtime.compilation import compiled
 from jaxsmw.stage import Stage
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
@@ -169,7 +170,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     queries, database = (np.asarray(points) for points in found._embeddings())
     assert database.shape[1] > found.functional_map.shape[0]
     with found._precision():
-        padded = matching.compiled(matching._reverse_map)(*found._last_stage())
+        padded = compiled(reverse_map)(*found._last_stage())
         reverse = np.asarray(padded)[: len(found.mesh_y.vertices)]
     _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
     expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
@@ -193,7 +194,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     points = [np.asarray(p) for p in found._embeddings()]
     # Registration also compares columns that are not eigenvectors.
     assert (points[1].shape[1] > found.functional_map.shape[0]) == (refiner is Registration)
-    padded = matching.compiled(matching._reverse_map)(*found._last_stage())
+    padded = compiled(reverse_map)(*found._last_stage())
     reverse = np.asarray(padded)[: len(found.mesh_y.vertices)]
     np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
@@ -328,7 +329,7 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
         return refine_in_stages(*arguments, **options)
 
     meanwhile: list[list[int]] = []
-    monkeypatch.setattr(matching, "refine_in_stages", watched)
+    monkeypatch.setattr("jaxsmw.matching.refine_in_stages", watched)
     threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()

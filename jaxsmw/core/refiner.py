@@ -217,3 +217,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         on X to functions on Y.
         """
         return "pullback"
+
+
+def reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
+    """Recovers the reverse map Y -> X (n,) of a refiner's state for all vertices.
+
+    **Arguments:**
+
+    - `refiner`: the refiner that computed the state.
+    - `problem`: a `Problem` without samples.
+    - `state`: a `State` of the refiner.
+    """
+    return refiner.recover_reverse(refiner.prepare(problem), state)

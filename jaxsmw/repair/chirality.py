@@ -9,12 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Float, Int64
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
 from jaxsmw.choices import Mirror
-from jaxsmw.core.refiner import Problem, Refiner, State
+from jaxsmw.core.refiner import Problem, reverse_map
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import principal_components
@@ -183,7 +183,7 @@ class Hands:
         views = [spectrum.pad(size) for spectrum in self.stage.view(*spectra)]
         start = jax.device_put(pad_rows(first, size).astype(np.int32))
         found = self.stage.run(views[0], views[1], start)
-        reverse = compiled(_reverse_map)(self.stage.refiner, Problem(views[0], views[1]), found.state)
+        reverse = compiled(reverse_map)(self.stage.refiner, Problem(views[0], views[1]), found.state)
         forward, backward = (np.asarray(T).astype(np.int64) for T in (found.pointwise_map, reverse))
         return forward[: len(x.shot)], backward[: len(y.shot)]
 
@@ -241,10 +241,6 @@ def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> flo
 def _log_ratio(own: float, mirrored: float) -> float:
     tiny = 1e-9  # With this addend, the result is 0 if both errors are 0.
     return float(np.log((own + tiny) / (mirrored + tiny)))
-
-
-def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int[Array, " n"]:
-    return refiner.recover_reverse(refiner.prepare(problem), state)
 
 
 class Decision(NamedTuple):
