@@ -224,6 +224,11 @@ def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
             "a.off: the suffix '.off' is not supported",
         ),
         ("demo --output {t}/d --init landmarks:a.fcsv", "a.fcsv: contains landmarks of one mesh only"),
+        ("match {m} --output m --init landmarks:a.PP", "a.PP: contains landmarks of one mesh only"),
+        ("match {m} --output m --init landmarks:a.mps", "a.mps: contains landmarks of one mesh only"),
+        ("match {m} --output {t}/m.fcsv", "m.fcsv: maps are written as text, .npy or .mat, not as .fcsv"),
+        # A table may contain vertices of both meshes, so the command goes on and reads a mesh.
+        ("match {m} --output {t}/m --init landmarks:a.csv", "missing_x.off"),
     ],
 )
 def test_suffixes_of_landmark_files_are_checked_before_the_meshes_are_read(run, tmp_path, arguments, fault):

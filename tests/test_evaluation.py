@@ -114,7 +114,22 @@ class TestReading:
         assert [entry.name for entry in tmp_path.iterdir()] == ["a.map"]
 
     @pytest.mark.parametrize(
-        "suffix", [".png", ".JPG", ".svg", ".pdf", ".html", ".json", ".ply", ".off", ".glb"]
+        "suffix",
+        [
+            ".png",
+            ".JPG",
+            ".svg",
+            ".pdf",
+            ".html",
+            ".json",
+            ".npz",
+            ".ply",
+            ".off",
+            ".glb",
+            ".pcd",
+            ".fcsv",
+            ".mps",
+        ],
     )
     def test_names_of_other_kinds_of_files_are_refused(self, tmp_path, suffix):
         with pytest.raises(

@@ -119,21 +119,17 @@ def check_initial_map(init: str) -> None:
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
         return
-    from jaxsmw.io.landmark_files import check_readable_suffix
+    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES, check_readable_suffix
 
     if len(files) > 1:
         for file in files:
             check_readable_suffix(file)
-    elif files[0].lower().endswith(_LANDMARKS_OF_ONE_MESH):
+    # A single file contains a source and a target vertex per line, under any other suffix.
+    elif files[0].lower().endswith(LANDMARK_SUFFIXES):
         raise InputError(
             f"{files[0]}: contains landmarks of one mesh only: give the landmarks of both meshes, as --init "
             "landmarks:SOURCE_FILE,TARGET_FILE."
         )
-
-
-# Files with these suffixes contain named points of one mesh. A file of `landmarks:FILE` instead contains a
-# source and a target vertex per line, and can have any other suffix.
-_LANDMARKS_OF_ONE_MESH = (".mrk.json", ".fcsv", ".pp", ".mps")
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:

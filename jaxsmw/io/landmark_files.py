@@ -34,6 +34,8 @@ _WRITERS: dict[str, Callable[[Landmarks], str]] = {
     ".csv": lambda landmarks: format_table(landmarks, ","),
     ".txt": lambda landmarks: format_table(landmarks, "\t"),
 }
+LANDMARK_SUFFIXES = tuple(suffix for suffix, parse in _PARSERS.items() if parse is not parse_table)
+"""The suffixes of files that certainly contain named points. Many tables contain something else."""
 # Files of these formats always state a coordinate system.
 _WITH_SYSTEM = (".mrk.json", ".fcsv")
 

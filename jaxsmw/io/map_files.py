@@ -20,18 +20,20 @@ from numpy.typing import ArrayLike
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
 from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.io.mesh_data import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
-# Suffixes of other kinds of files, whose programs cannot open a map. The suffixes `.mat`
-# and `.npy` are missing here, because maps are also written in these formats.
+# Suffixes of other kinds of files, whose programs cannot open a map. The suffixes `.mat` and `.npy` are
+# removed, because maps are also written in these formats.
 _NOT_MAPS = {
     *(".npz", ".baryc_gt", ".vts", ".json"),
     *(".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".svg", ".pdf", ".eps", ".ps"),
     *(".html", ".htm", ".xhtml"),
-    *(".off", ".obj", ".ply", ".stl", ".vtk", ".vtp", ".gltf", ".glb", ".xyz", ".pcd"),
-}
+    *(*MESH_SUFFIXES, *POINT_CLOUD_SUFFIXES, *LANDMARK_SUFFIXES),
+} - {".mat", ".npy"}
 
 
 def read_pointwise_map(
@@ -118,8 +120,8 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 def check_map_name(path: str | os.PathLike[str]) -> None:
     """Check that a pointwise map can be written under a file name.
 
-    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, and the formats `.npz`,
-    `.baryc_gt`, `.vts` and `.json`. All other names are accepted.
+    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, landmarks, and the
+    formats `.npz`, `.baryc_gt`, `.vts` and `.json`. All other names are accepted, including those of tables.
 
     **Arguments:**
 
