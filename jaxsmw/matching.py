@@ -60,7 +60,8 @@ logger = logging.getLogger("jaxsmw")
 class Correspondence:
     """The result of `match`: a map from X to Y, the spectra, and statistics of the map.
 
-    The methods `surface_points`, `one_to_one`, `soft_map` and `expected_error` compute further results.
+    The methods `surface_points`, `one_to_one`, `soft_map` and `expected_error` compute further results. The
+    results of `surface_points` and `expected_error` are kept, so further calls cost no time.
 
     **Attributes:**
 
@@ -148,6 +149,11 @@ class Correspondence:
         **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
         0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
         """
+        points = self._surface_points
+        return SurfacePoints(points.faces.copy(), points.weights.copy())
+
+    @functools.cached_property
+    def _surface_points(self) -> SurfacePoints:
         return self._points_near(self.pair, self.pointwise_map, *self._embeddings())
 
     def reverse_surface_points(self) -> SurfacePoints:
@@ -216,7 +222,7 @@ class Correspondence:
         return register_mesh(
             self.mesh_x,
             self.mesh_y,
-            self.surface_points(),
+            self._surface_points,
             stiffness=stiffness,
             same_unit=self.pair.partial,
         )
@@ -300,6 +306,10 @@ class Correspondence:
         **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
         the square root of Y's area.
         """
+        return self._expected_error.copy()
+
+    @functools.cached_property
+    def _expected_error(self) -> Float[np.ndarray, " m"]:
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,

@@ -1,5 +1,6 @@
 """Rigid alignment, and the initial map that uses it."""
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -61,12 +62,28 @@ def _expected(found):
     return float(found.expected_error().mean())
 
 
+def _count_calls(monkeypatch, name):
+    """Let a function append to the returned list whenever it is called."""
+    module, _, function = name.rpartition(".")
+    original, calls = getattr(importlib.import_module(module), function), []
+
+    def counted(*arguments, **options):
+        calls.append(None)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(name, counted)
+    return calls
+
+
 @pytest.mark.parametrize("mirror", ["auto", "no"])
-def test_asymmetric_shapes_are_matched_from_both_initial_maps(mirror):
+def test_asymmetric_shapes_are_matched_from_both_initial_maps(mirror, monkeypatch):
     """The lump differs from its mirror image, so `match` keeps the better of two maps."""
     noise = 0.004 * np.random.default_rng(1).normal(size=LUMP.vertices.shape)
     target = make_mesh(Rotation.random(random_state=3).apply(LUMP.vertices + noise), LUMP.faces)
+    estimates = _count_calls(monkeypatch, "jaxsmw.matching.expected_error")
     found = match(LUMP, target, mirror=mirror)
+    found.expected_error()
+    assert len(estimates) == 2  # one for each map
     each = {init: match(LUMP, target, init=init, mirror="no") for init in ("shot", "aligned")}
     from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
     best = each["shot" if from_shot else "aligned"]

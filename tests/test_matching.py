@@ -620,6 +620,20 @@ def test_surface_points_are_more_accurate_than_vertices(pair):
     np.testing.assert_allclose(points.weights.sum(axis=1), 1, atol=1e-15)
 
 
+def test_surface_points_and_expected_errors_are_computed_once(pair, monkeypatch):
+    found = match(*pair[:2], **OPTIONS)
+    points, expected = found.surface_points(), found.expected_error()
+    copies = points.weights.copy(), expected.copy()
+    points.faces[:], points.weights[:], expected[:] = -1, -1, -1  # a caller may change the results
+    for name in ("expected_error", "nearest_point_on_candidates"):
+        monkeypatch.delattr(f"jaxsmw.matching.{name}")
+    again = found.surface_points()
+    np.testing.assert_array_equal(again.weights, copies[0])
+    np.testing.assert_array_equal(found.expected_error(), copies[1])
+    assert again.faces.min() >= 0
+    assert found.registered_mesh().surface_points.faces.shape == again.faces.shape
+
+
 def test_unreferenced_vertices_get_surface_points_and_expected_errors(pair):
     mesh_x, mesh_y, _ = pair
     extra = make_mesh(np.vstack([mesh_x.vertices, mesh_x.vertices[:1]]), mesh_x.faces)
