@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -73,7 +75,8 @@ class SampledShape(NamedTuple):
         return vertices if self.samples is None else self.samples.nearest[vertices]
 
 
-class SampledPair(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class SampledPair:
     """A pair of shapes, each with the vertices at which its descriptors are compared.
 
     **Attributes:**
@@ -90,6 +93,11 @@ class SampledPair(NamedTuple):
     def sides(self) -> tuple[SampledShape, SampledShape]:
         """The sampled shapes X and Y."""
         return self.x, self.y
+
+    @cached_property
+    def shot(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+        """SHOT of X and Y at the compared vertices, with the usual radius; see `paired_shot`."""
+        return paired_shot(self)
 
 
 def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
@@ -121,7 +129,12 @@ def compared_samples(mesh: Mesh) -> SurfaceSamples | None:
 
 
 def describe(
-    pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum, number_of_descriptors: int
+    pair: Pair,
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    number_of_descriptors: int,
+    *,
+    sampled: SampledPair | None = None,
 ) -> tuple[Spectrum, Spectrum]:
     """Add vertex descriptors, which are principal components of SHOT, to the spectra of both shapes.
 
@@ -136,6 +149,7 @@ def describe(
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
     - `number_of_descriptors`: the number d of components, from 1 to 352. The d components of largest variance
       are used.
+    - `sampled`: the result of `sample_pair` for this pair, if it was already computed.
 
     **Returns:** The spectra of X and Y, with `descriptors` of shapes (m, d) and (n, d), without unit. The
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
@@ -147,7 +161,7 @@ def describe(
         raise InputError(
             f"{number_of_descriptors} descriptors were requested: give a number from 1 to {SHOT_DIMENSION}."
         )
-    sampled = sample_pair(pair, spectrum_x, spectrum_y)
+    sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
     dtype = spectrum_x.eigenvectors.dtype
     shot = np.hstack([np.concatenate(both) for both in _shot_at_all_radii(sampled)], dtype=dtype)
     areas = [np.asarray(side.spectrum.vertex_areas, np.float64) for side in sampled.sides]
@@ -247,7 +261,7 @@ def _shot_at_all_radii(
     sampled: SampledPair,
 ) -> list[tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]]:
     """Compute SHOT of both shapes with the usual radius and, on fine meshes, also with the smaller radius."""
-    shot = [paired_shot(sampled)]
+    shot = [sampled.shot]
     if min(len(mesh.vertices) for mesh in sampled.pair.meshes) >= _FINE:
         with suppress(InputError), warnings.catch_warnings():
             # A mesh that is too coarse for the smaller radius still has descriptors of the usual radius.

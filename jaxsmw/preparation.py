@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import describe
+from jaxsmw.descriptors import SampledPair, describe, sample_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
@@ -54,6 +54,7 @@ class PreparedPair:
     - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
     - `samples`: a pair of arrays, the samples of X (s,) and of Y (s,) as 0-based vertices in farthest-point
       order; None if no samples were requested.
+    - `sampled`: the `SampledPair` whose descriptors were compared; None if no descriptors were compared.
     - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
     """
 
@@ -63,6 +64,7 @@ class PreparedPair:
     init: InitialMap | ArrayLike | SurfacePoints
     initial_map: Int64[np.ndarray, " m"]
     samples: Samples | None = None
+    sampled: SampledPair | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     def started_from(self, init: InitialMap) -> PreparedPair:
@@ -72,7 +74,7 @@ class PreparedPair:
         """
         seconds: dict[str, float] = {}
         with timed("initial map", seconds):
-            start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init)
+            start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init, sampled=self.sampled)
         return replace(self, init=init, initial_map=start, seconds=seconds)
 
     @cached_property
@@ -144,12 +146,15 @@ def prepare(
                 "has components, or join vertices at the same position (weld=True, on the command line "
                 "--weld)."
             )
+    sampled = None
     with timed("initial map", seconds):
-        start = initial_map(pair, *spectra, init=init)
+        if isinstance(init, str) or number_of_descriptors:
+            sampled = sample_pair(pair, *spectra)
+        start = initial_map(pair, *spectra, init=init, sampled=sampled)
     if number_of_descriptors:
         with timed("descriptors", seconds):
             try:
-                spectra = describe(pair, *spectra, number_of_descriptors)
+                spectra = describe(pair, *spectra, number_of_descriptors, sampled=sampled)
             except InputError as error:
                 if descriptors_required:
                     raise
@@ -161,4 +166,4 @@ def prepare(
                 lambda mesh: farthest_point_samples(mesh, number_of_samples), *pair.meshes
             )
             samples = jax.device_put(samples_x), jax.device_put(samples_y)
-    return PreparedPair(pair, *spectra, init, start, samples, seconds)
+    return PreparedPair(pair, *spectra, init, start, samples, sampled, seconds)

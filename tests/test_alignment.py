@@ -81,9 +81,11 @@ def test_asymmetric_shapes_are_matched_from_both_initial_maps(mirror, monkeypatc
     noise = 0.004 * np.random.default_rng(1).normal(size=LUMP.vertices.shape)
     target = make_mesh(Rotation.random(random_state=3).apply(LUMP.vertices + noise), LUMP.faces)
     estimates = _count_calls(monkeypatch, "jaxsmw.matching.expected_error")
+    descriptors = _count_calls(monkeypatch, "jaxsmw.descriptors.shot_descriptors")
     found = match(LUMP, target, mirror=mirror)
     found.expected_error()
     assert len(estimates) == 2  # one for each map
+    assert len(descriptors) == 2  # one for each shape
     each = {init: match(LUMP, target, init=init, mirror="no") for init in ("shot", "aligned")}
     from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
     best = each["shot" if from_shot else "aligned"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jaxsmw.descriptors import SampledPair, paired_shot
+from jaxsmw.descriptors import SampledPair
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.sampling import poisson_disk_samples
 
@@ -29,7 +29,7 @@ def aligned_features(sampled: SampledPair) -> tuple[Float[np.ndarray, "m d"], Fl
     """
     return tuple(  # type: ignore[return-value]
         np.hstack([shot, _POSITION_WEIGHT * positions])
-        for shot, positions in zip(paired_shot(sampled), _aligned_positions(sampled), strict=True)
+        for shot, positions in zip(sampled.shot, _aligned_positions(sampled), strict=True)
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
-from jaxsmw.descriptors import SampledPair, paired_shot
+from jaxsmw.descriptors import SampledPair
 
 # The weight of commutativity with the Laplacian relative to preservation of SHOT. On eight pairs of real
 # bodies, the weights 0, 1, 10 and 100 give initial maps with mean geodesic errors of 0.313, 0.076, 0.055 and
@@ -36,7 +36,7 @@ def functional_features(
     """
     spectrum_x, spectrum_y = sampled.x.spectrum, sampled.y.spectrum
     dtype = spectrum_x.eigenvectors.dtype
-    shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in paired_shot(sampled))
+    shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in sampled.shot)
     solution = RegularizedLeastSquares(
         wavelet_preservation=None,
         orthogonality=None,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import InitialMap
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
+from jaxsmw.descriptors import SampledPair, sample_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import extend_to_unreferenced
@@ -31,6 +31,7 @@ def initial_map(
     spectrum_y: Spectrum,
     *,
     init: InitialMap | ArrayLike | SurfacePoints = "shot",
+    sampled: SampledPair | None = None,
 ) -> Int64[np.ndarray, " m"]:
     """Compute the pointwise map T: X -> Y from which refinement begins.
 
@@ -55,6 +56,7 @@ def initial_map(
           its face.
         - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The initial
           map is then computed by nearest-neighbour search in SHOT and in geodesic distances to the landmarks.
+    - `sampled`: the result of `jaxsmw.descriptors.sample_pair` for this pair, if it was already computed.
 
     **Returns:** The initial map as an integer array (m,), 0-based vertices of Y. With SHOT, the function
     issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
@@ -67,7 +69,7 @@ def initial_map(
     if isinstance(init, SurfacePoints):
         init = check_surface_points(init, pair.mesh_y, "initial map").nearest_corners(pair.mesh_y)
     if isinstance(init, str):
-        sampled = sample_pair(pair, spectrum_x, spectrum_y)
+        sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
         return extend_to_unreferenced(pair.mesh_x, nearest_map(sampled, *_features(sampled, init)))
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
@@ -77,7 +79,7 @@ def initial_map(
         )
     if given.ndim == 1:
         return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
-    sampled = sample_pair(pair, spectrum_x, spectrum_y)
+    sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
     found = nearest_map(sampled, *_finite(sampled, "landmark", landmark_features(sampled, given)))
     found[given[:, 0]] = given[:, 1]
     return extend_to_unreferenced(pair.mesh_x, found)
@@ -89,7 +91,7 @@ _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 def _features(sampled: SampledPair, init: str) -> _Features:
     """Compute the features of both shapes for the initial map of the given name."""
     if init == "shot":
-        features = paired_shot(sampled)
+        features = sampled.shot
     elif init in SIGNATURES:
         features = signature_features(sampled, init)
     elif init == "functional":

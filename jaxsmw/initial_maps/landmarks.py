@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int64
 
-from jaxsmw.descriptors import SampledPair, SampledShape, paired_shot
+from jaxsmw.descriptors import SampledPair, SampledShape
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
 
@@ -47,7 +47,7 @@ def landmark_features(
                 f"of {sampled.y.mesh.name}: remove one of them."
             )
     features = []
-    zipped = zip(sampled.sides, landmarks.T, sampled.pair.units_of_length, paired_shot(sampled), strict=True)
+    zipped = zip(sampled.sides, landmarks.T, sampled.pair.units_of_length, sampled.shot, strict=True)
     for side, vertices, unit, described in zipped:
         mesh = side.mesh
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))
