@@ -134,8 +134,9 @@ def paired_spectra(
     spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
     For two full shapes, k_X = k_Y = k.
 
-    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if the area
-    of one mesh of a partial pair is less than a thousandth of the other area.
+    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`). For a partial
+    pair, `InputError` is also raised if all eigenvalues of a mesh are zero, or if the area of one mesh is
+    less than a thousandth of the other area.
     """
     if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
@@ -153,10 +154,26 @@ def paired_spectra(
             f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
             "their units of length probably differ: scale one of the meshes."
         )
+    # If one mesh has only zero eigenvalues, its range leaves only zero eigenvalues on the other mesh as well.
+    for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):
+        check_eigenvalues(mesh, spectrum)
     scales = (area / max(areas) for area in areas)
     return common_range(
         *(s.scale(factor) for s, factor in zip((spectrum_x, spectrum_y), scales, strict=True))
     )
+
+
+def check_eigenvalues(mesh: Mesh, spectrum: Spectrum) -> None:
+    """Check that a spectrum has an eigenvalue above zero.
+
+    **Raises:** `InputError` if all eigenvalues are zero.
+    """
+    if np.asarray(spectrum.eigenvalues)[-1] == 0:
+        raise InputError(
+            f"{mesh.name}: the largest of the {len(spectrum.eigenvalues)} eigenvalues is zero, so the "
+            "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh has "
+            "components, or join vertices at the same position (weld=True, on the command line --weld)."
+        )
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:

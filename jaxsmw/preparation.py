@@ -20,7 +20,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.initial_maps import InitialMap, initial_map
-from jaxsmw.pair import Pair, paired_spectra
+from jaxsmw.pair import Pair, check_eigenvalues, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
@@ -139,13 +139,7 @@ def prepare(
     with timed("eigenbases", seconds):
         spectra = paired_spectra(pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     for mesh, spectrum in zip(pair.meshes, spectra, strict=True):
-        if np.asarray(spectrum.eigenvalues)[-1] == 0:
-            raise InputError(
-                f"{mesh.name}: the largest of the {number_of_eigenvectors} eigenvalues is zero, so the "
-                "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh "
-                "has components, or join vertices at the same position (weld=True, on the command line "
-                "--weld)."
-            )
+        check_eigenvalues(mesh, spectrum)
     sampled = None
     with timed("initial map", seconds):
         if isinstance(init, str) or number_of_descriptors:

@@ -545,6 +545,15 @@ def test_triangle_soup_is_refused_with_a_hint_to_weld(pair):
         match(soup, mesh, preset=Stage(number_of_eigenvectors=30))
 
 
+@pytest.mark.parametrize("soup_first", [False, True])
+def test_the_message_names_the_mesh_of_a_partial_pair_that_has_only_zero_eigenvalues(soup_first):
+    whole = bumpy_mesh(2)
+    faces = np.arange(whole.faces.size).reshape(-1, 3)
+    meshes = [whole, make_mesh(whole.vertices[whole.faces.ravel()], faces, name="soup.off")]
+    with pytest.raises(InputError, match=r"^soup\.off: the largest of the 30 eigenvalues is zero"):
+        match(*meshes[:: -1 if soup_first else 1], preset=Stage(number_of_eigenvectors=30), partial=True)
+
+
 @pytest.fixture(scope="module")
 def part(pair):
     """The upper two thirds of the bumpy body as X, the full shape as Y in the same unit, and the true map."""
