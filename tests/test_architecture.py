@@ -29,6 +29,7 @@ LAYERS = (
     "repair",
     "presets",
     "matching",
+    "collection",
     "evaluation",
     "report",
     "cli",

@@ -1,0 +1,517 @@
+"""The statistical shape model of a collection: generalised Procrustes alignment, mean shape and modes.
+
+All shapes have the same n vertices, and vertex i is the same point of the body on every shape. Means over the
+surface are sums over the vertices with weights, which have the sum 1. The distance of two shapes is therefore
+in the unit of length of the shapes, and does not depend on the resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Bool, Float64, Real
+from scipy.spatial.distance import cdist
+
+from jaxsmw.errors import InputError
+from jaxsmw.runtime.threads import one_blas_thread
+
+# The alignment ends when the mean changes by less than this multiple of its size, or after `_MOST_ROUNDS`.
+_TOLERANCE = 1e-10
+_MOST_ROUNDS = 1000
+# Modes are left out if their standard deviation is below this multiple of the size of the mean. Mesh files in
+# single precision have larger rounding errors.
+_SMALLEST_DEVIATION = 1e-8
+# Scores count as equal if they differ by less than this share, so that rounding does not choose the signs
+# of modes.
+_EQUAL_SCORES = 1e-6
+# The number of vertices for which displacements are computed at once.
+_BLOCK = 1024
+
+Shapes = Real[np.ndarray, "N n 3"] | Sequence[Real[np.ndarray, "_ 3"]]
+"""The positions of n corresponding vertices on N shapes, as one array or as a sequence of arrays (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The result of `align`. Vertex v of shape i moves to `scales[i] * rotations[i] @ v + translations[i]`.
+
+    **Attributes:**
+
+    - `aligned`: the aligned shapes (N, n, 3), in the unit of length of the shapes.
+    - `mean`: the mean of the aligned shapes (n, 3).
+    - `rotations`: a rotation (N, 3, 3) without reflection for each shape.
+    - `translations`: a translation (N, 3) for each shape.
+    - `scales`: a positive factor (N,) for each shape; 1 if shapes keep their size.
+    - `weights`: the weights of the vertices (n,), with the sum 1.
+    - `scaled`: whether the alignment changed the sizes of shapes.
+    """
+
+    aligned: Float64[np.ndarray, "N n 3"]
+    mean: Float64[np.ndarray, "n 3"]
+    rotations: Float64[np.ndarray, "N 3 3"]
+    translations: Float64[np.ndarray, "N 3"]
+    scales: Float64[np.ndarray, " N"]
+    weights: Float64[np.ndarray, " n"]
+    scaled: bool
+
+
+def align(
+    shapes: Shapes,
+    *,
+    scale: bool = False,
+    weights: Real[np.ndarray, " _"] | None = None,
+    reference: int = 0,
+) -> Alignment:
+    """Align shapes to their mean, by generalised Procrustes analysis.
+
+    Each round moves every shape to the mean, in the least-squares sense, and then updates the mean (Gower,
+    "Generalized Procrustes analysis", Psychometrika 1975; Goodall, "Procrustes methods in the statistical
+    analysis of shape", JRSS B 1991). The first mean is the reference shape. The rounds end when the mean
+    changes by less than 1e-10 of its size, or after 1000 rounds. A round takes time in proportion to N² and
+    not to n, because all rotations follow from the inner products of the coordinates of the shapes.
+
+    The size of a shape is its centroid size: the square root of the weighted mean of the squared distances
+    from the vertices to their weighted centroid.
+
+    **Arguments:**
+
+    - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
+    - `scale`: whether to remove differences of size. With `scale`, each shape is scaled to fit the mean in
+      the least-squares sense. A common factor then gives the mean the average size of the given shapes.
+    - `weights`: non-negative weights of the vertices (n,), such as the vertex areas of the template, so that
+      dense regions of the triangulation do not dominate. None (the default) for equal weights.
+    - `reference`: the index of the shape whose rotation and centroid do not change.
+
+    **Returns:** An `Alignment`.
+
+    **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
+    coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
+    the reference do not fit the shapes.
+    """
+    points = _checked(shapes)
+    count, n, _ = points.shape
+    shares = _checked_weights(weights, n)
+    if not 0 <= reference < count:
+        raise InputError(f"the reference shape is {reference}, but the shapes are 0 to {count - 1}.")
+    centroids = np.einsum("v,ivc->ic", shares, points)
+    products = _inner_products(points, centroids, shares)
+    squared_sizes = np.einsum("icic->i", products)
+    for index in np.flatnonzero(_is_point(squared_sizes, centroids)):
+        raise InputError(f"shape {index} is a single point; leave the shape out.")
+
+    rotations, scales = _rotations_and_scales(products, squared_sizes, reference, scale=scale)
+    rotations = rotations[reference].T @ rotations
+    rotations[reference] = np.eye(3)
+    translations = centroids[reference] - scales[:, None] * np.einsum("icd,id->ic", rotations, centroids)
+    aligned = np.empty_like(points)
+    for i, shape in enumerate(points):
+        # Centred coordinates keep their digits if a shape is far from the origin.
+        aligned[i] = scales[i] * ((shape - centroids[i]) @ rotations[i].T) + centroids[reference]
+    return Alignment(aligned, aligned.mean(axis=0), rotations, translations, scales, shares, scale)
+
+
+class DistanceCurve(NamedTuple):
+    """A mean distance for each number of modes.
+
+    **Attributes:**
+
+    - `numbers_of_modes`: the numbers of modes, in the given order.
+    - `mean`: the mean of the distances for each number of modes, in the unit of length of the shapes.
+    - `standard_error`: the standard error of each mean, in the same unit.
+    """
+
+    numbers_of_modes: tuple[int, ...]
+    mean: Float64[np.ndarray, " numbers"]
+    standard_error: Float64[np.ndarray, " numbers"]
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeModel:
+    """The mean of aligned shapes and the modes in which the shapes differ from the mean.
+
+    The modes are the principal components of the shapes (Cootes, Taylor, Cooper, Graham, "Active shape
+    models", CVIU 1995). The inner product of two fields u and v of displacements is sum_i w_i u_i · v_i, with
+    the weights w of the vertices. The change of a score by one standard deviation therefore moves the surface
+    by one standard deviation, as the root mean square over the surface.
+
+    **Attributes:**
+
+    - `alignment`: the `Alignment` of the N shapes.
+    - `modes`: displacements (k, n, 3), orthonormal in this inner product. The largest score of each mode is
+      positive.
+    - `variances`: the variance of the scores of each mode (k,), decreasing, in squared units of length. Sums
+      of squares are divided by N - 1.
+    - `scores`: the inner products (N, k) of the displacements of each shape with the modes.
+    - `total_variance`: the sum of the variances of all modes, including modes that the model leaves out.
+    """
+
+    alignment: Alignment
+    modes: Float64[np.ndarray, "k n 3"]
+    variances: Float64[np.ndarray, " k"]
+    scores: Float64[np.ndarray, "N k"]
+    total_variance: float
+
+    def __repr__(self) -> str:
+        count, n, _ = self.aligned.shape
+        return f"ShapeModel({count} shapes, {n} vertices, {len(self.modes)} modes)"
+
+    @property
+    def mean(self) -> Float64[np.ndarray, "n 3"]:
+        """The mean of the aligned shapes (n, 3)."""
+        return self.alignment.mean
+
+    @property
+    def aligned(self) -> Float64[np.ndarray, "N n 3"]:
+        """The aligned shapes (N, n, 3)."""
+        return self.alignment.aligned
+
+    @property
+    def weights(self) -> Float64[np.ndarray, " n"]:
+        """The weights of the vertices (n,), with the sum 1."""
+        return self.alignment.weights
+
+    def shape(self, scores: Real[np.ndarray, " j"]) -> Float64[np.ndarray, "n 3"]:
+        """Make the shape with the given scores, in the coordinates of the mean.
+
+        **Arguments:**
+
+        - `scores`: scores of the first j modes (j,), at most k. The scores of further modes are 0.
+
+        **Raises:** `InputError` if there are more scores than modes.
+        """
+        if len(scores) > len(self.modes):
+            raise InputError(f"there are {len(scores)} scores, but the model has {len(self.modes)} modes.")
+        return self.mean + np.tensordot(scores, self.modes[: len(scores)], axes=1)
+
+    def project(self, shape: Real[np.ndarray, "_ 3"]) -> Float64[np.ndarray, " k"]:
+        """Return the scores of a shape, after its alignment to the mean.
+
+        **Arguments:**
+
+        - `shape`: positions of the n vertices (n, 3), in any coordinate system of the same unit of length. If
+          the model removes differences of size, the unit does not matter.
+
+        **Returns:** The scores (k,). A shape of the collection has its row of `scores`.
+
+        **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
+        the shape is a single point.
+        """
+        if len(shape) != len(self.mean):
+            raise InputError(f"the shape has {len(shape)} vertices, but the model has {len(self.mean)}.")
+        if not np.isfinite(shape).all():
+            raise InputError("the shape has coordinates that are not finite; give finite coordinates.")
+        centroid = self.weights @ shape
+        centered = shape - centroid
+        mean = self.mean - self.weights @ self.mean
+        squared_size = float(self.weights @ (centered**2).sum(axis=1))
+        if _is_point(squared_size, centroid):
+            raise InputError("the shape is a single point; give a shape with distinct vertices.")
+        weighted = self.weights[:, None] * mean
+        rotations, fit = _nearest_rotations((weighted.T @ centered)[None])
+        factor = fit[0] / squared_size * self._common_factor(mean) if self.alignment.scaled else 1.0
+        displacements = factor * (centered @ rotations[0].T) - mean
+        return np.einsum("v,vc,kvc->k", self.weights, displacements, self.modes, optimize=True)
+
+    def _common_factor(self, mean: Float64[np.ndarray, "n 3"]) -> float:
+        """The factor that `align` applies to shapes after their least-squares fit to the mean.
+
+        Every aligned shape A satisfies |A|² = factor * <A, mean>. The sum of these equations over all shapes
+        gives the factor, because the mean of all A is the mean.
+        """
+        squared_mean = float(self.weights @ (mean**2).sum(axis=1))
+        count = len(self.scores)
+        return 1 + self.total_variance * (count - 1) / count / squared_mean
+
+    def compactness(self) -> Float64[np.ndarray, " k"]:
+        """Return the share of the total variance that the first 1, 2, …, k modes have (k,).
+
+        The last share is 1 if the model has all modes.
+        """
+        # Without variance there are no modes, and the result is empty.
+        return np.cumsum(self.variances) / (self.total_variance or 1.0)
+
+    def generalisation(self, numbers_of_modes: Sequence[int]) -> DistanceCurve:
+        """Measure how well the model describes new shapes, by leaving out one shape at a time.
+
+        A model of the other N - 1 shapes reconstructs the shape that was left out (Davies, "Learning shape:
+        optimal models for analysing natural variability", 2002; Styner et al., "Evaluation of 3D
+        correspondence methods for model building", IPMI 2003). The error of a shape is the mean distance
+        over the surface between the shape and its reconstruction. The shapes are not aligned again. For each
+        shape, the modes of the other shapes follow from an N x N matrix.
+
+        **Arguments:**
+
+        - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to N - 2.
+
+        **Returns:** The mean error of the N shapes for each number, and its standard error.
+
+        **Raises:** `InputError` if there are fewer than two shapes, or a number is not between 0 and N - 2.
+        """
+        count = len(self.scores)
+        if count < 2:
+            raise InputError("leaving out one shape needs at least two shapes.")
+        numbers = _checked_numbers(numbers_of_modes, count - 2, f"the other {count - 1} shapes determine")
+        coordinates = _coordinates(self.alignment)
+        residuals = np.zeros((len(numbers), *coordinates.shape))
+        with one_blas_thread():
+            for i, left_out in enumerate(coordinates):
+                others = np.delete(coordinates, i, axis=0)
+                mean = others.mean(axis=0)
+                modes = _directions(others - mean, _smallest_norm(self.alignment))
+                scores = modes @ (left_out - mean)
+                for at, number in enumerate(numbers):
+                    residuals[at, i] = left_out - mean - scores[:number] @ modes[:number]
+        errors = np.array([self._mean_lengths(of_number, coordinates) for of_number in residuals])
+        return _curve(numbers, errors.reshape(len(numbers), count))
+
+    def specificity(
+        self, numbers_of_modes: Sequence[int], *, samples: int = 1000, seed: int = 0
+    ) -> DistanceCurve:
+        """Measure how much random shapes of the model resemble shapes of the collection.
+
+        The scores of a random shape have a normal distribution with the variances of the modes (Davies 2002;
+        Styner et al. 2003). Its distance is the mean distance over the surface to the nearest shape of the
+        collection. The nearest shape is the shape with the smallest root mean square of the distances.
+
+        **Arguments:**
+
+        - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to k.
+        - `samples`: the number of random shapes, at least 2.
+        - `seed`: the random seed. The random numbers of a mode do not depend on `numbers_of_modes`.
+
+        **Returns:** The mean distance for each number, and its standard error.
+
+        **Raises:** `InputError` if there are fewer than two samples, or a number is not between 0 and k.
+        """
+        if samples < 2:
+            raise InputError(f"the number of samples is {samples}: choose 2 or more.")
+        numbers = _checked_numbers(numbers_of_modes, len(self.modes), "the model has")
+        coordinates = _coordinates(self.alignment)
+        # The numbers of one mode after the other, so that further modes do not change the first numbers.
+        normal = np.random.default_rng(seed).standard_normal((len(self.modes), samples)).T
+        drawn = normal * np.sqrt(self.variances)
+        distances = []
+        for number in numbers:
+            random_shapes = np.zeros((samples, coordinates.shape[1]))
+            random_shapes[:, :number] = drawn[:, :number]
+            if coordinates.shape[1]:
+                random_shapes -= coordinates[cdist(random_shapes, coordinates).argmin(axis=1)]
+            distances.append(self._mean_lengths(random_shapes, coordinates))
+        return _curve(numbers, np.array(distances).reshape(len(numbers), samples))
+
+    def _mean_lengths(
+        self, fields: Float64[np.ndarray, "p r"], coordinates: Float64[np.ndarray, "N r"]
+    ) -> Float64[np.ndarray, " p"]:
+        """Return the mean length over the surface of fields of displacements, given by their coordinates.
+
+        `coordinates` are the coordinates of the shapes in the same orthonormal basis (`_coordinates`).
+        """
+        combinations = fields @ (coordinates / (coordinates**2).sum(axis=0)).T
+        lengths = np.zeros(len(fields))
+        for block, displacements in _displacements(self.alignment):
+            values = (combinations @ displacements).reshape(len(fields), len(self.weights[block]), 3)
+            lengths += np.sqrt(np.einsum("pvc,pvc->pv", values, values)) @ self.weights[block]
+        return lengths
+
+
+def shape_model(
+    shapes: Shapes,
+    *,
+    scale: bool = False,
+    weights: Real[np.ndarray, " _"] | None = None,
+    reference: int = 0,
+    number_of_modes: int | None = None,
+) -> ShapeModel:
+    """Align shapes, and compute their mean and the modes of their variation.
+
+    **Arguments:**
+
+    - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
+    - `scale`, `weights`, `reference`: see `align`.
+    - `number_of_modes`: the largest number of modes; None (the default) for all modes. A model of N shapes
+      has at most N - 1 modes. Modes whose standard deviation is below 1e-8 of the size of the mean are
+      left out as rounding errors. One shape and identical shapes therefore have no modes.
+
+    **Returns:** A `ShapeModel`.
+
+    **Raises:** `InputError` as `align` does, or if the number of modes is below 1.
+    """
+    if number_of_modes is not None and number_of_modes < 1:
+        raise InputError(f"the number of modes is {number_of_modes}: choose 1 or more.")
+    alignment = align(shapes, scale=scale, weights=weights, reference=reference)
+    coordinates = _coordinates(alignment)
+    squared = (coordinates**2).sum(axis=0)
+    variances = squared / max(len(coordinates) - 1, 1)
+    scores = coordinates[:, :number_of_modes]
+    modes = np.empty((scores.shape[1], *alignment.mean.shape))
+    combinations = (scores / squared[:number_of_modes]).T
+    for block, displacements in _displacements(alignment):
+        modes[:, block] = (combinations @ displacements).reshape(modes[:, block].shape)
+    return ShapeModel(alignment, modes, variances[:number_of_modes], scores, float(variances.sum()))
+
+
+def _checked(shapes: Shapes) -> Float64[np.ndarray, "N n 3"]:
+    """Return the shapes as one array in float64."""
+    if len(shapes) == 0:
+        raise InputError("there is no shape; give at least one shape.")
+    sizes = [len(shape) for shape in shapes]
+    for index, size in enumerate(sizes):
+        if size != sizes[0]:
+            raise InputError(
+                f"shape {index} has {size} vertices, but shape 0 has {sizes[0]}; give shapes in the "
+                f"triangulation of one template."
+            )
+        if not np.isfinite(shapes[index]).all():
+            raise InputError(f"shape {index} has coordinates that are not finite; leave the shape out.")
+    if sizes[0] == 0:
+        raise InputError("the shapes have no vertices; give shapes with vertices.")
+    return np.asarray(shapes, dtype=np.float64)
+
+
+def _is_point(
+    squared_sizes: Float64[np.ndarray, "*N"] | float, centroids: Float64[np.ndarray, "*N 3"]
+) -> Bool[np.ndarray, "*N"] | np.bool_:
+    """Return whether all vertices of a shape are at its centroid, except for rounding errors."""
+    return squared_sizes <= (1e-12 * np.abs(centroids).max(axis=-1)) ** 2
+
+
+def _checked_weights(weights: Real[np.ndarray, " _"] | None, n: int) -> Float64[np.ndarray, " n"]:
+    """Return the weights of n vertices with the sum 1."""
+    if weights is None:
+        return np.full(n, 1 / n)
+    if len(weights) != n:
+        raise InputError(f"there are {len(weights)} weights, but the shapes have {n} vertices.")
+    values = np.asarray(weights, dtype=np.float64)
+    if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
+        raise InputError("the weights must be finite, not negative and not all zero, such as vertex areas.")
+    values = values / values.max()
+    return values / values.sum()
+
+
+def _checked_numbers(numbers: Sequence[int], most: int, reason: str) -> tuple[int, ...]:
+    """Return numbers of modes as a tuple."""
+    for number in numbers:
+        if not 0 <= number <= most:
+            raise InputError(f"the number of modes is {number}, but {reason} {most}; choose 0 to {most}.")
+    return tuple(int(number) for number in numbers)
+
+
+def _inner_products(
+    points: Float64[np.ndarray, "N n 3"],
+    centroids: Float64[np.ndarray, "N 3"],
+    weights: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, "N 3 N 3"]:
+    """Return the weighted inner products of the centred coordinates of all shapes."""
+    count = len(points)
+    products = np.zeros((3 * count, 3 * count))
+    for block in _blocks(len(weights)):
+        rows = (points[:, block] - centroids[:, None]) * np.sqrt(weights[block])[:, None]
+        rows = rows.transpose(0, 2, 1).reshape(3 * count, -1)
+        products += rows @ rows.T
+    return products.reshape(count, 3, count, 3)
+
+
+def _rotations_and_scales(
+    products: Float64[np.ndarray, "N 3 N 3"],
+    squared_sizes: Float64[np.ndarray, " N"],
+    reference: int,
+    *,
+    scale: bool,
+) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, " N"]]:
+    """Return the rotations and scales of all shapes, from the inner products of their centred coordinates."""
+    count = len(squared_sizes)
+    flat = products.reshape(3 * count, 3 * count)
+    size = np.sqrt(squared_sizes).mean()
+    # The mean is sum_i P_i (X_i - centroid_i), and the 3 x 3 matrices P_i are the columns of `combination`.
+    combination = np.zeros((3, 3 * count))
+    combination[:, 3 * reference : 3 * reference + 3] = np.eye(3)
+    with one_blas_thread():
+        for _ in range(_MOST_ROUNDS):
+            covariances = (combination @ flat).reshape(3, count, 3).transpose(1, 0, 2)
+            rotations, fit = _nearest_rotations(covariances)
+            scales = fit / squared_sizes if scale else np.ones(count)
+            updated = (scales[:, None, None] * rotations / count).transpose(1, 0, 2).reshape(3, 3 * count)
+            if scale:
+                factor = size / np.sqrt(_squared_norm(updated, flat))
+                updated, scales = factor * updated, factor * scales
+            change = np.sqrt(_squared_norm(updated - combination, flat))
+            combination = updated
+            if change <= _TOLERANCE * size:
+                break
+    return rotations, scales
+
+
+def _squared_norm(combination: Float64[np.ndarray, "3 q"], products: Float64[np.ndarray, "q q"]) -> float:
+    """Return the squared norm of a combination of the coordinates of shapes, given their inner products."""
+    return max(float(np.sum((combination @ products) * combination)), 0.0)
+
+
+def _nearest_rotations(
+    covariances: Float64[np.ndarray, "N 3 3"],
+) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, " N"]]:
+    """Return the rotations R without reflection that maximise trace(R^T C), and the maxima.
+
+    C is the sum of target times moved point^T (Kabsch, "A solution for the best rotation to relate two sets
+    of vectors", 1976).
+    """
+    left, values, right = np.linalg.svd(covariances)
+    signs = np.ones_like(values)
+    signs[:, 2] = np.where(np.linalg.det(left @ right) < 0, -1, 1)
+    return (left * signs[:, None]) @ right, (values * signs).sum(axis=1)
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    """Yield slices of at most `_BLOCK` vertices."""
+    for start in range(0, n, _BLOCK):
+        yield slice(start, min(start + _BLOCK, n))
+
+
+def _displacements(alignment: Alignment) -> Iterator[tuple[slice, Float64[np.ndarray, "N q"]]]:
+    """Yield blocks of vertices, with the displacements of all shapes from the mean in one row per shape."""
+    for block in _blocks(len(alignment.mean)):
+        yield block, (alignment.aligned[:, block] - alignment.mean[block]).reshape(len(alignment.aligned), -1)
+
+
+def _smallest_norm(alignment: Alignment) -> float:
+    """Return the norm of the scores of a mode below which the mode is a rounding error."""
+    centered = alignment.mean - alignment.weights @ alignment.mean
+    size = np.sqrt(alignment.weights @ (centered**2).sum(axis=1))
+    return float(_SMALLEST_DEVIATION * size * np.sqrt(max(len(alignment.aligned) - 1, 1)))
+
+
+def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
+    """Return the scores of all modes, the coordinates of the shapes in an orthonormal basis.
+
+    A QR decomposition of one block of vertices after the other reduces the displacements to an N x N matrix
+    with the same inner products. This matrix keeps small singular values, which inner products square.
+    """
+    count = len(alignment.aligned)
+    reduced = np.zeros((0, count))
+    for block, displacements in _displacements(alignment):
+        weighted = np.repeat(np.sqrt(alignment.weights[block]), 3)[:, None] * displacements.T
+        reduced = scipy.linalg.qr(
+            np.vstack([reduced, weighted]), mode="r", overwrite_a=True, check_finite=False
+        )[0][:count]
+    _, values, right = np.linalg.svd(reduced, full_matrices=False)
+    scores = (values[:, None] * right)[values > _smallest_norm(alignment)].T
+    sizes = np.abs(scores)
+    first = (sizes >= (1 - _EQUAL_SCORES) * sizes.max(axis=0)).argmax(axis=0)
+    return scores * np.sign(scores[first, np.arange(scores.shape[1])])
+
+
+def _directions(centered: Float64[np.ndarray, "N r"], smallest: float) -> Float64[np.ndarray, "k r"]:
+    """Return orthonormal directions of decreasing variance, without directions of rounding errors."""
+    if centered.size == 0:
+        return np.zeros((0, centered.shape[1]))
+    _, values, right = np.linalg.svd(centered, full_matrices=False)
+    return right[values > smallest]
+
+
+def _curve(numbers: tuple[int, ...], distances: Float64[np.ndarray, "numbers p"]) -> DistanceCurve:
+    """Return the means of distances, and their standard errors."""
+    error = distances.std(axis=1, ddof=1) / np.sqrt(distances.shape[1])
+    return DistanceCurve(numbers, distances.mean(axis=1), error)
