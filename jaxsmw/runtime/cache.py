@@ -13,7 +13,7 @@ import os
 import platform
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -60,17 +60,14 @@ def cached(
     place, limit = _place(), _limit()
     if place is None:
         return compute()
-    key = _key(kind, inputs)
-    path = place / f"{kind}-{key}.npz"
-    arrays = None if _recomputing.get() else _load(path, key)
+    store = Store(place)
+    arrays = None if _recomputing.get() else store.load(kind, inputs)
     if arrays is None:
         arrays = compute()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(path) as temporary:
-                contents = np.array([key, *arrays])
-                np.savez(temporary, contents=contents, **arrays)  # type: ignore[arg-type]
-            _remove_oldest(path.parent, limit)
+            place.mkdir(parents=True, exist_ok=True)
+            store.save(kind, inputs, arrays)
+            _remove_oldest(place, limit)
         except (OSError, InputError):
             # The text and the line number are the same for all entries, so Python shows this warning once.
             warnings.warn(
@@ -81,6 +78,39 @@ def cached(
                 stacklevel=1,
             )
     return arrays
+
+
+class Store:
+    """Results in a directory, each with the values on which it depends.
+
+    **Arguments:**
+
+    - `directory`: an existing directory.
+    """
+
+    def __init__(self, directory: Path):
+        self.directory = directory
+
+    def load(
+        self, kind: str, inputs: Sequence[np.ndarray | str | int | float]
+    ) -> dict[str, np.ndarray] | None:
+        """Return a stored result, or None if it is missing or damaged; see `cached` for the arguments."""
+        key = _key(kind, inputs)
+        return _load(self._path(kind, key), key)
+
+    def save(
+        self, kind: str, inputs: Sequence[np.ndarray | str | int | float], arrays: Mapping[str, np.ndarray]
+    ) -> None:
+        """Store a result; see `cached` for the arguments.
+
+        **Raises:** `OSError` or `InputError` if the result cannot be written.
+        """
+        key = _key(kind, inputs)
+        with atomic_write(self._path(kind, key)) as temporary:
+            np.savez(temporary, contents=np.array([key, *arrays]), **arrays)  # type: ignore[arg-type]
+
+    def _path(self, kind: str, key: str) -> Path:
+        return self.directory / f"{kind}-{key}.npz"
 
 
 _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)

@@ -1,0 +1,589 @@
+"""The function `match_collection`, which matches all shapes of a collection consistently, and its result."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from jaxsmw.choices import DEFAULT_PRESET
+from jaxsmw.collection.consistency import Edge, estimate_edge_errors
+from jaxsmw.collection.edges import EdgeMap, compare_hands, match_edge
+from jaxsmw.collection.graph import choose_edges, shape_distances
+from jaxsmw.collection.hands import choose_hands
+from jaxsmw.collection.settings import CollectionSettings
+from jaxsmw.collection.shape_model import ShapeModel, shape_model
+from jaxsmw.collection.shapes import PreparedShape, describe_shape, descriptor_axes, prepare_shape
+from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
+from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.eigenbasis import choose_eigensolver
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.presets import Preset, PresetName, choose_preset
+from jaxsmw.repair.chirality import Decision
+from jaxsmw.runtime.cache import Store
+from jaxsmw.runtime.progress import timed
+from jaxsmw.runtime.workers import run_tasks
+from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
+
+logger = logging.getLogger("jaxsmw")
+
+Progress = Callable[[str, int, int], None]
+"""A function that is called with the name of a step, the number of finished parts and the number of parts."""
+
+
+@dataclass(frozen=True)
+class MatchedEdge:
+    """An edge of the graph of a collection: two matched shapes, and what became of their map.
+
+    Errors are in units of the square root of the area.
+
+    **Attributes:**
+
+    - `source`, `target`: the numbers of the two shapes.
+    - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
+    - `distortion`: the distortion of the map, or None.
+    - `cycle_error`: the error of the map that the cycles of the graph show; see `edge_errors`.
+    - `residual`: the mean distance between the map and the map through the template.
+    - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
+      contradicted the other maps), or `"contradicted"` (still contradicts the other maps, and hardly counts).
+    """
+
+    source: int
+    target: int
+    expected_error: float
+    distortion: float | None
+    cycle_error: float
+    residual: float
+    decision: str
+
+    def sentence(self, names: Sequence[str]) -> str:
+        """Return a sentence about the edge, given the names of all shapes."""
+        errors = (
+            f"expected error {1e3 * self.expected_error:.0f}, cycle error {1e3 * self.cycle_error:.0f}, "
+            f"distance from the consistent map {1e3 * self.residual:.0f} thousandths"
+        )
+        return f"{names[self.source]} to {names[self.target]}: {self.decision} ({errors})"
+
+
+@dataclass(frozen=True, eq=False)
+class Collection:
+    """The result of `match_collection`: consistent maps between all shapes of a collection.
+
+    Vertex v of the template corresponds to the same point of the body on every shape.
+
+    **Attributes:**
+
+    - `meshes`: the meshes of the N shapes.
+    - `template`: the number of the template, which has n vertices.
+    - `points`: for each shape, the point of every vertex of the template, n `SurfacePoints` on its mesh.
+    - `mirrored`: a mask (N,), True for shapes of the other hand, whose mirror images were matched.
+    - `registered`: for each shape, the `RegisteredMesh` of the template on the shape; on the mirror image if
+      the shape is mirrored.
+    - `edges`: the matched pairs, each a `MatchedEdge`.
+    - `axes`: the axes of the descriptors, or None.
+    - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds.
+    """
+
+    meshes: tuple[Mesh, ...]
+    template: int
+    points: tuple[SurfacePoints, ...]
+    mirrored: Bool[np.ndarray, " N"]
+    registered: tuple[RegisteredMesh, ...]
+    edges: tuple[MatchedEdge, ...]
+    axes: DescriptorAxes | None = None
+    left_out: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        wrong = sum(edge.decision == "contradicted" for edge in self.edges)
+        return (
+            f"Collection({len(self.meshes)} shapes, template {self.names[self.template]}, "
+            f"{len(self.edges)} edges, {wrong} contradicted)"
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the shapes."""
+        return tuple(mesh.name for mesh in self.meshes)
+
+    def vertices(self, shape: int) -> Float64[np.ndarray, "n 3"]:
+        """Return the positions of the template's vertices on a shape (n, 3), in the shape's coordinates."""
+        found = self.registered[shape].vertices
+        return found * np.array([-1.0, 1.0, 1.0]) if self.mirrored[shape] else found
+
+    def from_template(self, shape: int) -> Int64[np.ndarray, " n"]:
+        """Return the map from the template (n,) to a shape, as 0-based vertices of the shape."""
+        return self.registered[shape].surface_points.nearest_corners(self.registered[shape].mesh_y)
+
+    def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
+        """Return the map from a shape (m,) to the template, as 0-based vertices of the template."""
+        return self.registered[shape].points_of_target.nearest_corners(self.registered[shape].mesh_x)
+
+    def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
+        """Return the map from one shape (m,) to another through the template, as 0-based vertices.
+
+        The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
+        the rounding to vertices.
+        """
+        images = self.registered[target].carry(self.registered[source].points_of_target)
+        mesh = self.registered[target].mesh_y
+        from jaxsmw.geometry.surface_distance import nearest_surface_points
+
+        return nearest_surface_points(images, mesh)[0].nearest_corners(mesh)
+
+    def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
+        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
+
+        Shapes of the other hand enter as their mirror images.
+        """
+        template = self.meshes[self.template]
+        return shape_model(
+            [one.vertices for one in self.registered],
+            scale=scale,
+            weights=template.vertex_areas,
+            reference=self.template,
+            number_of_modes=number_of_modes,
+        )
+
+
+def match_collection(
+    meshes: Sequence[Mesh | MeshLike],
+    *,
+    names: Sequence[str] | None = None,
+    preset: PresetName | Preset = DEFAULT_PRESET,
+    template: int | None = None,
+    mirror: bool = True,
+    stiffness: float = DEFAULT_STIFFNESS,
+    settings: CollectionSettings = CollectionSettings(),  # noqa: B008 (immutable)
+    seed: int = 0,
+    directory: Path | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Collection:
+    """Match all shapes of a collection, such that the maps of all pairs agree.
+
+    Only the edges of a graph are matched, a few for each shape. Cycles of the graph show which maps are
+    wrong. The maps from a template to all shapes are the robust means of the maps along all edges. Maps that
+    contradict these means are matched again, from the consistent maps.
+
+    **Arguments:**
+
+    - `meshes`: at least two meshes of the same kind of body, in any poses, units and triangulations. Each is
+      a `Mesh`, or a mesh that `make_mesh` accepts.
+    - `names`: the names of the meshes. The default are the names of the meshes.
+    - `preset`: see `match`.
+    - `template`: the number of the template. The default is the shape with the smallest sum of errors along
+      the best paths to all other shapes (the medoid).
+    - `mirror`: whether shapes of opposite hands, such as left and right teeth, are recognised and matched by
+      their mirror images; see `match`.
+    - `stiffness`: see `register_mesh`.
+    - `settings`: the `CollectionSettings`.
+    - `seed`: the seed of the random edges of the graph.
+    - `directory`: an existing directory in which finished steps are kept. A second call with the same
+      directory continues an interrupted call. If meshes are added, only their own edges are matched.
+    - `executor`: an executor that matches edges, for example `jaxsmw.runtime.workers.open_executor`. By
+      default, edges are matched one after another in this process.
+    - `progress`: a function that is called after each part of a step with the name of the step, the number of
+      finished parts, and the number of parts.
+
+    **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`.
+
+    **Raises:** `InputError` if fewer than two meshes can be matched, or if the template is left out.
+    """
+    given = [_as_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
+    return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, progress).run(
+        template, mirror, stiffness
+    )
+
+
+def _as_mesh(mesh: Mesh | MeshLike, number: int, names: Sequence[str] | None) -> Mesh:
+    name = f"mesh {number}" if names is None else names[number]
+    if not isinstance(mesh, Mesh):
+        return make_mesh(mesh, name=name)
+    return mesh if names is None else replace(mesh, name=name)
+
+
+class _EdgeTask(NamedTuple):
+    """The match of an edge in a worker, which reads both shapes from a store."""
+
+    directory: Path
+    keys: tuple[tuple[Any, ...], tuple[Any, ...]]
+    names: tuple[str, str]
+    preset: Preset
+    init: Int64[np.ndarray, " m"] | None
+    aligned: bool
+
+
+@functools.lru_cache(maxsize=16)
+def _stored_shape(directory: Path, key: tuple[Any, ...], name: str) -> PreparedShape:
+    arrays = Store(directory).load("shape", key)
+    if arrays is None:
+        raise InputError(f"{directory}: the prepared shape {name} is missing: run the same command again.")
+    return PreparedShape.from_arrays(arrays, name)
+
+
+def _match_stored(task: _EdgeTask) -> EdgeMap:
+    x, y = (_stored_shape(task.directory, key, name) for key, name in zip(task.keys, task.names, strict=True))
+    return match_edge(x, y, task.preset, init=task.init, aligned=task.aligned)
+
+
+class _Matcher:
+    """The steps of `match_collection`, with the settings that they share."""
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        preset: Preset,
+        settings: CollectionSettings,
+        seed: int,
+        directory: Path | None,
+        executor: Executor | None,
+        progress: Progress | None,
+    ):
+        self.given, self.preset, self.settings, self.seed = list(meshes), preset, settings, seed
+        self.store = None if directory is None else Store(directory)
+        self.executor, self.progress = executor, progress or (lambda *_: None)
+        self.left_out: dict[str, str] = {}
+        self.seconds: dict[str, float] = {}
+
+    def run(self, template: int | None, mirror: bool, stiffness: float) -> Collection:
+        with timed("shapes", self.seconds):
+            kept = self._prepare()
+        if len(kept) < 2:
+            raise InputError(
+                f"a collection needs at least two meshes, but {len(kept)} can be matched: "
+                + "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
+            )
+        if template is not None:
+            if template not in kept:
+                raise InputError(
+                    f"the template {self.given[template].name} cannot be matched: choose another."
+                )
+            template = kept.index(template)
+        with timed("hands", self.seconds):
+            decisions = self._compare_hands() if mirror else {}
+            mirrored = choose_hands(len(self.shapes), decisions)
+            self.aligned = any(decision.asymmetric for decision in decisions.values())
+            if mirrored.any():
+                self._mirror(mirrored)
+        with timed("descriptors", self.seconds):
+            self._describe()
+        with timed("graph", self.seconds):
+            edges = self._edges()
+        with timed("edges", self.seconds):
+            self.maps = dict(self._match(dict.fromkeys(edges), "edges"))
+        replaced: set[Edge] = set()
+        with timed("synchronization", self.seconds):
+            network, chosen, points = self._synchronize(template)
+            for _ in range(self.settings.rounds):
+                wrong = self._contradicted(edges, network, points)
+                if not wrong:
+                    break
+                inits = {(i, j): self._through(chosen, points, i, j) for i, j in wrong}
+                again = dict(self._match(inits, "contradicted edges"))
+                better = self._better(again, network, points)
+                if not better:
+                    break
+                self.maps |= better
+                replaced |= set(better)
+                network, chosen, points = self._synchronize(template)
+        with timed("registered meshes", self.seconds):
+            registered = self._register(chosen, points, stiffness)
+        found = [self._describe_edge(edge, network, points, replaced) for edge in edges]
+        return Collection(
+            meshes=tuple(self.given[number] for number in kept),
+            template=chosen,
+            points=tuple(points),
+            mirrored=mirrored,
+            registered=tuple(registered),
+            edges=tuple(found),
+            axes=self.axes,
+            left_out=self.left_out,
+            seconds=self.seconds,
+        )
+
+    @property
+    def meshes(self) -> list[Mesh]:
+        """The matched meshes: mirror images for shapes of the other hand."""
+        return [shape.mesh for shape in self.shapes]
+
+    def _prepare(self) -> list[int]:
+        """Prepare all shapes, and return the numbers of the shapes that can be matched."""
+        fewest = min((int(mesh.referenced_vertices.sum()) for mesh in self.given), default=0)
+        self.preset = self.preset.fitted(max(fewest, 4))
+        eigensolver = choose_eigensolver(*self.given) if self.given else "exact"
+        self.shapes: list[PreparedShape] = []
+        kept = []
+        for number, mesh in enumerate(self.given):
+            try:
+                self.shapes.append(prepare_shape(mesh, self.preset, eigensolver=eigensolver))
+                kept.append(number)
+            except (InputError, ArithmeticError) as error:
+                self.left_out[mesh.name] = str(error)
+                logger.warning("%s is left out: %s", mesh.name, error)
+            self.progress("shapes", number + 1, len(self.given))
+        return kept
+
+    def _compare_hands(self) -> dict[Edge, Decision]:
+        """Compare the hands along the edges of a sparse graph, if the first comparisons show asymmetry."""
+        edges = choose_edges(shape_distances(self.shapes), edges_per_shape=2.0, seed=self.seed)
+        first = edges[:: max(1, len(edges) // _FIRST_HANDS)][:_FIRST_HANDS]
+        decisions = {edge: self._hand(edge) for edge in first}
+        if not any(decision.asymmetric for decision in decisions.values()):
+            return decisions
+        for number, edge in enumerate(edges):
+            if edge not in decisions:
+                decisions[edge] = self._hand(edge)
+            self.progress("hands", number + 1, len(edges))
+        return decisions
+
+    def _hand(self, edge: Edge) -> Decision:
+        i, j = edge
+        inputs = (*self._key(i), *self._key(j))
+        stored = None if self.store is None else self.store.load("hand", inputs)
+        if stored is not None:
+            mirrored, evidence, doubtful, asymmetric = stored["decision"].tolist()
+            return Decision(
+                bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)
+            )
+        found = compare_hands(self.shapes[i], self.shapes[j])
+        if self.store is not None:
+            evidence = np.nan if found.evidence is None else found.evidence
+            values = np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], np.float64)
+            self.store.save("hand", inputs, {"decision": values})
+        return found
+
+    def _mirror(self, mirrored: Bool[np.ndarray, " N"]) -> None:
+        for number in np.flatnonzero(mirrored).tolist():
+            shape = self.shapes[number]
+            self.shapes[number] = replace(
+                shape, mesh=shape.mesh.mirrored(), spectrum=shape.spectrum.reflect()
+            )
+
+    def _describe(self) -> None:
+        """Add descriptors along common axes. The axes are kept, so that added meshes change no edge."""
+        self.axes: DescriptorAxes | None = None
+        if not self.preset.number_of_descriptors:
+            return
+        inputs = (repr(self.preset),)
+        stored = None if self.store is None else self.store.load("descriptor-axes", inputs)
+        if stored is not None:
+            self.axes = DescriptorAxes(
+                tuple(stored["radii"].tolist()), PrincipalAxes(stored["mean"], stored["axes"])
+            )
+        else:
+            self.axes = descriptor_axes(self.shapes, self.preset)
+            if self.store is not None:
+                arrays = {
+                    "radii": np.array(self.axes.radii),
+                    "mean": self.axes.principal.mean,
+                    "axes": self.axes.principal.axes,
+                }
+                self.store.save("descriptor-axes", inputs, arrays)
+        self.shapes = [describe_shape(shape, self.axes) for shape in self.shapes]
+
+    def _edges(self) -> list[Edge]:
+        """Choose the edges. Edges between shapes of an earlier call with the same directory are kept."""
+        names = [mesh.name for mesh in self.meshes]
+        inputs = (repr(self.settings.edges_per_shape), self.seed)
+        stored = None if self.store is None else self.store.load("graph", inputs)
+        given: list[Edge] = []
+        if stored is not None:
+            row = {name: number for number, name in enumerate(names)}
+            pairs = [(row.get(a), row.get(b)) for a, b in stored["edges"].reshape(-1, 2).tolist()]
+            given = [(min(a, b), max(a, b)) for a, b in pairs if a is not None and b is not None]
+        edges = choose_edges(
+            shape_distances(self.shapes),
+            edges_per_shape=self.settings.edges_per_shape,
+            given=given,
+            seed=self.seed,
+        )
+        if self.store is not None:
+            listed = np.array([[names[i], names[j]] for i, j in edges])
+            self.store.save("graph", inputs, {"edges": listed})
+        return edges
+
+    def _key(self, number: int) -> tuple[Any, ...]:
+        mesh = self.shapes[number].mesh
+        return mesh.vertices, mesh.faces, self.preset.number_of_eigenvectors
+
+    def _edge_key(self, edge: Edge, init: Int64[np.ndarray, " m"] | None) -> tuple[Any, ...]:
+        axes = () if self.axes is None else (self.axes.principal.axes,)
+        first = "shot" if init is None else init
+        keys = (*self._key(edge[0]), *self._key(edge[1]))
+        return (*keys, *axes, repr(self.preset), str(self.aligned), first)
+
+    def _match(
+        self, inits: Mapping[Edge, Int64[np.ndarray, " m"] | None], step: str
+    ) -> Iterator[tuple[Edge, EdgeMap]]:
+        """Match edges from given initial maps, or from `"shot"`. Edges whose match fails are left out."""
+        missing: dict[Edge, Int64[np.ndarray, " m"] | None] = {}
+        for edge, init in inits.items():
+            stored = None if self.store is None else self.store.load("edge", self._edge_key(edge, init))
+            if stored is None:
+                missing[edge] = init
+            else:
+                yield edge, EdgeMap.from_arrays(stored)
+        done = len(inits) - len(missing)
+        self.progress(step, done, len(inits))
+        for edge, found in self._matched(missing):
+            done += 1
+            self.progress(step, done, len(inits))
+            if isinstance(found, BaseException):
+                if not isinstance(found, InputError | ArithmeticError):
+                    raise found
+                logger.warning("%s", found)
+                continue
+            if self.store is not None:
+                self.store.save("edge", self._edge_key(edge, inits[edge]), found.arrays())
+            yield edge, found
+
+    def _matched(
+        self, inits: Mapping[Edge, Int64[np.ndarray, " m"] | None]
+    ) -> Iterator[tuple[Edge, EdgeMap | BaseException]]:
+        if self.executor is None:
+            for (i, j), init in inits.items():
+                try:
+                    yield (
+                        (i, j),
+                        match_edge(
+                            self.shapes[i], self.shapes[j], self.preset, init=init, aligned=self.aligned
+                        ),
+                    )
+                except (InputError, ArithmeticError) as error:
+                    yield (i, j), error
+            return
+        with TemporaryDirectory() as temporary:
+            store = self.store or Store(Path(temporary))
+            keys = self._save_shapes(store, inits)
+            edges = {f"{i} {j}": (i, j) for i, j in inits}
+            tasks = {
+                name: _EdgeTask(
+                    store.directory.resolve(),
+                    (keys[i], keys[j]),
+                    (self.meshes[i].name, self.meshes[j].name),
+                    self.preset,
+                    inits[i, j],
+                    self.aligned,
+                )
+                for name, (i, j) in edges.items()
+            }
+            for name, found in run_tasks(_match_stored, tasks, self.executor):
+                yield edges[name], found
+
+    def _save_shapes(self, store: Store, edges: Iterable[Edge]) -> dict[int, tuple[str, ...]]:
+        """Save the prepared shapes of edges for workers, and return their keys."""
+        import hashlib
+
+        keys = {}
+        for number in sorted({shape for edge in edges for shape in edge}):
+            arrays = self.shapes[number].arrays()
+            digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays.values()))
+            keys[number] = (digest.hexdigest(),)
+            if store.load("shape", keys[number]) is None:
+                store.save("shape", keys[number], arrays)
+        return keys
+
+    def _synchronize(self, template: int | None) -> tuple[Network, int, list[SurfacePoints]]:
+        """Estimate the errors of all edges from cycles, choose the template, and synchronise the maps."""
+        edges = list(self.maps)
+        meshes, units = self.meshes, [mesh.area**0.5 for mesh in self.meshes]
+        points = {edge: found.forward for edge, found in self.maps.items()}
+        points |= {(j, i): found.backward for (i, j), found in self.maps.items()}
+        vertex_maps = {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()}
+        prior = np.array([found.expected_error for found in self.maps.values()])
+        estimated, _, _ = estimate_edge_errors(
+            edges,
+            vertex_maps,
+            [mesh.vertices / unit for mesh, unit in zip(meshes, units, strict=True)],
+            [self._cycle_samples(number) for number in range(len(meshes))],
+            prior,
+        )
+        # A map that looks good by itself, and only differs from the others by chance, is no better than it
+        # expects to be.
+        errors = np.maximum(estimated, prior / 2)
+        network = Network(
+            meshes, points, dict(zip(edges, errors.tolist(), strict=True)), self.settings.synchronization
+        )
+        chosen = network.medoid() if template is None else template
+        return network, chosen, synchronize(network, chosen)
+
+    def _cycle_samples(self, number: int) -> Int64[np.ndarray, " s"]:
+        samples = self.shapes[number].samples
+        mesh = self.shapes[number].mesh
+        if samples is None:
+            used = np.flatnonzero(mesh.referenced_vertices)
+            return used[:: max(1, len(used) // self.settings.cycle_samples)]
+        return np.asarray(samples, np.int64)[: self.settings.cycle_samples]
+
+    def _contradicted(
+        self, edges: Iterable[Edge], network: Network, points: Sequence[SurfacePoints]
+    ) -> list[Edge]:
+        """Return the edges whose match failed or whose maps contradict the consistent maps."""
+        limit = self.settings.contradicted_from
+        return [
+            (i, j)
+            for i, j in edges
+            if (i, j) not in self.maps or self._residual(network, points, i, j) >= limit
+        ]
+
+    @staticmethod
+    def _residual(network: Network, points: Sequence[SurfacePoints], i: int, j: int) -> float:
+        return max(network.residual(points, i, j), network.residual(points, j, i))
+
+    def _through(
+        self, template: int, points: Sequence[SurfacePoints], i: int, j: int
+    ) -> Int64[np.ndarray, " m"]:
+        meshes = self.meshes
+        return vertex_map_between(points[i], points[j], meshes[template], meshes[i], meshes[j])
+
+    def _better(
+        self, again: Mapping[Edge, EdgeMap], network: Network, points: Sequence[SurfacePoints]
+    ) -> dict[Edge, EdgeMap]:
+        """Return the new maps that are closer to the consistent maps than the old maps are."""
+        better = {}
+        for (i, j), found in again.items():
+            before = self._residual(network, points, i, j) if (i, j) in self.maps else np.inf
+            maps = {(i, j): found.forward, (j, i): found.backward}
+            errors = {(min(i, j), max(i, j)): found.expected_error}
+            now = self._residual(Network(self.meshes, maps, errors, network.settings), points, i, j)
+            if now < before:
+                better[i, j] = found
+        return better
+
+    def _register(
+        self, template: int, points: Sequence[SurfacePoints], stiffness: float
+    ) -> list[RegisteredMesh]:
+        registered = []
+        for number, (mesh, known) in enumerate(zip(self.meshes, points, strict=True)):
+            registered.append(register_mesh(self.meshes[template], mesh, known, stiffness=stiffness))
+            self.progress("registered meshes", number + 1, len(points))
+        return registered
+
+    def _describe_edge(
+        self, edge: Edge, network: Network, points: Sequence[SurfacePoints], replaced: set[Edge]
+    ) -> MatchedEdge:
+        if edge not in self.maps:
+            return MatchedEdge(*edge, np.inf, None, np.inf, np.inf, "contradicted")
+        found, residual = self.maps[edge], self._residual(network, points, *edge)
+        wrong = residual >= self.settings.contradicted_from
+        decision = "contradicted" if wrong else "replaced" if edge in replaced else "kept"
+        return MatchedEdge(
+            *edge, found.expected_error, found.distortion, network.error(*edge), residual, decision
+        )
+
+
+# The number of pairs whose hands are compared first. If none of them is asymmetric, as bodies are not, hands
+# are not compared any further.
+_FIRST_HANDS = 5

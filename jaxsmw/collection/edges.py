@@ -1,0 +1,106 @@
+"""The matches of the edges of a collection's graph, each in both directions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxsmw.collection.shapes import PreparedShape, prepare_pair
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.matching import Correspondence, match_prepared
+from jaxsmw.pair import Pair
+from jaxsmw.presets import Preset
+from jaxsmw.repair.chirality import Decision, Hands
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeMap:
+    """The maps between the two shapes of an edge, the source X (m vertices) and the target Y (n vertices).
+
+    **Attributes:**
+
+    - `forward`: the match of every vertex of X, m `SurfacePoints` on Y.
+    - `backward`: the match of every vertex of Y, n `SurfacePoints` on X.
+    - `expected_error`: the mean expected error, in units of the square root of the area; see
+      `jaxsmw.repair.expected_error`.
+    - `distortion`: the distortion of the map, or None if the preset has no repair.
+    - `suspicious`: whether the map looks wrong by itself, without the other shapes.
+    """
+
+    forward: SurfacePoints
+    backward: SurfacePoints
+    expected_error: float
+    distortion: float | None
+    suspicious: bool
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> EdgeMap:
+        """Return the maps that `arrays` describes."""
+        points = [
+            SurfacePoints(arrays[f"{name}_faces"].astype(np.int64), arrays[f"{name}_weights"].astype(float))
+            for name in ("forward", "backward")
+        ]
+        expected, distortion, suspicious = arrays["scores"].tolist()
+        return cls(*points, expected, None if np.isnan(distortion) else distortion, bool(suspicious))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the maps as arrays, for a file."""
+        distortion = np.nan if self.distortion is None else self.distortion
+        return {
+            "forward_faces": self.forward.faces.astype(np.int32),
+            "forward_weights": self.forward.weights,
+            "backward_faces": self.backward.faces.astype(np.int32),
+            "backward_weights": self.backward.weights,
+            "scores": np.array([self.expected_error, distortion, self.suspicious], np.float64),
+        }
+
+    @classmethod
+    def of(cls, found: Correspondence) -> EdgeMap:
+        """Return the maps of a correspondence in both directions."""
+        return cls(
+            found.surface_points(),
+            found.reverse_surface_points(),
+            float(found.expected_error().mean()),
+            found.distortion,
+            found.suspicious,
+        )
+
+
+def match_edge(
+    x: PreparedShape,
+    y: PreparedShape,
+    preset: Preset,
+    *,
+    init: Int64[np.ndarray, " m"] | None = None,
+    aligned: bool = False,
+) -> EdgeMap:
+    """Match two shapes of a collection.
+
+    A map that looks wrong is repaired, but no alternative initial maps are tried, because the maps of other
+    edges provide a better initial map later.
+
+    **Arguments:**
+
+    - `x`, `y`: the source X (m vertices) and the target Y, of the same hand.
+    - `preset`: the stages and the repair.
+    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y. The default is `"shot"`.
+    - `aligned`: whether to refine the initial map `"aligned"` as well, and to keep the better map; see
+      `jaxsmw.match`.
+
+    **Returns:** The `EdgeMap`.
+
+    **Raises:** `ArithmeticError` if refinement fails numerically.
+    """
+    prepared = prepare_pair(x, y, init)
+    starts = [prepared]
+    if aligned and init is None:
+        starts.append(prepared.started_from("aligned"))
+    return EdgeMap.of(match_prepared(prepared.pair, starts, preset, alternatives=False).correspondence)
+
+
+def compare_hands(x: PreparedShape, y: PreparedShape) -> Decision:
+    """Decide whether Y corresponds to X or to the mirror image of X; see `jaxsmw.repair.chirality.Hands`."""
+    return Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")

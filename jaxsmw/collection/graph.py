@@ -1,0 +1,103 @@
+"""The graph of a collection: which pairs of shapes are matched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from jaxsmw.collection.consistency import Edge
+from jaxsmw.collection.shapes import PreparedShape
+
+# Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
+_COMPARED_EIGENVALUES = 50
+
+
+def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N"]:
+    """Compute how much the shapes of a collection differ, without matching them.
+
+    The distance of two shapes is the root mean square of two parts, each divided by its median over all
+    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian (Reuter, Wolter,
+    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006), which hardly change with
+    the pose. The second part compares the second moments of the descriptors over the surface, which also
+    change with the pose.
+
+    **Arguments:**
+
+    - `shapes`: the N shapes. Without descriptors, only eigenvalues are compared.
+
+    **Returns:** The distances (N, N), symmetric, without unit, with a zero diagonal.
+    """
+    features = [[_log_eigenvalues(shape) for shape in shapes]]
+    if all(shape.spectrum.descriptors is not None for shape in shapes):
+        features.append([_moments(shape) for shape in shapes])
+    squared = np.zeros((len(shapes), len(shapes)))
+    for rows in features:
+        part = np.linalg.norm(np.array(rows)[:, None] - np.array(rows)[None], axis=2)
+        usual = np.median(part[~np.eye(len(shapes), dtype=bool)]) if len(shapes) > 1 else 1.0
+        squared += (part / max(usual, np.finfo(float).tiny)) ** 2 / len(features)
+    return np.sqrt(squared)
+
+
+def _log_eigenvalues(shape: PreparedShape) -> Float64[np.ndarray, " k"]:
+    values = np.asarray(shape.spectrum.eigenvalues, np.float64)[1 : _COMPARED_EIGENVALUES + 1]
+    # Several eigenvalues of a mesh with several components are zero.
+    return np.log(np.maximum(values, 1e-6 * values.max()))
+
+
+def _moments(shape: PreparedShape) -> Float64[np.ndarray, " q"]:
+    values = np.asarray(shape.spectrum.descriptors, np.float64)
+    areas = np.asarray(shape.spectrum.vertex_areas, np.float64)
+    return np.sqrt((areas / areas.sum()) @ values**2)
+
+
+def choose_edges(
+    distances: Float64[np.ndarray, "N N"],
+    *,
+    edges_per_shape: float = 4.0,
+    given: Sequence[Edge] = (),
+    seed: int = 0,
+) -> list[Edge]:
+    """Choose the pairs of a collection that are matched.
+
+    The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
+    Edges to the nearest neighbours of each shape form cycles. A quarter of the edges are random. Random edges
+    keep the paths between any two shapes short, and they contradict errors that all similar shapes share.
+
+    **Arguments:**
+
+    - `distances`: the distances of the shapes (N, N); see `shape_distances`.
+    - `edges_per_shape`: the number of edges divided by N. If there are fewer pairs, all pairs are chosen.
+    - `given`: edges that are already matched and are kept. If shapes were added to a collection, only edges
+      of these shapes are added.
+    - `seed`: the seed of the random edges.
+
+    **Returns:** The edges (i, j) with i < j, in ascending order.
+    """
+    number = len(distances)
+    chosen = {(min(edge), max(edge)) for edge in given}
+    known = {shape for edge in chosen for shape in edge}
+    wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]
+    new = number - len(known)
+    most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
+    added: set[Edge] = set()
+    # Distances of zero would be missing edges in a sparse graph.
+    tree = minimum_spanning_tree(np.triu(distances + 1e-9 * (1 + distances.max(initial=0)), 1)).tocoo()
+    added |= {
+        (min(i, j), max(i, j)) for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True)
+    } & set(wanted)
+    generator = np.random.default_rng(seed)
+    random = [wanted[row] for row in generator.permutation(len(wanted))]
+    for edge in random[: round(most / 4)]:
+        added.add(edge)
+    order = np.argsort(distances + np.diag(np.full(number, np.inf)), axis=1, kind="stable")
+    possible = set(wanted)
+    for rank in range(number - 1):
+        nearest = [(min(i, j), max(i, j)) for i, j in enumerate(order[:, rank].tolist())]
+        for edge in sorted(possible & set(nearest), key=lambda edge: distances[edge]):
+            if len(added) >= most:
+                break
+            added.add(edge)
+    return sorted(chosen | added)

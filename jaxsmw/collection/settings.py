@@ -1,0 +1,32 @@
+"""The settings of `match_collection`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxsmw.collection.synchronization import SynchronizationSettings
+
+
+@dataclass(frozen=True)
+class CollectionSettings:
+    """The settings of the graph and of the consistency of a collection.
+
+    Lengths are in units of the square root of the area of each shape. Table R25 is in
+    `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `edges_per_shape` (Table R25): the number of matched pairs divided by the number of shapes.
+    - `cycle_samples`: the number of samples of each shape at which cycles are compared.
+    - `contradicted_from` (Table R25): an edge contradicts the collection if the mean distance between its
+      maps and the maps through the template is at least this value. The edge is then matched again, from the
+      consistent map.
+    - `rounds`: the largest number of times that contradicted edges are matched again.
+    - `synchronization`: the settings of `synchronize`.
+    """
+
+    edges_per_shape: float = 4.0
+    cycle_samples: int = 200
+    contradicted_from: float = 0.05
+    rounds: int = 2
+    synchronization: SynchronizationSettings = SynchronizationSettings()  # noqa: RUF009 (immutable)

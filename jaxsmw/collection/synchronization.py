@@ -1,0 +1,242 @@
+"""Consistent maps from a template to all shapes of a collection, computed from the maps of a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Float64, Int64
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from jaxsmw.collection.consistency import Edge
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
+
+
+@dataclass(frozen=True)
+class SynchronizationSettings:
+    """The settings of `synchronize`. Lengths are in units of the square root of the area of each shape.
+
+    **Attributes:**
+
+    - `iterations` (Table R25): the number of averagings.
+    - `robust_scale` (Table R25): the distance at which a point has half of the weight of a point at distance
+      zero. Points of wrong maps are much farther away.
+    - `discontinuity_distance`: if the matches of the corners of a triangle are farther apart, a point inside
+      the triangle follows the match of the nearest corner instead of an average.
+    """
+
+    iterations: int = 5
+    robust_scale: float = 0.02
+    discontinuity_distance: float = 0.1
+
+
+def vertices_as_points(mesh: Mesh) -> SurfacePoints:
+    """Return all vertices of a mesh as n `SurfacePoints`, each at or next to its vertex."""
+    return nearest_surface_points(mesh.vertices, mesh)[0]
+
+
+def carry(
+    points: SurfacePoints,
+    mesh: Mesh,
+    images: Float64[np.ndarray, "n 3"],
+    discontinuity_distance: float,
+) -> Float64[np.ndarray, "p 3"]:
+    """Carry points on a mesh to another surface, by interpolation of the matches of the corners.
+
+    **Arguments:**
+
+    - `points`: p `SurfacePoints` on the mesh.
+    - `mesh`: the mesh (n vertices).
+    - `images`: the positions of the matches of the vertices on the other surface (n, 3).
+    - `discontinuity_distance`: the largest distance between matches that are averaged, in the unit of
+      `images`.
+
+    **Returns:** The positions (p, 3), in the unit of `images`, near to the other surface.
+    """
+    corners = images[mesh.faces[points.faces]]
+    main = np.take_along_axis(corners, points.weights.argmax(axis=1)[:, None, None], axis=1)
+    torn = np.linalg.norm(corners - main, axis=2).max(axis=1) > discontinuity_distance
+    return np.where(torn[:, None], main[:, 0], np.einsum("pk,pkx->px", points.weights, corners))
+
+
+def robust_mean(
+    candidates: Float[Array, "d n 3"],
+    weights: Float[Array, " d"],
+    start: Float[Array, "n 3"],
+    scale: Float[Array, ""],
+) -> Float[Array, "n 3"]:
+    """Average candidate positions of each point, such that distant candidates count little.
+
+    The weights are those of the Cauchy loss, which decrease with the squared distance from the current mean.
+    Five reweighted averages are computed. The function is traced JAX code.
+
+    **Arguments:**
+
+    - `candidates`: d candidate positions of each of n points (d, n, 3).
+    - `weights`: the weight of each of the d maps (d,).
+    - `start`: the first estimate of each position (n, 3).
+    - `scale`: the distance at which a candidate has half of its weight.
+
+    **Returns:** The means (n, 3).
+    """
+
+    def iterate(mean: Float[Array, "n 3"], _: None) -> tuple[Float[Array, "n 3"], None]:
+        squared = jnp.sum((candidates - mean) ** 2, axis=2)
+        share = weights[:, None] / (1 + squared / scale**2)
+        total = jnp.maximum(share.sum(axis=0), jnp.finfo(share.dtype).tiny)
+        return jnp.sum(share[:, :, None] * candidates, axis=0) / total[:, None], None
+
+    return lax.scan(iterate, start, length=5)[0]
+
+
+class Network:
+    """The shapes of a collection and the maps along the edges of its graph.
+
+    **Arguments:**
+
+    - `meshes`: the meshes of the N shapes.
+    - `maps`: for each edge, the maps in both directions: the key (i, j) has one `SurfacePoints` on mesh j for
+      every vertex of mesh i.
+    - `errors`: the estimated error of each edge, with the key (i, j) for i < j, in units of the square root
+      of the area.
+    - `settings`: the settings of the synchronisation.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        maps: Mapping[tuple[int, int], SurfacePoints],
+        errors: Mapping[Edge, float],
+        settings: SynchronizationSettings = SynchronizationSettings(),
+    ):
+        self.meshes, self.errors, self.settings = meshes, errors, settings
+        self.units = [mesh.area**0.5 for mesh in meshes]
+        self._images = {(i, j): points.positions(meshes[j]) for (i, j), points in maps.items()}
+        self._neighbors = [sorted(i for i, k in maps if k == j) for j in range(len(meshes))]
+        self._most = max(map(len, self._neighbors), default=0)
+
+    def error(self, i: int, j: int) -> float:
+        """Return the estimated error of the maps between shapes i and j."""
+        return self.errors[min(i, j), max(i, j)]
+
+    def lengths(self) -> csr_array:
+        """Return the errors of all edges as a symmetric sparse matrix (N, N)."""
+        rows, columns = zip(*self._images, strict=True) if self._images else ((), ())
+        # An error of zero would be a missing edge.
+        values = [max(self.error(i, j), 1e-6) for i, j in self._images]
+        return csr_array((values, (rows, columns)), shape=(len(self.meshes),) * 2)
+
+    def medoid(self) -> int:
+        """Return the shape with the smallest sum of errors along the best paths to all shapes."""
+        return int(np.argmin(dijkstra(self.lengths(), directed=False).sum(axis=1)))
+
+    def along_best_paths(self, template: int) -> list[SurfacePoints]:
+        """Map the vertices of the template to all shapes, each along the path with the smallest error.
+
+        **Returns:** For each shape, n `SurfacePoints` for the n vertices of the template.
+
+        **Raises:** `ValueError` if a shape has no path to the template.
+        """
+        lengths, before = dijkstra(self.lengths(), directed=False, indices=template, return_predecessors=True)
+        if not np.isfinite(lengths).all():
+            raise ValueError("the graph is not connected: add edges between its parts")
+        points: list[SurfacePoints | None] = [None] * len(self.meshes)
+        points[template] = vertices_as_points(self.meshes[template])
+        for shape in np.argsort(lengths, kind="stable").tolist():
+            if shape != template:
+                source = int(before[shape])
+                known = points[source]
+                assert known is not None
+                points[shape] = self._project(self.carried(known, source, shape), shape)
+        return [known for known in points if known is not None]
+
+    def carried(self, points: SurfacePoints, source: int, target: int) -> Float64[np.ndarray, "p 3"]:
+        """Carry points on shape `source` along an edge. Returns positions (p, 3) near to shape `target`."""
+        limit = self.settings.discontinuity_distance * self.units[target]
+        return carry(points, self.meshes[source], self._images[source, target], limit)
+
+    def averaged(self, points: Sequence[SurfacePoints], template: int) -> list[SurfacePoints]:
+        """Move the points on each shape to the robust mean of the points carried from its neighbours.
+
+        The points on the template stay.
+        """
+
+        def moved(shape: int) -> SurfacePoints:
+            if shape == template:
+                return points[shape]
+            unit, neighbors = self.units[shape], self._neighbors[shape]
+            weights = np.array([1 / max(self.error(i, shape), 1e-3) ** 2 for i in neighbors])
+            candidates = np.stack([self.carried(points[i], i, shape) for i in neighbors]) / unit
+            start = points[shape].positions(self.meshes[shape]) / unit
+            n, size = len(start), padded_size(len(start))
+            # Maps and vertices are padded, so that all shapes share one compiled program.
+            padding = ((0, self._most - len(neighbors)), (0, size - n), (0, 0))
+            found = compiled(robust_mean)(
+                jnp.asarray(np.pad(candidates, padding), jnp.float32),
+                jnp.asarray(pad_rows(weights / weights.max(), self._most), jnp.float32),
+                jnp.asarray(pad_rows(start, size), jnp.float32),
+                jnp.asarray(self.settings.robust_scale, jnp.float32),
+            )
+            return self._project(np.asarray(found, np.float64)[:n] * unit, shape)
+
+        return [moved(shape) for shape in range(len(self.meshes))]
+
+    def residual(self, points: Sequence[SurfacePoints], i: int, j: int) -> float:
+        """Return the mean distance of the map i -> j from the map through the template.
+
+        The distance is in units of the square root of the area of j. Distances above 0.5 count as 0.5.
+        """
+        offsets = self.carried(points[i], i, j) - points[j].positions(self.meshes[j])
+        return float(np.minimum(np.linalg.norm(offsets, axis=1) / self.units[j], 0.5).mean())
+
+    def _project(self, positions: Float64[np.ndarray, "p 3"], shape: int) -> SurfacePoints:
+        return nearest_surface_points(positions, self.meshes[shape])[0]
+
+
+def synchronize(network: Network, template: int) -> list[SurfacePoints]:
+    """Compute maps from the template to all shapes that agree with the maps of all edges.
+
+    The first maps follow the paths with the smallest errors. Each iteration then moves the points on a shape
+    to the robust mean of the points on its neighbours in the graph, carried along the edges. This is the
+    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
+
+    **Arguments:**
+
+    - `network`: the `Network` of shapes and maps.
+    - `template`: the number of the template.
+
+    **Returns:** For each shape, n `SurfacePoints` for the n vertices of the template.
+
+    **Raises:** `ValueError` if a shape has no path to the template.
+    """
+    points = network.along_best_paths(template)
+    for _ in range(network.settings.iterations):
+        points = network.averaged(points, template)
+    return points
+
+
+def vertex_map_between(
+    points_x: SurfacePoints, points_y: SurfacePoints, template: Mesh, mesh_x: Mesh, mesh_y: Mesh
+) -> Int64[np.ndarray, " m"]:
+    """Compute the vertex map X -> Y through the template.
+
+    **Arguments:**
+
+    - `points_x`, `points_y`: the points of the template's vertices on X and on Y.
+    - `template`: the template.
+    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
+
+    **Returns:** The map (m,), as 0-based vertices of Y.
+    """
+    registered = replace(template, vertices=points_x.positions(mesh_x))
+    on_template, _ = nearest_surface_points(mesh_x.vertices, registered)
+    images = on_template.positions(replace(template, vertices=points_y.positions(mesh_y)))
+    return nearest_surface_points(images, mesh_y)[0].nearest_corners(mesh_y)
