@@ -175,9 +175,8 @@ class Correspondence:
         Y receives the match of the nearest referenced vertex.
         """
         with self._precision():
-            found = compiled(reverse_map)(*self._last_stage())
-        found = np.asarray(found)[: len(self.mesh_y.vertices)].astype(np.int64)
-        return extend_to_unreferenced(self.mesh_y, found)
+            padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
+        return extend_to_unreferenced(self.mesh_y, padded[: len(self.mesh_y.vertices)].astype(np.int64))
 
     def _points_near(
         self,
@@ -515,6 +514,7 @@ def match_prepared(
     seconds: dict[str, float] | None = None,
     compiling: Sequence[Future[object]] = (),
     alternatives: bool = True,
+    refined: Sequence[Outcome | None] = (),
 ) -> Match:
     """Refine the initial maps of a prepared pair, and return the match with the smallest expected error.
 
@@ -529,6 +529,8 @@ def match_prepared(
     - `seconds`: a dictionary to which the times of the steps are added.
     - `compiling`: compilations in the background, which refinement waits for.
     - `alternatives`: whether repair tries alternative initial maps.
+    - `refined`: for each start, the outcome of all stages if the stages already ran; see
+      `jaxsmw.repair.batches`.
 
     **Returns:** The `Match`.
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jaxsmw.cli import benchmark, demo, evaluate, match, render, spectrum, transfer
+from jaxsmw.cli import benchmark, collection, demo, evaluate, match, render, spectrum, transfer
 from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import say, show
 
@@ -17,6 +17,7 @@ _COMMANDS = {
     "demo": demo,
     "match": match,
     "transfer": transfer,
+    "collection": collection,
     "evaluate": evaluate,
     "benchmark": benchmark,
     "spectrum": spectrum,

@@ -1,0 +1,6 @@
+"""Consistent maps between all shapes of a collection, and models of their shapes."""
+
+import lazy_loader
+
+# `__init__.pyi` lists the public names. A module is loaded when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Int64
 
+from jaxsmw.collection.pairs import refined_starts
 from jaxsmw.collection.shapes import PreparedShape, prepare_pair
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.matching import Correspondence, match_prepared
 from jaxsmw.pair import Pair
+from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
 from jaxsmw.repair.chirality import Decision, Hands
 
@@ -39,12 +42,14 @@ class EdgeMap:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> EdgeMap:
         """Return the maps that `arrays` describes."""
-        points = [
-            SurfacePoints(arrays[f"{name}_faces"].astype(np.int64), arrays[f"{name}_weights"].astype(float))
+        forward, backward = (
+            SurfacePoints(arrays[f"{name}_faces"].astype(np.int64), arrays[f"{name}_weights"])
             for name in ("forward", "backward")
-        ]
+        )
         expected, distortion, suspicious = arrays["scores"].tolist()
-        return cls(*points, expected, None if np.isnan(distortion) else distortion, bool(suspicious))
+        return cls(
+            forward, backward, expected, None if np.isnan(distortion) else distortion, bool(suspicious)
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the maps as arrays, for a file."""
@@ -69,36 +74,52 @@ class EdgeMap:
         )
 
 
-def match_edge(
-    x: PreparedShape,
-    y: PreparedShape,
-    preset: Preset,
-    *,
-    init: Int64[np.ndarray, " m"] | None = None,
-    aligned: bool = False,
-) -> EdgeMap:
-    """Match two shapes of a collection.
+@dataclass(frozen=True, eq=False)
+class EdgeTask:
+    """The match of an edge.
+
+    **Attributes:**
+
+    - `x`, `y`: the source X (m vertices) and the target Y, of the same hand.
+    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
+    - `aligned`: whether to refine the initial map `"aligned"` as well, and to keep the better map; see
+      `jaxsmw.match`.
+    """
+
+    x: PreparedShape
+    y: PreparedShape
+    init: Int64[np.ndarray, " m"] | None = None
+    aligned: bool = False
+
+    def starts(self) -> list[PreparedPair]:
+        """Return the prepared pair, once for each initial map."""
+        first = prepare_pair(self.x, self.y, self.init)
+        return [first, first.started_from("aligned")] if self.aligned and self.init is None else [first]
+
+
+def match_edges(
+    tasks: Iterable[EdgeTask], preset: Preset, devices: Sequence[jax.Device] | None = None
+) -> Iterator[EdgeMap | ArithmeticError]:
+    """Match the edges of a graph, in batches on accelerators; see `match_pairs`.
 
     A map that looks wrong is repaired, but no alternative initial maps are tried, because the maps of other
     edges provide a better initial map later.
 
     **Arguments:**
 
-    - `x`, `y`: the source X (m vertices) and the target Y, of the same hand.
+    - `tasks`: the edges.
     - `preset`: the stages and the repair.
-    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y. The default is `"shot"`.
-    - `aligned`: whether to refine the initial map `"aligned"` as well, and to keep the better map; see
-      `jaxsmw.match`.
+    - `devices`: the JAX devices. The default is all devices of the default backend.
 
-    **Returns:** The `EdgeMap`.
-
-    **Raises:** `ArithmeticError` if refinement fails numerically.
+    **Returns:** An iterator with one `EdgeMap` per edge, in the order of `tasks`; an `ArithmeticError` for an
+    edge whose refinement fails numerically.
     """
-    prepared = prepare_pair(x, y, init)
-    starts = [prepared]
-    if aligned and init is None:
-        starts.append(prepared.started_from("aligned"))
-    return EdgeMap.of(match_prepared(prepared.pair, starts, preset, alternatives=False).correspondence)
+    for starts, refined in refined_starts((task.starts() for task in tasks), preset, devices=devices):
+        try:
+            found = match_prepared(starts[0].pair, starts, preset, refined=refined, alternatives=False)
+            yield EdgeMap.of(found.correspondence)
+        except ArithmeticError as error:
+            yield error
 
 
 def compare_hands(x: PreparedShape, y: PreparedShape) -> Decision:

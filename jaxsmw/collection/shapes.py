@@ -12,7 +12,7 @@ from jaxtyping import Array, Int, Int64
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import DescriptorAxes, SampledPair, SampledShape, compared_samples
-from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.initial_maps.nearest import nearest_map
@@ -122,3 +122,32 @@ def prepare_pair(
 def descriptor_axes(shapes: Sequence[PreparedShape], preset: Preset) -> DescriptorAxes:
     """Compute the principal axes of the descriptors of all shapes; see `DescriptorAxes`."""
     return DescriptorAxes.of([shape.sampled for shape in shapes], preset.number_of_descriptors)
+
+
+def prepare_shapes(
+    meshes: Sequence[Mesh], preset: Preset
+) -> tuple[list[PreparedShape], Preset, DescriptorAxes | None]:
+    """Prepare all shapes of a collection, with descriptors along common axes.
+
+    **Arguments:**
+
+    - `meshes`: the meshes, each a `Mesh`.
+    - `preset`: the preset.
+
+    **Returns:** The prepared shapes, the preset adapted to the smallest mesh, and the axes of the
+    descriptors; None if the preset uses no descriptors.
+
+    **Raises:** `InputError` if a mesh cannot be used.
+    """
+    preset = fitted_preset(meshes, preset)
+    eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
+    shapes = [prepare_shape(mesh, preset, eigensolver=eigensolver) for mesh in meshes]
+    if not (shapes and preset.number_of_descriptors):
+        return shapes, preset, None
+    axes = descriptor_axes(shapes, preset)
+    return [describe_shape(shape, axes) for shape in shapes], preset, axes
+
+
+def fitted_preset(meshes: Sequence[Mesh], preset: Preset) -> Preset:
+    """Return the preset, adapted to the mesh with the fewest referenced vertices; see `Preset.fitted`."""
+    return preset.fitted(min((int(mesh.referenced_vertices.sum()) for mesh in meshes), default=0) or 1)

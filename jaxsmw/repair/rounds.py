@@ -29,6 +29,7 @@ def refine_in_stages(
     repair: RepairSettings | None = None,
     *,
     alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
+    refined: Outcome | None = None,
     history: bool = False,
 ) -> Outcome:
     """Refine the initial map of a pair by the given stages in order, and repair a map that looks wrong.
@@ -60,6 +61,8 @@ def refine_in_stages(
     - `alternatives`: alternative initial maps (m,), as an iterable that is consumed only if needed. By
       default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
       initial maps, there are no alternatives by default.
+    - `refined`: the outcome of all stages from the initial map, for example from `refine_batch`. By default,
+      the stages run first.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** An `Outcome` with padded maps. Refinement stops at the first stage that fails.
@@ -70,10 +73,10 @@ def refine_in_stages(
     runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
     first = prepared.padded_map(prepared.initial_map)
     if repair is None:
-        return runner.run(0, Outcome([], first))
+        return refined or runner.run(0, Outcome([], first))
     finest = max((of_x for of_x, _ in views), key=lambda of_x: of_x.eigenvalues.shape[0])
     repairer = _Repairer(runner, Judge(prepared.pair, finest, repair), repair)
-    best = repairer.finished(repairer.begun(first))
+    best = repairer.judge.judged(refined) if refined else repairer.finished(repairer.begun(first))
     if best.successful and best.suspicious:
         best = repairer.repaired(best)
     if not (best.successful and best.suspicious):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.collection.shape_model import ShapeModel, align, shape_model
+from jaxsmw.collection.shape_models import ShapeModel, align, shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creature import CREATURES, creature
 

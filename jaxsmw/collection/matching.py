@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -11,23 +13,31 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64
 
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import Edge, estimate_edge_errors
-from jaxsmw.collection.edges import EdgeMap, compare_hands, match_edge
+from jaxsmw.collection.edges import EdgeMap, EdgeTask, compare_hands, match_edges
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.hands import choose_hands
 from jaxsmw.collection.settings import CollectionSettings
-from jaxsmw.collection.shape_model import ShapeModel, shape_model
-from jaxsmw.collection.shapes import PreparedShape, describe_shape, descriptor_axes, prepare_shape
+from jaxsmw.collection.shape_models import ShapeModel, shape_model
+from jaxsmw.collection.shapes import (
+    PreparedShape,
+    describe_shape,
+    descriptor_axes,
+    fitted_preset,
+    prepare_shape,
+)
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
 from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
 from jaxsmw.runtime.cache import Store
@@ -86,9 +96,9 @@ class Collection:
     - `meshes`: the meshes of the N shapes.
     - `template`: the number of the template, which has n vertices.
     - `points`: for each shape, the point of every vertex of the template, n `SurfacePoints` on its mesh.
-    - `mirrored`: a mask (N,), True for shapes of the other hand, whose mirror images were matched.
-    - `registered`: for each shape, the `RegisteredMesh` of the template on the shape; on the mirror image if
-      the shape is mirrored.
+    - `mirrored`: a mask (N,), True for shapes of the other hand, such as right teeth among left teeth. Their
+      mirror images were matched. All points and positions belong to the meshes themselves.
+    - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
     - `axes`: the axes of the descriptors, or None.
     - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
@@ -117,18 +127,28 @@ class Collection:
         """The names of the shapes."""
         return tuple(mesh.name for mesh in self.meshes)
 
-    def vertices(self, shape: int) -> Float64[np.ndarray, "n 3"]:
-        """Return the positions of the template's vertices on a shape (n, 3), in the shape's coordinates."""
-        found = self.registered[shape].vertices
-        return found * np.array([-1.0, 1.0, 1.0]) if self.mirrored[shape] else found
+    def sentences(self) -> tuple[str, ...]:
+        """Return sentences about the template, the graph, its decisions, the hands and the missing meshes."""
+        decisions = Counter(edge.decision for edge in self.edges)
+        found = [
+            f"{len(self.meshes)} shapes, {len(self.edges)} matched pairs; the template is "
+            f"{self.names[self.template]}.",
+            f"{decisions['kept']} maps agree with the others, {decisions['replaced']} were wrong and were "
+            f"replaced, {decisions['contradicted']} still contradict the others and hardly count.",
+        ]
+        if self.mirrored.any():
+            names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
+            found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
+        found += [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
+        return tuple(found)
 
     def from_template(self, shape: int) -> Int64[np.ndarray, " n"]:
         """Return the map from the template (n,) to a shape, as 0-based vertices of the shape."""
-        return self.registered[shape].surface_points.nearest_corners(self.registered[shape].mesh_y)
+        return self.registered[shape].surface_points.nearest_corners(self.meshes[shape])
 
     def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
         """Return the map from a shape (m,) to the template, as 0-based vertices of the template."""
-        return self.registered[shape].points_of_target.nearest_corners(self.registered[shape].mesh_x)
+        return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
 
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
         """Return the map from one shape (m,) to another through the template, as 0-based vertices.
@@ -137,21 +157,32 @@ class Collection:
         the rounding to vertices.
         """
         images = self.registered[target].carry(self.registered[source].points_of_target)
-        mesh = self.registered[target].mesh_y
-        from jaxsmw.geometry.surface_distance import nearest_surface_points
-
+        mesh = self.meshes[target]
         return nearest_surface_points(images, mesh)[0].nearest_corners(mesh)
 
-    def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
-        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
+    def registered_mesh(self, source: int, target: int) -> RegisteredMesh:
+        """Register one shape on another, by the map through the template; see `register_mesh`.
 
-        Shapes of the other hand enter as their mirror images.
+        With the registered mesh, `jaxsmw.transfer` transfers landmarks and attributes from `source` to
+        `target`.
         """
-        template = self.meshes[self.template]
+        if source == self.template:
+            return self.registered[target]
+        images = self.registered[target].carry(self.registered[source].points_of_target)
+        points, _ = nearest_surface_points(images, self.meshes[target])
+        return register_mesh(self.meshes[source], self.meshes[target], points)
+
+    def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
+        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_models`.
+
+        If a shape is of the other hand than the template, its mirror image enters the model.
+        """
+        other_hand = self.mirrored != self.mirrored[self.template]
+        signs = np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
         return shape_model(
-            [one.vertices for one in self.registered],
+            [one.vertices * sign for one, sign in zip(self.registered, signs, strict=True)],
             scale=scale,
-            weights=template.vertex_areas,
+            weights=self.meshes[self.template].vertex_areas,
             reference=self.template,
             number_of_modes=number_of_modes,
         )
@@ -169,6 +200,7 @@ def match_collection(
     seed: int = 0,
     directory: Path | None = None,
     executor: Executor | None = None,
+    devices: Sequence[jax.Device] | None = None,
     progress: Progress | None = None,
 ) -> Collection:
     """Match all shapes of a collection, such that the maps of all pairs agree.
@@ -193,7 +225,8 @@ def match_collection(
     - `directory`: an existing directory in which finished steps are kept. A second call with the same
       directory continues an interrupted call. If meshes are added, only their own edges are matched.
     - `executor`: an executor that matches edges, for example `jaxsmw.runtime.workers.open_executor`. By
-      default, edges are matched one after another in this process.
+      default, edges are matched in this process.
+    - `devices`: the JAX devices that match edges in this process, by default all; see `match_pairs`.
     - `progress`: a function that is called after each part of a step with the name of the step, the number of
       finished parts, and the number of parts.
 
@@ -202,7 +235,7 @@ def match_collection(
     **Raises:** `InputError` if fewer than two meshes can be matched, or if the template is left out.
     """
     given = [_as_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
-    return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, progress).run(
+    return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, devices, progress).run(
         template, mirror, stiffness
     )
 
@@ -214,7 +247,7 @@ def _as_mesh(mesh: Mesh | MeshLike, number: int, names: Sequence[str] | None) ->
     return mesh if names is None else replace(mesh, name=name)
 
 
-class _EdgeTask(NamedTuple):
+class _StoredTask(NamedTuple):
     """The match of an edge in a worker, which reads both shapes from a store."""
 
     directory: Path
@@ -233,9 +266,12 @@ def _stored_shape(directory: Path, key: tuple[Any, ...], name: str) -> PreparedS
     return PreparedShape.from_arrays(arrays, name)
 
 
-def _match_stored(task: _EdgeTask) -> EdgeMap:
+def _match_stored(task: _StoredTask) -> EdgeMap:
     x, y = (_stored_shape(task.directory, key, name) for key, name in zip(task.keys, task.names, strict=True))
-    return match_edge(x, y, task.preset, init=task.init, aligned=task.aligned)
+    (found,) = match_edges([EdgeTask(x, y, task.init, task.aligned)], task.preset, jax.devices()[:1])
+    if isinstance(found, ArithmeticError):
+        raise found
+    return found
 
 
 class _Matcher:
@@ -249,11 +285,13 @@ class _Matcher:
         seed: int,
         directory: Path | None,
         executor: Executor | None,
+        devices: Sequence[jax.Device] | None,
         progress: Progress | None,
     ):
         self.given, self.preset, self.settings, self.seed = list(meshes), preset, settings, seed
         self.store = None if directory is None else Store(directory)
-        self.executor, self.progress = executor, progress or (lambda *_: None)
+        self.executor, self.devices = executor, devices
+        self.progress = progress or (lambda *_: None)
         self.left_out: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
 
@@ -298,11 +336,19 @@ class _Matcher:
                 self.maps |= better
                 replaced |= set(better)
                 network, chosen, points = self._synchronize(template)
-        with timed("registered meshes", self.seconds):
-            registered = self._register(chosen, points, stiffness)
         found = [self._describe_edge(edge, network, points, replaced) for edge in edges]
+        meshes = [self.given[number] for number in kept]
+        # The mirror image of a mesh has the same faces, with the corners in reverse order.
+        points = [
+            SurfacePoints(of_shape.faces, np.ascontiguousarray(of_shape.weights[:, ::-1]))
+            if other
+            else of_shape
+            for of_shape, other in zip(points, mirrored, strict=True)
+        ]
+        with timed("registered meshes", self.seconds):
+            registered = self._register(meshes, chosen, points, stiffness)
         return Collection(
-            meshes=tuple(self.given[number] for number in kept),
+            meshes=tuple(meshes),
             template=chosen,
             points=tuple(points),
             mirrored=mirrored,
@@ -320,8 +366,7 @@ class _Matcher:
 
     def _prepare(self) -> list[int]:
         """Prepare all shapes, and return the numbers of the shapes that can be matched."""
-        fewest = min((int(mesh.referenced_vertices.sum()) for mesh in self.given), default=0)
-        self.preset = self.preset.fitted(max(fewest, 4))
+        self.preset = fitted_preset(self.given, self.preset)
         eigensolver = choose_eigensolver(*self.given) if self.given else "exact"
         self.shapes: list[PreparedShape] = []
         kept = []
@@ -453,23 +498,17 @@ class _Matcher:
         self, inits: Mapping[Edge, Int64[np.ndarray, " m"] | None]
     ) -> Iterator[tuple[Edge, EdgeMap | BaseException]]:
         if self.executor is None:
-            for (i, j), init in inits.items():
-                try:
-                    yield (
-                        (i, j),
-                        match_edge(
-                            self.shapes[i], self.shapes[j], self.preset, init=init, aligned=self.aligned
-                        ),
-                    )
-                except (InputError, ArithmeticError) as error:
-                    yield (i, j), error
+            tasks = (
+                EdgeTask(self.shapes[i], self.shapes[j], init, self.aligned) for (i, j), init in inits.items()
+            )
+            yield from zip(inits, match_edges(tasks, self.preset, self.devices), strict=True)
             return
         with TemporaryDirectory() as temporary:
             store = self.store or Store(Path(temporary))
             keys = self._save_shapes(store, inits)
             edges = {f"{i} {j}": (i, j) for i, j in inits}
-            tasks = {
-                name: _EdgeTask(
+            stored = {
+                name: _StoredTask(
                     store.directory.resolve(),
                     (keys[i], keys[j]),
                     (self.meshes[i].name, self.meshes[j].name),
@@ -479,14 +518,12 @@ class _Matcher:
                 )
                 for name, (i, j) in edges.items()
             }
-            for name, found in run_tasks(_match_stored, tasks, self.executor):
+            for name, found in run_tasks(_match_stored, stored, self.executor):
                 yield edges[name], found
 
     def _save_shapes(self, store: Store, edges: Iterable[Edge]) -> dict[int, tuple[str, ...]]:
         """Save the prepared shapes of edges for workers, and return their keys."""
-        import hashlib
-
-        keys = {}
+        keys: dict[int, tuple[str, ...]] = {}
         for number in sorted({shape for edge in edges for shape in edge}):
             arrays = self.shapes[number].arrays()
             digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays.values()))
@@ -563,11 +600,11 @@ class _Matcher:
         return better
 
     def _register(
-        self, template: int, points: Sequence[SurfacePoints], stiffness: float
+        self, meshes: Sequence[Mesh], template: int, points: Sequence[SurfacePoints], stiffness: float
     ) -> list[RegisteredMesh]:
         registered = []
-        for number, (mesh, known) in enumerate(zip(self.meshes, points, strict=True)):
-            registered.append(register_mesh(self.meshes[template], mesh, known, stiffness=stiffness))
+        for number, (mesh, known) in enumerate(zip(meshes, points, strict=True)):
+            registered.append(register_mesh(meshes[template], mesh, known, stiffness=stiffness))
             self.progress("registered meshes", number + 1, len(points))
         return registered
 

@@ -1,0 +1,430 @@
+"""`jaxsmw collection`: match all meshes of a directory consistently."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from jaxsmw.choices import DEFAULT_PRESET, PresetName
+from jaxsmw.cli.arguments import add_weld, path, refuse_without, whole_number
+from jaxsmw.cli.console import Stopwatch, report_progress, say, show
+from jaxsmw.cli.interruption import announce_consequence, quiet_children
+from jaxsmw.cli.outputs import check_outputs
+from jaxsmw.errors import InputError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from jaxsmw.collection import Collection
+    from jaxsmw.collection.shape_models import ShapeModel
+    from jaxsmw.io.landmarks import Landmarks
+    from jaxsmw.io.mesh_data import MeshData
+
+HELP = "match all meshes of a directory consistently; register a template on each; compute a shape model"
+
+_MirrorCollection = Literal["auto", "no"]
+# More edges cost time, but hardly improve the maps. (Table R25 of docs/research_log.md)
+_MOST_EDGES = 6
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument(
+        "directory",
+        metavar="DIRECTORY",
+        type=path,
+        help="directory with meshes of the same kind of body, each in a file of its own. Meshes that cannot "
+        "be read or matched are named and left out",
+    )
+    parser.add_argument(
+        "--output",
+        metavar="DIR",
+        type=path,
+        required=True,
+        help="directory for the results. An interrupted run is continued by the same command. If meshes are "
+        "added to DIRECTORY, the same command matches only their own pairs",
+    )
+    parser.add_argument(
+        "--template",
+        metavar="FILE",
+        type=path,
+        help="mesh of DIRECTORY whose triangulation all meshes receive (default: the mesh that is most "
+        "similar to all others)",
+    )
+    parser.add_argument(
+        "--preset",
+        choices=get_args(PresetName),
+        default=DEFAULT_PRESET,
+        help="method of refinement, as for match (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--mirror",
+        choices=get_args(_MirrorCollection),
+        default="auto",
+        help="auto finds meshes of opposite hands, such as left and right teeth, and matches their mirror "
+        "images; no matches all meshes as they are (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--edges",
+        metavar="N",
+        type=whole_number(1, _MOST_EDGES),
+        help=f"number of matched pairs divided by the number of meshes, at most {_MOST_EDGES} (default: 4)",
+    )
+    parser.add_argument(
+        "--scale",
+        action="store_true",
+        help="remove differences in size from the shape model (default: keep sizes)",
+    )
+    parser.add_argument(
+        "--modes", metavar="N", type=whole_number(1), help="largest number of modes (default: all modes)"
+    )
+    parser.add_argument(
+        "--suffix",
+        metavar="SUFFIX",
+        default=".ply",
+        help="suffix of the written meshes, which determines their format (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--landmarks",
+        metavar="FILE",
+        type=path,
+        help="landmarks on one mesh, which are transferred to all meshes, in the formats of transfer "
+        "--landmarks",
+    )
+    parser.add_argument(
+        "--landmarks-of",
+        metavar="FILE",
+        type=path,
+        help="mesh of DIRECTORY to which the landmarks belong (default: the mesh with the name of the "
+        "landmark file)",
+    )
+    parser.add_argument(
+        "--attributes-of",
+        metavar="FILE",
+        type=path,
+        help="mesh of DIRECTORY whose colours, labels, texture coordinates and other attributes are "
+        "transferred to all meshes",
+    )
+    parser.add_argument(
+        "--seed",
+        type=whole_number(0),
+        default=0,
+        help="seed of the random pairs (default: %(default)s)",
+    )
+    processes = parser.add_mutually_exclusive_group()
+    processes.add_argument(
+        "--workers",
+        metavar="N",
+        type=whole_number(1),
+        help="number of worker processes that match pairs, each on one core (default: this process alone)",
+    )
+    processes.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers match the pairs"
+    )
+    add_weld(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Match all meshes of a directory, and write maps, registered meshes, the shape model and a page.
+
+    **Raises:** `InputError` if an option or the directory cannot be used, or if fewer than two meshes can be
+    matched. `ArithmeticError` if a computation fails.
+    """
+    stopwatch = Stopwatch()
+    with stopwatch.step("loading"):
+        files = _mesh_files(options.directory)
+        _check(options, files)
+        from jaxsmw.runtime.files import make_directory
+        from jaxsmw.runtime.journal import claimed_directory
+    with stopwatch.step("reading"):
+        data, unreadable = _read(files, weld=options.weld)
+        landmarks = _read_landmarks(options)
+    if options.template and Path(options.template).name not in data:
+        raise InputError(f"{options.template}: the template cannot be used: choose another template.")
+    directory = make_directory(options.output)
+    work = make_directory(directory / "work")
+    announce_consequence(
+        f"finished pairs are kept in {options.output}, and the same command continues from there"
+    )
+    with claimed_directory(directory, _provenance(options)), _executor(options) as executor:
+        collection = _match(options, data, work, executor)
+        collection.left_out.update(unreadable)
+        stopwatch.add(collection.seconds)
+        with stopwatch.step("shape model"):
+            model = collection.shape_model(scale=options.scale, number_of_modes=options.modes)
+            measures = _measures(model)
+        with stopwatch.step("writing"):
+            _write(options, collection, data, landmarks, model, measures, directory)
+    _show(collection, measures)
+    show(f"time: {stopwatch.summary()} (compilation included)")
+    report_progress(f"the results are in {options.output}")
+
+
+def _mesh_files(directory: str) -> dict[str, Path]:
+    """Return the mesh files of a directory: a dictionary from file names to paths, in natural order.
+
+    **Raises:** `InputError` if the directory cannot be read, or contains fewer than two mesh files.
+    """
+    from jaxsmw.io.mesh_data import MESH_SUFFIXES
+
+    try:
+        found = sorted(
+            entry.name
+            for entry in os.scandir(directory)
+            if entry.is_file() and entry.name.lower().endswith(MESH_SUFFIXES)
+        )
+    except OSError as error:
+        raise InputError(
+            f"{directory}: cannot be read as a directory ({error.strerror}): give a directory with meshes."
+        ) from error
+    if len(found) < 2:
+        raise InputError(
+            f"{directory}: contains {len(found)} mesh files, but a collection needs at least two: give a "
+            f"directory with meshes ({', '.join(MESH_SUFFIXES)})."
+        )
+    return {name: Path(directory) / name for name in found}
+
+
+def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
+    """Check the options and the output directory before the long computation."""
+    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.mesh_data import check_mesh_suffix
+
+    refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
+    check_mesh_suffix(f"mesh{options.suffix}")
+    if options.suffix.count(".") != 1 or "/" in options.suffix:
+        raise InputError(f"--suffix: {options.suffix!r} is not a suffix: give for example .ply or .obj.")
+    for option in ("template", "landmarks_of", "attributes_of"):
+        file = getattr(options, option)
+        if file and not (Path(file).name in files and _same(file, files[Path(file).name])):
+            raise InputError(
+                f"--{option.replace('_', '-')}: {file} is not a mesh file in {options.directory}: give the "
+                "path of one of its files."
+            )
+    if options.landmarks:
+        check_readable_suffix(options.landmarks)
+        check_landmark_suffix(f"landmarks{_landmark_suffix(options.landmarks)}")
+        options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, files)
+    check_outputs(
+        [*map(str, files.values()), options.landmarks],
+        directories=[(options.output, ("collection.json", "index.html", "modes.npz", "scores.csv"))],
+    )
+    if _same(options.output, Path(options.directory)):
+        raise InputError(
+            f"{options.output}: is the directory of the meshes: choose another directory for the results."
+        )
+
+
+def _same(file: str, other: Path) -> bool:
+    return os.path.realpath(file) == os.path.realpath(other)
+
+
+def _landmark_suffix(file: str) -> str:
+    """Return the suffix with which transferred landmarks are written."""
+    name = Path(file).name.lower()
+    if name.endswith(".mps"):
+        return ".csv"
+    return ".mrk.json" if name.endswith(".mrk.json") else Path(name).suffix
+
+
+def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
+    """Return the mesh file with the name of a landmark file.
+
+    **Raises:** `InputError` if there is not exactly one such mesh.
+    """
+    stem = Path(landmarks).name[: -len(_landmark_suffix(landmarks))]
+    found = [str(file) for name, file in files.items() if Path(name).stem == stem]
+    if len(found) != 1:
+        raise InputError(
+            f"{landmarks}: no single mesh is named {stem}: give --landmarks-of FILE, the mesh with these "
+            "landmarks."
+        )
+    return found[0]
+
+
+def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData], dict[str, str]]:
+    """Read all meshes.
+
+    **Returns:** A dictionary from file names to meshes, and a dictionary from the names of unreadable files
+    to the reasons.
+
+    **Raises:** `InputError` if fewer than two meshes can be read.
+    """
+    from jaxsmw.io.mesh_data import read_mesh_data
+
+    data, unreadable = {}, {}
+    for name, file in files.items():
+        try:
+            data[name] = read_mesh_data(file, weld=weld)
+        except InputError as error:
+            unreadable[name] = str(error)
+            say(f"{name} is left out: {error}")
+    if len(data) < 2:
+        raise InputError(f"only {len(data)} of {len(files)} meshes can be read: a collection needs two.")
+    return data, unreadable
+
+
+def _read_landmarks(options: argparse.Namespace) -> Landmarks | None:
+    if not options.landmarks:
+        return None
+    from jaxsmw.io.landmark_files import read_landmark_file
+
+    return read_landmark_file(options.landmarks)
+
+
+@contextmanager
+def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
+    from jaxsmw.runtime.workers import open_executor
+
+    if not (options.workers or options.scheduler):
+        with nullcontext():
+            yield None
+        return
+    with quiet_children(), open_executor(options.workers or 1, options.scheduler) as executor:
+        yield executor
+
+
+def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Return the settings and versions that all runs with the same output must share."""
+    from jaxsmw.runtime.provenance import code_digest, measured_code, versions
+
+    settings = {name: getattr(options, name) for name in ("preset", "mirror", "edges", "weld", "seed")}
+    return {"settings": settings, "versions": versions() | {"code": code_digest(measured_code())}}
+
+
+def _names(data: Mapping[str, MeshData]) -> list[str]:
+    """Return the file names without suffix, unless two of these names are equal."""
+    stems = [Path(name).stem for name in data]
+    return stems if len(set(stems)) == len(stems) else [name.replace(".", "_") for name in data]
+
+
+def _match(
+    options: argparse.Namespace, data: Mapping[str, MeshData], work: Path, executor: Executor | None
+) -> Collection:
+    from tqdm import tqdm
+
+    from jaxsmw.collection.matching import match_collection
+    from jaxsmw.collection.settings import CollectionSettings
+
+    settings = CollectionSettings()
+    if options.edges:
+        settings = CollectionSettings(edges_per_shape=float(options.edges))
+    bars: dict[str, tqdm] = {}
+
+    def progress(step: str, done: int, number: int) -> None:
+        if step not in bars:
+            bars[step] = tqdm(total=number, desc=step, disable=options.quiet, smoothing=0)
+        bars[step].total = number
+        bars[step].update(done - bars[step].n)
+        if done == number:
+            bars.pop(step).close()
+
+    return match_collection(
+        [one.mesh for one in data.values()],
+        names=_names(data),
+        preset=options.preset,
+        template=None if options.template is None else list(data).index(Path(options.template).name),
+        mirror=options.mirror == "auto",
+        settings=settings,
+        seed=options.seed,
+        directory=work,
+        executor=executor,
+        progress=progress,
+    )
+
+
+def _measures(model: ShapeModel) -> dict[str, Any]:
+    """Return the variances and the figures of merit of a shape model, for `collection.json`."""
+    count, modes = len(model.scores), len(model.modes)
+    numbers = [number for number in _REPORTED_MODES if number <= min(modes, count - 2)]
+    found: dict[str, Any] = {
+        "variances": model.variances.tolist(),
+        "compactness": model.compactness().tolist(),
+        "numbers_of_modes": numbers,
+    }
+    if numbers:
+        for name, curve in (
+            ("generalisation", model.generalisation(numbers)),
+            ("specificity", model.specificity(numbers)),
+        ):
+            found[name] = {"mean": curve.mean.tolist(), "standard_error": curve.standard_error.tolist()}
+    return found
+
+
+# Generalisation and specificity are reported for these numbers of modes, as far as the model has them.
+_REPORTED_MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
+
+
+def _write(
+    options: argparse.Namespace,
+    collection: Collection,
+    data: Mapping[str, MeshData],
+    landmarks: Landmarks | None,
+    model: ShapeModel,
+    measures: Mapping[str, Any],
+    directory: Path,
+) -> None:
+    from jaxsmw.collection.files import (
+        write_attributes,
+        write_landmarks,
+        write_maps,
+        write_model,
+        write_registered,
+        write_summary,
+    )
+    from jaxsmw.report.collection_page import PageEdge, write_collection_page
+    from jaxsmw.runtime.provenance import machine
+
+    by_name = dict(zip(_names(data), data.values(), strict=True))
+    kept = [by_name[name] for name in collection.names]
+    write_maps(collection, directory)
+    write_registered(collection, kept[collection.template], directory, options.suffix)
+    write_model(collection, model, directory, options.suffix)
+    if landmarks is not None:
+        source = _number(collection, options.landmarks_of, "the mesh with the landmarks")
+        write_landmarks(collection, source, landmarks, directory, _landmark_suffix(options.landmarks))
+    if options.attributes_of:
+        source = _number(collection, options.attributes_of, "the mesh with the attributes")
+        write_attributes(collection, source, kept, directory, options.suffix)
+    write_summary(collection, measures, directory, {**_provenance(options), "machine": machine()})
+    template = collection.meshes[collection.template]
+    write_collection_page(
+        directory / "index.html",
+        names=collection.names,
+        faces=template.faces,
+        registered=[one.vertices for one in collection.registered],
+        template=collection.template,
+        edges=[
+            PageEdge(
+                edge.source,
+                edge.target,
+                1e3 * edge.expected_error,
+                edge.decision == "contradicted",
+                edge.sentence(collection.names),
+            )
+            for edge in collection.edges
+        ],
+        model=model,
+        title=f"Collection {Path(options.directory).resolve().name}",
+        notes=collection.sentences(),
+        left_out=collection.left_out,
+    )
+
+
+def _number(collection: Collection, file: str, what: str) -> int:
+    for name in (Path(file).stem, Path(file).name.replace(".", "_")):
+        if name in collection.names:
+            return collection.names.index(name)
+    raise InputError(f"{file}: {what} was left out of the collection: choose another mesh.")
+
+
+def _show(collection: Collection, measures: Mapping[str, Any]) -> None:
+    for sentence in collection.sentences():
+        show(sentence)
+    if shares := measures["compactness"]:
+        first = ", ".join(f"{share:.0%}" for share in shares[:3])
+        show(f"shape model: {len(shares)} modes; the first modes together have {first} of the variance.")

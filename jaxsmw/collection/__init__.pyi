@@ -1,0 +1,30 @@
+from .consistency import edge_errors
+from .graph import choose_edges, shape_distances
+from .hands import choose_hands
+from .matching import Collection, MatchedEdge, match_collection
+from .pairs import match_pairs
+from .settings import CollectionSettings
+from .shape_models import Alignment, ShapeModel, align, shape_model
+from .shapes import PreparedShape, prepare_shapes
+from .synchronization import Network, SynchronizationSettings, synchronize
+
+__all__ = [
+    "Alignment",
+    "Collection",
+    "CollectionSettings",
+    "MatchedEdge",
+    "Network",
+    "PreparedShape",
+    "ShapeModel",
+    "SynchronizationSettings",
+    "align",
+    "choose_edges",
+    "choose_hands",
+    "edge_errors",
+    "match_collection",
+    "match_pairs",
+    "prepare_shapes",
+    "shape_distances",
+    "shape_model",
+    "synchronize",
+]

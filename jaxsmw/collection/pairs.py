@@ -1,0 +1,116 @@
+"""The function `match_pairs`, which matches any pairs of several shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import jax
+
+from jaxsmw.choices import DEFAULT_PRESET
+from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.matching import Correspondence, match_prepared
+from jaxsmw.preparation import PreparedPair
+from jaxsmw.presets import Preset, PresetName, choose_preset
+from jaxsmw.repair.batches import refine_batch
+from jaxsmw.repair.outcome import Outcome
+
+# The number of pairs per device that are refined before their maps are judged and repaired.
+_PAIRS_PER_DEVICE = 64
+
+
+def match_pairs(
+    meshes: Sequence[Mesh | MeshLike],
+    pairs: Sequence[tuple[int, int]],
+    *,
+    preset: PresetName | Preset = DEFAULT_PRESET,
+    alternatives: bool = True,
+    batch_size: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Iterator[tuple[int, Correspondence]]:
+    """Match any pairs of several full shapes.
+
+    Spectra, descriptors and samples are computed once per shape. All shapes are described along the same axes
+    (`DescriptorAxes`), so that a map can differ slightly from the map of `match`. Accelerators, and several
+    devices, refine pairs in batches (`jaxsmw.refine_pairs`); one CPU refines one pair after another. Only
+    maps that look wrong are repaired. Mirror images are not considered.
+
+    **Arguments:**
+
+    - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts.
+    - `pairs`: the number of the source X and of the target Y of each pair.
+    - `preset`: the name of a preset, or a `Preset`; see `match`.
+    - `alternatives`: whether repair tries alternative initial maps.
+    - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
+    - `devices`: the JAX devices. The default is all devices of the default backend.
+
+    **Returns:** An iterator over tuples: the number of a pair in `pairs`, and its `Correspondence`.
+
+    **Raises:** `InputError` if a mesh cannot be used or a pair names no shape. While the iterator runs,
+    `ArithmeticError` if the refinement of a pair fails numerically.
+    """
+    given = [
+        mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=f"mesh {number}")
+        for number, mesh in enumerate(meshes)
+    ]
+    for number, pair in enumerate(pairs):
+        if len(pair) != 2 or not all(0 <= shape < len(given) for shape in pair):
+            raise InputError(
+                f"pair {number} is {tuple(pair)}, but there are {len(given)} meshes: give the numbers of two "
+                "meshes, counted from 0."
+            )
+    shapes, fitted, _ = prepare_shapes(given, choose_preset(preset))
+
+    def results() -> Iterator[tuple[int, Correspondence]]:
+        prepared = (([prepare_pair(shapes[i], shapes[j])]) for i, j in pairs)
+        for number, (starts, refined) in enumerate(
+            refined_starts(prepared, fitted, batch_size=batch_size, devices=devices)
+        ):
+            pair = starts[0].pair
+            found = match_prepared(pair, starts, fitted, refined=refined, alternatives=alternatives)
+            yield number, found.correspondence
+
+    return results()
+
+
+def refined_starts(
+    starts: Iterator[list[PreparedPair]],
+    preset: Preset,
+    *,
+    batch_size: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Iterator[tuple[list[PreparedPair], list[Outcome]]]:
+    """Refine the initial maps of many pairs in batches, if batches save time on the given devices.
+
+    **Arguments:**
+
+    - `starts`: for each pair, the prepared pair with one or several initial maps.
+    - `preset`: the preset, whose stages run.
+    - `batch_size`, `devices`: see `refine_pairs`.
+
+    **Returns:** An iterator over the pairs, in the given order: the prepared pairs and their outcomes before
+    repair. On one CPU there are no outcomes, because `match_prepared` then runs the stages itself.
+    """
+    devices = jax.devices() if devices is None else devices
+    if len(devices) == 1 and devices[0].platform == "cpu" and batch_size is None:
+        for one in starts:
+            yield one, []
+        return
+    waiting: list[list[PreparedPair]] = []
+
+    def refined() -> Iterator[tuple[list[PreparedPair], list[Outcome]]]:
+        flat = [start for one in waiting for start in one]
+        described = flat[0].spectrum_x.descriptors is not None
+        stages = (preset if described else preset.without_descriptors()).stages
+        outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))
+        for one in waiting:
+            yield one, [next(outcomes) for _ in one]
+
+    for one in starts:
+        waiting.append(one)
+        if len(waiting) == _PAIRS_PER_DEVICE * len(devices):
+            yield from refined()
+            waiting.clear()
+    if waiting:
+        yield from refined()
