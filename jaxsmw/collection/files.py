@@ -162,6 +162,10 @@ def write_summary(
             }
             for edge in collection.edges
         ],
+        "cycle_error": {
+            name: float(errors.mean()) if len(errors) else None
+            for name, errors in zip(("first", "final"), collection.cycle_errors or (), strict=False)
+        },
         "shape_model": measures,
         "seconds": collection.seconds,
         "provenance": provenance,

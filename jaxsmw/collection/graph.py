@@ -56,20 +56,21 @@ def _moments(shape: PreparedShape) -> Float64[np.ndarray, " q"]:
 def choose_edges(
     distances: Float64[np.ndarray, "N N"],
     *,
-    edges_per_shape: float = 4.0,
+    edges_per_shape: float | int = 4,
+    random_share: float = 0.25,
     given: Sequence[Edge] = (),
     seed: int = 0,
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched.
 
     The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
-    Edges to the nearest neighbours of each shape form cycles. A quarter of the edges are random. Random edges
-    keep the paths between any two shapes short, and they contradict errors that all similar shapes share.
+    Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep the paths between any two shapes short, and they contradict errors that all similar shapes share.
 
     **Arguments:**
 
     - `distances`: the distances of the shapes (N, N); see `shape_distances`.
     - `edges_per_shape`: the number of edges divided by N. If there are fewer pairs, all pairs are chosen.
+    - `random_share`: the share of random edges.
     - `given`: edges that are already matched and are kept. If shapes were added to a collection, only edges
       of these shapes are added.
     - `seed`: the seed of the random edges.
@@ -90,8 +91,7 @@ def choose_edges(
     } & set(wanted)
     generator = np.random.default_rng(seed)
     random = [wanted[row] for row in generator.permutation(len(wanted))]
-    for edge in random[: round(most / 4)]:
-        added.add(edge)
+    added |= set(random[: round(random_share * most)])
     order = np.argsort(distances + np.diag(np.full(number, np.inf)), axis=1, kind="stable")
     possible = set(wanted)
     for rank in range(number - 1):

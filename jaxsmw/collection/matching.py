@@ -101,6 +101,8 @@ class Collection:
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
     - `axes`: the axes of the descriptors, or None.
+    - `cycle_errors`: the errors of all triangles of the graph, with the first and with the final maps of its
+      edges, as two arrays in units of the square root of the area.
     - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds.
     """
@@ -112,6 +114,7 @@ class Collection:
     registered: tuple[RegisteredMesh, ...]
     edges: tuple[MatchedEdge, ...]
     axes: DescriptorAxes | None = None
+    cycle_errors: tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " d"]] | None = None
     left_out: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -324,6 +327,7 @@ class _Matcher:
         replaced: set[Edge] = set()
         with timed("synchronization", self.seconds):
             network, chosen, points = self._synchronize(template)
+            first_cycles = self.cycles
             for _ in range(self.settings.rounds):
                 wrong = self._contradicted(edges, network, points)
                 if not wrong:
@@ -355,6 +359,7 @@ class _Matcher:
             registered=tuple(registered),
             edges=tuple(found),
             axes=self.axes,
+            cycle_errors=(first_cycles, self.cycles),
             left_out=self.left_out,
             seconds=self.seconds,
         )
@@ -441,7 +446,8 @@ class _Matcher:
     def _edges(self) -> list[Edge]:
         """Choose the edges. Edges between shapes of an earlier call with the same directory are kept."""
         names = [mesh.name for mesh in self.meshes]
-        inputs = (repr(self.settings.edges_per_shape), self.seed)
+        settings = self.settings
+        inputs = (repr(settings.edges_per_shape), settings.random_share, self.seed)
         stored = None if self.store is None else self.store.load("graph", inputs)
         given: list[Edge] = []
         if stored is not None:
@@ -450,7 +456,8 @@ class _Matcher:
             given = [(min(a, b), max(a, b)) for a, b in pairs if a is not None and b is not None]
         edges = choose_edges(
             shape_distances(self.shapes),
-            edges_per_shape=self.settings.edges_per_shape,
+            edges_per_shape=settings.edges_per_shape,
+            random_share=settings.random_share,
             given=given,
             seed=self.seed,
         )
@@ -540,7 +547,7 @@ class _Matcher:
         points |= {(j, i): found.backward for (i, j), found in self.maps.items()}
         vertex_maps = {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()}
         prior = np.array([found.expected_error for found in self.maps.values()])
-        estimated, _, _ = estimate_edge_errors(
+        estimated, self.cycles, _ = estimate_edge_errors(
             edges,
             vertex_maps,
             [mesh.vertices / unit for mesh, unit in zip(meshes, units, strict=True)],

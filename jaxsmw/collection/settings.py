@@ -17,6 +17,7 @@ class CollectionSettings:
     **Attributes:**
 
     - `edges_per_shape` (Table R25): the number of matched pairs divided by the number of shapes.
+    - `random_share` (Table R25): the share of random edges; see `choose_edges`.
     - `cycle_samples`: the number of samples of each shape at which cycles are compared.
     - `contradicted_from` (Table R25): an edge contradicts the collection if the mean distance between its
       maps and the maps through the template is at least this value. The edge is then matched again, from the
@@ -25,7 +26,8 @@ class CollectionSettings:
     - `synchronization`: the settings of `synchronize`.
     """
 
-    edges_per_shape: float = 4.0
+    edges_per_shape: float | int = 4
+    random_share: float = 0.25
     cycle_samples: int = 200
     contradicted_from: float = 0.05
     rounds: int = 2

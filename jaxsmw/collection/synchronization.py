@@ -89,7 +89,7 @@ def robust_mean(
     """
 
     def iterate(mean: Float[Array, "n 3"], _: None) -> tuple[Float[Array, "n 3"], None]:
-        squared = jnp.sum((candidates - mean) ** 2, axis=2)
+        squared = jnp.sum((candidates - mean[None]) ** 2, axis=2)
         share = weights[:, None] / (1 + squared / scale**2)
         total = jnp.maximum(share.sum(axis=0), jnp.finfo(share.dtype).tiny)
         return jnp.sum(share[:, :, None] * candidates, axis=0) / total[:, None], None

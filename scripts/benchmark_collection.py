@@ -1,0 +1,217 @@
+"""Measures consistent maps of collections against maps of single pairs, and ablations of their parts.
+
+    pip install -e ".[benchmark]"
+    python scripts/benchmark_collection.py DATA_DIRECTORY faust_r smal_r shrec19_r tosca_nonisometric
+    python scripts/benchmark_collection.py DATA_DIRECTORY tosca_r/cat tosca_r/dog
+    python scripts/benchmark_collection.py DATA_DIRECTORY primate_molars mouse_mandibles --pairs 40
+    python scripts/benchmark_collection.py DATA_DIRECTORY smal_r --ablations
+
+Each data set is matched as one collection. `SET/CLASS` selects the shapes whose names begin with CLASS. On
+random ordered pairs (seed 0), the errors of the maps through the template are compared with the errors of
+`jaxsmw.match` on the same pairs. Errors are mean geodesic distances to the ground truth, in thousandths of
+the square root of the target's area. For sets with landmarks, the error is the mean distance of carried
+landmarks to manual landmarks, in thousandths of the diagonal of the target's bounding box; `match` then
+carries the landmarks with its registered mesh, as `scripts/benchmark_transfer.py` does.
+
+Finished pairs are kept in OUTPUT, so that an interrupted benchmark can be continued.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from tqdm import tqdm
+
+from jaxsmw import geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw.collection import Collection, CollectionSettings, match_collection
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.intervals import mean_interval
+from jaxsmw.geometry import nearest_surface_points
+from jaxsmw.geometry.surface_distance import bounding_box_diagonal
+from jaxsmw.io import Landmarks
+from jaxsmw.runtime.journal import Journal
+from jaxsmw.runtime.provenance import made_with
+from jaxsmw.transfer import transfer_landmarks
+
+# A pair is lost if its mean error is above this number of thousandths.
+_LOST = 100
+_TRIANGLES = 1000
+
+_DEFAULT = CollectionSettings()
+ABLATIONS = {
+    "default": _DEFAULT,
+    "2 edges per shape": replace(_DEFAULT, edges_per_shape=2),
+    "6 edges per shape": replace(_DEFAULT, edges_per_shape=6),
+    "random graph": replace(_DEFAULT, random_share=1.0),
+    "no random edges": replace(_DEFAULT, random_share=0.0),
+    "best paths alone": replace(_DEFAULT, synchronization=replace(_DEFAULT.synchronization, iterations=0)),
+    "means without robust weights": replace(
+        _DEFAULT, synchronization=replace(_DEFAULT.synchronization, robust_scale=1e3)
+    ),
+    "no second match": replace(_DEFAULT, rounds=0),
+    "every edge matched again": replace(_DEFAULT, contradicted_from=0.0, rounds=1),
+}
+"""A dictionary from the name of each ablation to its settings."""
+
+
+def main() -> None:
+    """Measure the collections that the command line names, and print a summary of each."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser.add_argument("sets", nargs="+", metavar="DATA_SET")
+    parser.add_argument("--pairs", type=int, default=200, help="number of compared pairs (default: 200)")
+    parser.add_argument("--ablations", action="store_true", help="also measure all ablations")
+    parser.add_argument("--no-direct", action="store_true", help="leave out the matches of single pairs")
+    parser.add_argument("--output", type=Path, default=Path("collections"), help="directory of the results")
+    options = parser.parse_args()
+    for name in options.sets:
+        chosen = ABLATIONS if options.ablations else {"default": _DEFAULT}
+        for ablation, settings in chosen.items():
+            found = _measure(options, name, settings, direct=not options.no_direct and ablation == "default")
+            print(f"{name}, {ablation}: {json.dumps(found)}", flush=True)
+    print(made_with())
+
+
+def _files(directory: Path, name: str) -> list[Path]:
+    data_set, _, prefix = name.partition("/")
+    files = sorted(
+        file
+        for file in (directory / data_set).rglob("*")
+        if file.suffix in (".off", ".ply", ".vtk") and file.name.startswith(prefix)
+    )
+    if len(files) < 2:
+        raise InputError(f"{directory / data_set}: contains {len(files)} meshes: give a data set with two.")
+    return files
+
+
+def _measure(
+    options: argparse.Namespace, name: str, settings: CollectionSettings, *, direct: bool
+) -> dict[str, Any]:
+    """Match a collection, and measure the errors of its maps."""
+    files = _files(options.directory, name)
+    meshes = [read_mesh(file) for file in files]
+    place = options.output / name.replace("/", "_")
+    work = place / "work"
+    work.mkdir(parents=True, exist_ok=True)
+    with tqdm() as bar:
+
+        def progress(step: str, done: int, number: int) -> None:
+            bar.total, bar.n = number, done
+            bar.set_description(step)
+
+        start = time.perf_counter()
+        found = match_collection(
+            meshes, names=[file.stem for file in files], settings=settings, directory=work, progress=progress
+        )
+    seconds = time.perf_counter() - start
+    measure = _measure_truth if (files[0].parents[1] / "corres").is_dir() else _measure_landmarks
+    pairs = list(itertools.permutations(range(len(files)), 2))
+    pairs = [pairs[row] for row in np.random.default_rng(0).permutation(len(pairs))[: options.pairs]]
+    journal = Journal(place / "direct.csv", ("source", "target"))
+    through, single = [], []
+    for i, j in tqdm(pairs, desc="pairs"):
+        through.append(measure(found, files, i, j, None))
+        if not direct:
+            continue
+        key = (files[i].stem, files[j].stem)
+        if key not in journal:
+            mirrored = bool(found.mirrored[i] != found.mirrored[j])
+            error = measure(found, files, i, j, _matched(found, i, j, mirrored))
+            journal.append([{"source": key[0], "target": key[1], "error": error}])
+        single.append(float(journal[key]["error"]))
+    result: dict[str, Any] = {
+        "shapes": len(files),
+        "edges": len(found.edges),
+        "replaced": sum(edge.decision == "replaced" for edge in found.edges),
+        "contradicted": sum(edge.decision == "contradicted" for edge in found.edges),
+        "through_template": _summary(np.array(through)),
+        "cycles": _cycles(found),
+        "seconds": seconds,
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+    if single:
+        result["direct"] = _summary(np.array(single))
+        result["ratio"] = float(np.mean(through) / np.mean(single))
+    return result
+
+
+def _matched(found: Collection, i: int, j: int, mirrored: bool) -> Any:
+    return match(found.meshes[i], found.meshes[j], mirror="yes" if mirrored else "no")
+
+
+def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
+    """Return the mean error of a map in thousandths, against ground truth."""
+    truth_files = [files[shape].parents[1] / "corres" / f"{files[shape].stem}.vts" for shape in (i, j)]
+    truth = read_ground_truth(truth_files, found.meshes[i], found.meshes[j])
+    pointwise_map = found.pointwise_map(i, j) if single is None else single.pointwise_map
+    return 1e3 * geodesic_error(found.meshes[j], pointwise_map, truth).mean
+
+
+def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
+    """Return the mean distance of carried landmarks to manual landmarks, in thousandths of the diagonal."""
+    marks_x, marks_y = (_landmarks(files[shape]) for shape in (i, j))
+    names = [name for name in marks_x.names if name in set(marks_y.names)]
+    marks_x, marks_y = marks_x.select(names), marks_y.select(names)
+    if single is None:
+        on_template, _ = nearest_surface_points(marks_x.positions, found.registered[i].mesh)
+        images = found.registered[j].carry(on_template)
+        points, _ = nearest_surface_points(images, found.meshes[j])
+        carried = points.positions(found.meshes[j])
+    else:
+        carried = transfer_landmarks(marks_x, single.registered_mesh()).landmarks.positions
+    distances = np.linalg.norm(carried - marks_y.positions, axis=1)
+    return 1e3 * float(distances.mean()) / bounding_box_diagonal(found.meshes[j])
+
+
+def _landmarks(file: Path) -> Landmarks:
+    from benchmark_transfer import _landmarks as read
+
+    return read(file)
+
+
+def _cycles(found: Collection) -> dict[str, float]:
+    """Return mean cycle errors in thousandths: of random triangles through the template, and of the graph."""
+    generator = np.random.default_rng(0)
+    number = len(found.meshes)
+    errors = []
+    for _ in range(_TRIANGLES if number > 2 else 0):
+        i, j, k = generator.choice(number, 3, replace=False)
+        mesh = found.meshes[i]
+        vertex = generator.choice(np.flatnonzero(mesh.referenced_vertices), 20)
+        position, before = mesh.vertices[vertex], i
+        for after in (j, k, i):
+            points, _ = nearest_surface_points(position, found.registered[before].mesh)
+            position, before = found.registered[after].carry(points), after
+        errors.append(np.linalg.norm(position - mesh.vertices[vertex], axis=1).mean() / mesh.area**0.5)
+    graph = found.cycle_errors or (np.array([]), np.array([]))
+    return {
+        name: float(1e3 * np.mean(values)) if len(values) else float("nan")
+        for name, values in (("template", errors), ("graph_first", graph[0]), ("graph_final", graph[1]))
+    }
+
+
+def _summary(errors: Float64[np.ndarray, " p"]) -> dict[str, float]:
+    interval = mean_interval(errors, 0)
+    return {
+        "mean": float(errors.mean()),
+        "low": float(interval.low),
+        "high": float(interval.high),
+        "median": float(np.median(errors)),
+        "largest": float(errors.max()),
+        "lost": int((errors > _LOST).sum()),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,303 @@
+"""The parts of collections: graph, cycles, hands, synchronisation and batches."""
+
+from itertools import combinations, permutations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxsmw import InputError, creature_pair, match
+from jaxsmw.collection import (
+    Network,
+    SynchronizationSettings,
+    choose_edges,
+    choose_hands,
+    edge_errors,
+    match_pairs,
+    synchronize,
+)
+from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, triangles
+from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
+from jaxsmw.geometry.creature import creature
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.repair.chirality import Decision
+
+
+def random_distances(number, seed=0):
+    points = np.random.default_rng(seed).normal(size=(number, 3))
+    return np.linalg.norm(points[:, None] - points[None], axis=2)
+
+
+def is_connected(edges, number):
+    rows, columns = np.array(edges).T
+    graph = coo_array((np.ones(len(edges)), (rows, columns)), shape=(number, number))
+    return connected_components(graph, directed=False)[0] == 1
+
+
+# ----------------------------------------------------------------------------------------------------- graph
+
+
+@pytest.mark.parametrize("number", [2, 3, 7, 40])
+def test_the_graph_is_connected_and_has_the_wanted_number_of_edges(number):
+    edges = choose_edges(random_distances(number), edges_per_shape=4)
+    assert len(edges) == min(4 * number, number * (number - 1) // 2)
+    assert all(0 <= i < j < number for i, j in edges) and edges == sorted(set(edges))
+    assert is_connected(edges, number)
+
+
+def test_the_graph_contains_the_minimum_spanning_tree_and_is_connected_with_few_edges():
+    # Two clusters: nearest neighbours alone would not connect them.
+    points = np.concatenate([np.random.default_rng(0).normal(size=(10, 2)), 50 + np.zeros((10, 2))])
+    points[10:] += np.random.default_rng(1).normal(size=(10, 2))
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    assert is_connected(choose_edges(distances, edges_per_shape=1.5), 20)
+    assert is_connected(choose_edges(np.zeros((6, 6)), edges_per_shape=1.5), 6)
+
+
+def test_added_shapes_add_only_their_own_edges():
+    distances = random_distances(20)
+    before = choose_edges(distances[:16, :16], edges_per_shape=3)
+    after = choose_edges(distances, edges_per_shape=3, given=before)
+    assert set(before) <= set(after)
+    added = set(after) - set(before)
+    assert len(added) == 3 * 4
+    assert all(max(edge) >= 16 for edge in added) and {shape for e in added for shape in e} >= {
+        16,
+        17,
+        18,
+        19,
+    }
+    assert choose_edges(distances, edges_per_shape=3, given=after) == after
+
+
+def test_random_edges_depend_on_the_seed_only():
+    distances = random_distances(30)
+    first, same, other = (choose_edges(distances, seed=seed) for seed in (0, 0, 1))
+    assert first == same
+    assert first != other
+
+
+# ---------------------------------------------------------------------------------------------------- cycles
+
+
+def test_triangles_are_all_triangles_of_the_graph():
+    edges = choose_edges(random_distances(15), edges_per_shape=4)
+    known = {frozenset(edge) for edge in edges}
+    expected = [
+        t for t in combinations(range(15), 3) if all(frozenset(e) in known for e in combinations(t, 2))
+    ]
+    assert expected and triangles(edges).tolist() == [list(t) for t in expected]
+
+
+def test_cycle_error_is_the_mean_clipped_distance():
+    rng = np.random.default_rng(0)
+    first, second, third = (rng.permutation(50) for _ in range(3))
+    positions, samples = rng.normal(size=(50, 3)), np.arange(0, 50, 7)
+    expected = [min(np.linalg.norm(positions[third[second[first[s]]]] - positions[s]), 0.5) for s in samples]
+    assert cycle_error(first, second, third, positions, samples) == pytest.approx(np.mean(expected))
+    inverse = np.argsort(second[first])
+    assert cycle_error(first, second, inverse, positions, samples) == 0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_wrong_edges_are_found_by_cycles(share):
+    """Each shape has its own numbering, and a wrong edge has a random map."""
+    rng = np.random.default_rng(0)
+    number, n = 16, 60
+    positions = rng.normal(size=(n, 3))
+    orders = [rng.permutation(n) for _ in range(number)]
+    edges = choose_edges(random_distances(number), edges_per_shape=5)
+    wrong = rng.permutation(len(edges))[: round(share * len(edges))]
+    maps = {}
+    for row, (i, j) in enumerate(edges):
+        forward = np.argsort(orders[j])[orders[i]]
+        if row in wrong:
+            forward = rng.permutation(n)
+        maps[i, j], maps[j, i] = forward, np.argsort(forward)
+    # Vertex v of shape i is point orders[i][v].
+    estimated, errors, cycles = estimate_edge_errors(
+        edges,
+        maps,
+        [positions[order] for order in orders],
+        [np.arange(n)] * number,
+        np.full(len(edges), 0.01),
+    )
+    is_wrong = np.isin(np.arange(len(edges)), wrong)
+    assert estimated[~is_wrong].max() < 0.05 < 0.3 < estimated[is_wrong].min()
+    np.testing.assert_array_equal(errors > 1e-9, is_wrong[cycles].any(axis=1))
+
+
+def test_an_edge_in_no_cycle_keeps_its_prior():
+    prior = jnp.array([0.1, 0.2, 0.3, 0.7])
+    edges = jnp.array([[0, 1], [1, 2], [0, 2], [2, 3]])
+    found = edge_errors(edges, jnp.array([[0, 1, 2]]), jnp.array([0.05]), prior)
+    np.testing.assert_allclose(found, [0.05, 0.05, 0.05, 0.7], rtol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------------- hands
+
+
+def test_hands_agree_with_noisy_evidence():
+    rng = np.random.default_rng(0)
+    hands = rng.random(20) < 0.4
+    decisions = {}
+    for i, j in combinations(range(20), 2):
+        if rng.random() < 0.3:
+            true = 1.0 if hands[i] != hands[j] else -1.0
+            evidence = 0.4 * true * (-0.3 if rng.random() < 0.1 else 1)
+            decisions[i, j] = Decision(evidence > 0.05, evidence, False, True)
+    np.testing.assert_array_equal(choose_hands(20, decisions), hands)
+
+
+def test_symmetric_shapes_have_one_hand():
+    decisions = {(0, 1): Decision(False, 0.3, True, False), (1, 2): Decision(False)}
+    assert not choose_hands(3, decisions).any()
+
+
+# ------------------------------------------------------------------------------------------- synchronisation
+
+
+@pytest.fixture(scope="module")
+def body():
+    return creature(vertices=600, seed=3)
+
+
+def noisy_network(body, edges, wrong, noise, number, seed=0):
+    """A network of copies of one body, whose maps are noisy displacements on the surface."""
+    from jaxsmw.geometry.surface_distance import nearest_surface_points
+
+    rng = np.random.default_rng(seed)
+    maps = {}
+    for i, j in edges:
+        for key in ((i, j), (j, i)):
+            moved = body.vertices + noise * np.sqrt(body.area) * rng.normal(size=body.vertices.shape)
+            if frozenset(key) in wrong:
+                moved = body.vertices * [-1, 1, 1]
+            maps[key] = nearest_surface_points(moved, body)[0]
+    errors = {edge: 0.3 if frozenset(edge) in wrong else 0.01 for edge in edges}
+    return Network([body] * number, maps, errors)
+
+
+def test_averages_remove_noise_and_ignore_wrong_edges(body):
+    number = 7
+    edges = list(combinations(range(number), 2))
+    wrong = {frozenset((0, 3)), frozenset((2, 5))}
+    network = noisy_network(body, edges, wrong, 0.01, number)
+    points = synchronize(network, 0)
+    unit = np.sqrt(body.area)
+
+    def error(i, j):
+        offsets = points[i].positions(body) - points[j].positions(body)
+        return np.linalg.norm(offsets, axis=1).mean() / unit
+
+    direct = (
+        np.linalg.norm(network.carried(vertices_as_points(body), 1, 2) - body.vertices, axis=1).mean() / unit
+    )
+    consistent = np.mean([error(i, j) for i, j in combinations(range(number), 2)])
+    assert direct > 0.008
+    assert consistent < 0.7 * direct
+    assert network.residual(points, 0, 3) > 0.1 > 0.03 > network.residual(points, 0, 1)
+
+
+def test_exact_maps_stay_exact(body):
+    edges = [(0, 1), (1, 2), (2, 3), (0, 3)]
+    network = noisy_network(body, edges, set(), 0.0, 4)
+    for points in synchronize(network, 2):
+        np.testing.assert_allclose(points.positions(body), body.vertices, atol=1e-6)
+
+
+def test_unconnected_shapes_are_refused(body):
+    with pytest.raises(ValueError, match="not connected"):
+        synchronize(noisy_network(body, [(0, 1)], set(), 0.0, 3), 0)
+
+
+def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
+    edges = {(0, 1): 1.0, (1, 2): 1.0, (2, 3): 1.0, (3, 4): 1.0}
+    points = vertices_as_points(body)
+    maps = {key: points for edge in edges for key in (edge, edge[::-1])}
+    assert Network([body] * 5, maps, edges).medoid() == 2
+
+
+def test_points_inside_torn_triangles_follow_the_nearest_corner(body):
+    points = SurfacePoints(np.array([0, 0]), np.array([[0.5, 0.3, 0.2], [0.2, 0.2, 0.6]]))
+    images = body.vertices.copy()
+    smooth = carry(points, body, images, 1.0)
+    np.testing.assert_allclose(smooth, points.positions(body))
+    images[body.faces[0, 0]] += 100
+    torn = carry(points, body, images, 1.0)
+    np.testing.assert_allclose(torn, images[body.faces[0, [0, 2]]])
+
+
+def test_robust_mean_ignores_outliers_and_padding():
+    rng = np.random.default_rng(0)
+    candidates = jnp.asarray(rng.normal(size=(9, 5, 3)) * 0.01)
+    outlying = candidates.at[0].add(1.0)
+    start, scale = jnp.zeros((5, 3)), jnp.asarray(0.02)
+    weights = jnp.ones(9)
+    found = robust_mean(outlying, weights, start, scale)
+    assert jnp.abs(found - candidates[1:].mean(axis=0)).max() < 0.01
+    padded = robust_mean(jnp.pad(outlying, ((0, 2), (0, 0), (0, 0))), jnp.pad(weights, (0, 2)), start, scale)
+    np.testing.assert_allclose(padded, found, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------- batches
+
+
+@pytest.fixture(scope="module")
+def three():
+    return [creature(vertices=600, pose=pose, seed=5) for pose in ("rest", "stand", "walk")]
+
+
+@pytest.fixture(scope="module")
+def one_by_one(three):
+    return dict(match_pairs(three, PAIRS))
+
+
+PAIRS = list(permutations(range(3), 2))[:4]
+
+
+def test_pairs_are_matched_as_by_match(three, one_by_one):
+    assert sorted(one_by_one) == list(range(len(PAIRS)))
+    for number, found in one_by_one.items():
+        i, j = PAIRS[number]
+        assert found.mesh_x is three[i] and found.mesh_y is three[j]
+        # All poses have the same triangulation.
+        error = three[j].vertices[found.pointwise_map] - three[j].vertices
+        direct = match(three[i], three[j], mirror="no", init="shot")
+        reference = three[j].vertices[direct.pointwise_map] - three[j].vertices
+        assert np.linalg.norm(error, axis=1).mean() < 1.2 * np.linalg.norm(reference, axis=1).mean() + 1e-3
+
+
+def test_batches_give_the_same_maps(three, one_by_one):
+    for number, found in match_pairs(three, PAIRS, batch_size=3):
+        expected = one_by_one[number]
+        assert (found.pointwise_map == expected.pointwise_map).mean() > 0.999
+        assert found.distortion == pytest.approx(expected.distortion, rel=1e-3)
+
+
+def test_bad_pairs_are_refused(three):
+    with pytest.raises(InputError, match="pair 1 is"):
+        match_pairs(three, [(0, 1), (0, 3)])
+
+
+def test_reverse_surface_points_come_from_the_same_embeddings():
+    pair = creature_pair(vertices=600, seed=1)
+    found = match(pair.source, pair.target, mirror="no")
+    reverse = found.reverse_surface_points()
+    assert len(reverse) == len(pair.target.vertices)
+    # A vertex that is carried there and back returns near to itself.
+    there = found.surface_points()
+    back = carry(there, pair.target, reverse.positions(pair.source), np.inf)
+    detour = np.linalg.norm(back - pair.source.vertices, axis=1) / np.sqrt(pair.source.area)
+    assert np.median(detour) < 0.02
+    nearest = reverse.nearest_corners(pair.source)
+    assert (nearest == found.reverse_map()).mean() > 0.7
+
+
+def test_settings_state_their_units():
+    settings = SynchronizationSettings()
+    assert 0 < settings.robust_scale < settings.discontinuity_distance < 1
+    assert jax.tree.leaves(settings) == [settings]
