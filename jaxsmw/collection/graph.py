@@ -64,7 +64,8 @@ def choose_edges(
     """Choose the pairs of a collection that are matched.
 
     The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
-    Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep the paths between any two shapes short, and they contradict errors that all similar shapes share.
+    Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep
+    the paths between any two shapes short, and they contradict errors that all similar shapes share.
 
     **Arguments:**
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import Edge, estimate_edge_errors
