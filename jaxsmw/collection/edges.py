@@ -114,9 +114,9 @@ def match_edges(
     **Returns:** An iterator with one `EdgeMap` per edge, in the order of `tasks`; an `ArithmeticError` for an
     edge whose refinement fails numerically.
     """
-    for starts, refined in refined_starts((task.starts() for task in tasks), preset, devices=devices):
+    for starts, fitted, refined in refined_starts((task.starts() for task in tasks), preset, devices=devices):
         try:
-            found = match_prepared(starts[0].pair, starts, preset, refined=refined, alternatives=False)
+            found = match_prepared(starts[0].pair, starts, fitted, refined=refined, alternatives=False)
             yield EdgeMap.of(found.correspondence)
         except ArithmeticError as error:
             yield error

@@ -28,7 +28,6 @@ from jaxsmw.collection.shapes import (
     PreparedShape,
     describe_shape,
     descriptor_axes,
-    fitted_preset,
     prepare_shape,
 )
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
@@ -371,7 +370,6 @@ class _Matcher:
 
     def _prepare(self) -> list[int]:
         """Prepare all shapes, and return the numbers of the shapes that can be matched."""
-        self.preset = fitted_preset(self.given, self.preset)
         eigensolver = choose_eigensolver(*self.given) if self.given else "exact"
         self.shapes: list[PreparedShape] = []
         kept = []

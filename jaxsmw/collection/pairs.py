@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import jax
 
 from jaxsmw.choices import DEFAULT_PRESET
-from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
+from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
 from jaxsmw.matching import Correspondence, match_prepared
@@ -60,13 +61,13 @@ def match_pairs(
                 f"pair {number} is {tuple(pair)}, but there are {len(given)} meshes: give the numbers of two "
                 "meshes, counted from 0."
             )
-    shapes, fitted, _ = prepare_shapes(given, choose_preset(preset))
+    chosen = choose_preset(preset)
+    shapes, _ = prepare_shapes(given, chosen)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
-        prepared = (([prepare_pair(shapes[i], shapes[j])]) for i, j in pairs)
-        for number, (starts, refined) in enumerate(
-            refined_starts(prepared, fitted, batch_size=batch_size, devices=devices)
-        ):
+        prepared = ([prepare_pair(shapes[i], shapes[j])] for i, j in pairs)
+        outcomes = refined_starts(prepared, chosen, batch_size=batch_size, devices=devices)
+        for number, (starts, fitted, refined) in enumerate(outcomes):
             pair = starts[0].pair
             found = match_prepared(pair, starts, fitted, refined=refined, alternatives=alternatives)
             yield number, found.correspondence
@@ -80,37 +81,31 @@ def refined_starts(
     *,
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
-) -> Iterator[tuple[list[PreparedPair], list[Outcome]]]:
+) -> Iterator[tuple[list[PreparedPair], Preset, list[Outcome]]]:
     """Refine the initial maps of many pairs in batches, if batches save time on the given devices.
 
     **Arguments:**
 
     - `starts`: for each pair, the prepared pair with one or several initial maps.
-    - `preset`: the preset, whose stages run.
+    - `preset`: the preset, whose stages run. For each pair, the preset is adapted to small meshes.
     - `batch_size`, `devices`: see `refine_pairs`.
 
-    **Returns:** An iterator over the pairs, in the given order: the prepared pairs and their outcomes before
-    repair. On one CPU there are no outcomes, because `match_prepared` then runs the stages itself.
+    **Returns:** An iterator over the pairs, in the given order: the prepared pairs, the adapted preset, and
+    the outcomes before repair. On one CPU there are no outcomes, because `match_prepared` then runs the
+    stages itself.
     """
     devices = jax.devices() if devices is None else devices
+    fitted = ((one, fitted_preset(preset, *one[0].pair.meshes)) for one in starts)
     if len(devices) == 1 and devices[0].platform == "cpu" and batch_size is None:
-        for one in starts:
-            yield one, []
+        for one, own in fitted:
+            yield one, own, []
         return
-    waiting: list[list[PreparedPair]] = []
-
-    def refined() -> Iterator[tuple[list[PreparedPair], list[Outcome]]]:
-        flat = [start for one in waiting for start in one]
-        described = flat[0].spectrum_x.descriptors is not None
-        stages = (preset if described else preset.without_descriptors()).stages
-        outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))
-        for one in waiting:
-            yield one, [next(outcomes) for _ in one]
-
-    for one in starts:
-        waiting.append(one)
-        if len(waiting) == _PAIRS_PER_DEVICE * len(devices):
-            yield from refined()
-            waiting.clear()
-    if waiting:
-        yield from refined()
+    # All pairs of a batch run the same stages.
+    for own, group in itertools.groupby(fitted, key=lambda pair: pair[1]):
+        while waiting := [one for one, _ in itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))]:
+            flat = [start for one in waiting for start in one]
+            described = flat[0].spectrum_x.descriptors is not None
+            stages = (own if described else own.without_descriptors()).stages
+            outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))
+            for one in waiting:
+                yield one, own, [next(outcomes) for _ in one]

@@ -15,6 +15,7 @@ from jaxsmw.descriptors import DescriptorAxes, SampledPair, SampledShape, compar
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.pair import Pair, check_eigenvalues
 from jaxsmw.preparation import PreparedPair
@@ -74,7 +75,8 @@ def prepare_shape(
     **Arguments:**
 
     - `mesh`: a `Mesh` (n vertices).
-    - `preset`: the preset, whose stages determine the numbers of eigenvectors and samples.
+    - `preset`: the preset, whose stages determine the numbers of eigenvectors and samples. The preset is
+      adapted to a small mesh; see `Preset.fitted`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All shapes of a collection need the same
       eigensolver, because their spectra are compared.
 
@@ -82,6 +84,7 @@ def prepare_shape(
 
     **Raises:** `InputError` if the spectrum cannot be computed, or SHOT is not defined on the mesh.
     """
+    preset = fitted_preset(preset, mesh)
     spectrum = compute_spectrum(
         mesh, preset.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
     )
@@ -89,7 +92,9 @@ def prepare_shape(
     if preset.number_of_samples:
         samples = jax.device_put(farthest_point_samples(mesh, preset.number_of_samples))
     check_eigenvalues(mesh, spectrum)
-    return PreparedShape(mesh, spectrum, compared_samples(mesh), samples)
+    compared = compared_samples(mesh)
+    shot_descriptors(mesh, samples=compared)  # kept in the cache, and refuses meshes that are too coarse
+    return PreparedShape(mesh, spectrum, compared, samples)
 
 
 def describe_shape(shape: PreparedShape, axes: DescriptorAxes) -> PreparedShape:
@@ -126,7 +131,7 @@ def descriptor_axes(shapes: Sequence[PreparedShape], preset: Preset) -> Descript
 
 def prepare_shapes(
     meshes: Sequence[Mesh], preset: Preset
-) -> tuple[list[PreparedShape], Preset, DescriptorAxes | None]:
+) -> tuple[list[PreparedShape], DescriptorAxes | None]:
     """Prepare all shapes of a collection, with descriptors along common axes.
 
     **Arguments:**
@@ -134,20 +139,21 @@ def prepare_shapes(
     - `meshes`: the meshes, each a `Mesh`.
     - `preset`: the preset.
 
-    **Returns:** The prepared shapes, the preset adapted to the smallest mesh, and the axes of the
-    descriptors; None if the preset uses no descriptors.
+    **Returns:** The prepared shapes, and the axes of the descriptors; None if the preset uses no descriptors.
 
     **Raises:** `InputError` if a mesh cannot be used.
     """
-    preset = fitted_preset(meshes, preset)
     eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
     shapes = [prepare_shape(mesh, preset, eigensolver=eigensolver) for mesh in meshes]
     if not (shapes and preset.number_of_descriptors):
-        return shapes, preset, None
+        return shapes, None
     axes = descriptor_axes(shapes, preset)
-    return [describe_shape(shape, axes) for shape in shapes], preset, axes
+    return [describe_shape(shape, axes) for shape in shapes], axes
 
 
-def fitted_preset(meshes: Sequence[Mesh], preset: Preset) -> Preset:
-    """Return the preset, adapted to the mesh with the fewest referenced vertices; see `Preset.fitted`."""
-    return preset.fitted(min((int(mesh.referenced_vertices.sum()) for mesh in meshes), default=0) or 1)
+def fitted_preset(preset: Preset, *meshes: Mesh) -> Preset:
+    """Return the preset, adapted to the mesh with the fewest referenced vertices; see `Preset.fitted`.
+
+    **Raises:** `InputError` if a mesh has too few vertices.
+    """
+    return preset.fitted(Pair(meshes[0], meshes[-1]).fewest_vertices())

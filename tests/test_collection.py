@@ -1,0 +1,371 @@
+"""Collections as a whole: consistency, interrupted runs, added meshes, hands, workers and the command."""
+
+import csv
+import json
+import os
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import assert_refused, runner
+
+import jaxsmw.collection.matching as matching
+from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
+from jaxsmw.collection import CollectionSettings, match_collection
+from jaxsmw.geometry.creature import CREATURES, creature
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io import Landmarks, read_landmark_file, write_landmark_file
+from jaxsmw.runtime.cache import Store
+
+VERTICES = 600
+SETTINGS = CollectionSettings(edges_per_shape=2)
+
+
+def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
+    """A mesh with its vertices in a random order, and the new number of each vertex."""
+    order = np.random.default_rng(seed).permutation(len(mesh.vertices))
+    new = np.argsort(order)
+    return make_mesh(mesh.vertices[order], new[mesh.faces], name=f"shape{seed}"), new
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    """Five poses of one creature, each with its own numbering, and the new number of each vertex."""
+    poses = CREATURES["biped"][:5]
+    return [renumbered(creature("biped", vertices=VERTICES, pose=pose), i) for i, pose in enumerate(poses)]
+
+
+@pytest.fixture(scope="module")
+def meshes(shapes):
+    return [mesh for mesh, _ in shapes]
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    return tmp_path_factory.mktemp("work")
+
+
+@pytest.fixture(scope="module")
+def found(meshes, work):
+    return match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work)
+
+
+def error(collection, shapes, i, j):
+    """The mean distance of matches from the truth, in units of the square root of the area."""
+    (_, new_x), (mesh_y, new_y) = shapes[i], shapes[j]
+    offsets = mesh_y.vertices[collection.pointwise_map(i, j)[new_x]] - mesh_y.vertices[new_y]
+    return np.linalg.norm(offsets, axis=1).mean() / np.sqrt(mesh_y.area)
+
+
+@pytest.fixture
+def matched(monkeypatch):
+    """The pairs that a call matches, as lists of names."""
+    pairs = []
+    original = matching.match_edges
+
+    def recording(tasks, *arguments):
+        def noted():
+            for task in tasks:
+                pairs.append((task.x.mesh.name, task.y.mesh.name))
+                yield task
+
+        return original(noted(), *arguments)
+
+    monkeypatch.setattr(matching, "match_edges", recording)
+    return pairs
+
+
+def test_all_pairs_are_matched_well_and_consistently(found, shapes):
+    errors = [error(found, shapes, i, j) for i, j in permutations(range(5), 2)]
+    assert len(found.edges) == 10
+    assert np.mean(errors) < 0.03
+    assert max(errors) < 0.1
+    for i in range(5):
+        there, back = found.from_template(i), found.to_template(i)
+        template = found.meshes[found.template]
+        assert there.shape == template.vertices.shape[:1]
+        assert back.shape == found.meshes[i].vertices.shape[:1]
+        detour = np.linalg.norm(template.vertices[back[there]] - template.vertices, axis=1)
+        assert np.median(detour) == 0
+
+
+def test_registered_meshes_have_the_template_s_triangulation(found):
+    template = found.meshes[found.template]
+    for mesh, registered in zip(found.meshes, found.registered, strict=True):
+        assert registered.mesh.faces is template.faces
+        assert np.quantile(registered.distances, 0.95) < 0.01 * np.sqrt(mesh.area)
+    own = found.registered[found.template].vertices
+    np.testing.assert_allclose(own, template.vertices, atol=1e-3 * np.sqrt(template.area))
+
+
+def test_the_template_can_be_chosen(meshes, work):
+    chosen = match_collection(
+        meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work, template=3
+    )
+    assert chosen.template == 3
+    with pytest.raises(InputError, match="at least two meshes"):
+        match_collection(meshes[:1], preset="paper")
+
+
+def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, found, matched):
+    again = match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work)
+    assert matched == []
+    for first, second in zip(found.registered, again.registered, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+    assert again.edges == found.edges
+
+
+def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
+    class Interrupted(Exception):
+        pass
+
+    def interrupt(step, done, number):
+        if step == "edges" and done == 4:
+            raise Interrupted
+
+    def run(progress=None):
+        return match_collection(
+            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path, progress=progress
+        )
+
+    with pytest.raises(Interrupted):
+        run(interrupt)
+    before = list(matched)
+    # An unfinished temporary file and a damaged result, as a crash can leave them.
+    (tmp_path / ".0123456789abcdef0123456789abcdef.npz").write_bytes(b"PK")
+    damaged = next(tmp_path.glob("edge-*.npz"))
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    resumed = run()
+    assert len(before) == 4
+    # The fourth pair was matched, but not stored, and the damaged result is computed again.
+    assert len(matched) == 4 + (10 - 3) + 1
+    for first, second in zip(found.registered, resumed.registered, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_an_added_mesh_is_matched_alone(meshes, matched, tmp_path):
+    def run(number):
+        return match_collection(
+            meshes[:number], preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path
+        )
+
+    run(4)
+    matched.clear()
+    added = run(5)
+    assert 1 <= len(matched) <= 2
+    assert all("shape4" in pair for pair in matched)
+    assert len(added.meshes) == 5
+
+
+def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
+    # A single triangle has too few vertices.
+    triangle = make_mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle")
+    result = match_collection(
+        [*meshes, triangle], preset="paper", settings=SETTINGS, mirror=False, directory=work
+    )
+    assert list(result.left_out) == ["triangle"] and "3 vertices" in result.left_out["triangle"]
+    assert result.names == found.names
+    assert any("triangle" in sentence for sentence in result.sentences())
+
+
+def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
+    """The first match of one pair maps every vertex to the mirror image of its match."""
+    original = matching.match_edges
+    settings = CollectionSettings(edges_per_shape=2)
+
+    def corrupting(tasks, *arguments):
+        tasks = list(tasks)
+        for task, edge in zip(tasks, original(iter(tasks), *arguments), strict=True):
+            if task.init is None and (task.x.mesh.name, task.y.mesh.name) == ("shape1", "shape3"):
+                shuffled = np.random.default_rng(0).permutation(len(edge.forward))
+                back = np.random.default_rng(1).permutation(len(edge.backward))
+                edge = matching.EdgeMap(
+                    edge.forward[shuffled],
+                    edge.backward[back],
+                    edge.expected_error,
+                    edge.distortion,
+                    edge.suspicious,
+                )
+            yield edge
+
+    monkeypatch.setattr(matching, "match_edges", corrupting)
+    result = match_collection(meshes, preset="paper", settings=settings, mirror=False)
+    (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
+    assert edge.decision == "replaced"
+    assert "replaced" in edge.sentence(result.names)
+    assert edge.residual < 0.05
+    assert max(error(result, shapes, i, j) for i, j in permutations(range(5), 2)) < 0.1
+    first, final = result.cycle_errors
+    assert first.mean() > 3 * final.mean()
+
+
+def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
+    store = Store(tmp_path)
+    store.save("edge", (np.arange(3), "a"), {"x": np.eye(2)})
+    np.testing.assert_array_equal(store.load("edge", (np.arange(3), "a"))["x"], np.eye(2))
+    assert store.load("edge", (np.arange(4), "a")) is None
+    assert store.load("graph", (np.arange(3), "a")) is None
+
+
+@pytest.mark.cluster
+def test_workers_give_the_same_maps(meshes, found, tmp_path):
+    from jaxsmw.runtime.workers import open_executor
+
+    with open_executor(2) as executor:
+        result = match_collection(
+            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path, executor=executor
+        )
+    for i, j in permutations(range(5), 2):
+        assert (result.pointwise_map(i, j) == found.pointwise_map(i, j)).mean() > 0.99
+
+
+@pytest.mark.slow
+def test_the_mirror_image_of_a_tooth_is_recognised(shared):
+    """Two of six teeth are replaced by their mirror images."""
+    files = sorted((shared / "data" / "primate_molars").glob("*.off"))[:6]
+    teeth = [read_mesh(file) for file in files]
+    sides = dict(csv.reader((shared / "data" / "primate_molars" / "chirality.csv").open()))
+    expected = np.array([sides.get(file.stem, sides.get(file.stem.removesuffix("_sas"))) for file in files])
+    result = match_collection(teeth, settings=CollectionSettings(edges_per_shape=2.5))
+    by_side = [set(expected[result.mirrored == hand]) for hand in (True, False)]
+    assert all(len(side) <= 1 for side in by_side)
+    model = result.shape_model(scale=True)
+    assert model.scores.shape == (6, 5)
+
+
+@pytest.mark.slow
+def test_real_people_through_the_template(shared):
+    """Maps through the template are as good as direct maps, and no pair is lost."""
+    data = shared / "data" / "faust_r"
+    names = [f"tr_reg_{number:03}" for number in (0, 3, 7, 12, 15, 18)]
+    people = [read_mesh(data / "off" / f"{name}.off") for name in names]
+    truth = [np.loadtxt(data / "corres" / f"{name}.vts", dtype=int) - 1 for name in names]
+    result = match_collection(people, settings=CollectionSettings(edges_per_shape=2.5), mirror=False)
+    errors = []
+    for i, j in permutations(range(6), 2):
+        offsets = people[j].vertices[result.pointwise_map(i, j)[truth[i]]] - people[j].vertices[truth[j]]
+        errors.append(np.linalg.norm(offsets, axis=1).mean() / np.sqrt(people[j].area))
+    assert np.mean(errors) < 0.018
+    assert max(errors) < 0.05
+
+
+# ----------------------------------------------------------------------------------------------- the command
+
+
+@pytest.fixture
+def run(capsys):
+    return runner(capsys)
+
+
+@pytest.fixture(scope="module")
+def directory(meshes, tmp_path_factory):
+    place = tmp_path_factory.mktemp("meshes")
+    for mesh, suffix in zip(meshes[:4], (".ply", ".off", ".obj", ".stl"), strict=True):
+        write_mesh(place / f"{mesh.name}{suffix}", mesh)
+    (place / "notes.txt").write_text("not a mesh")
+    (place / "broken.ply").write_text("ply\nformat")
+    return place
+
+
+OPTIONS = ("--preset", "paper", "--mirror", "no", "--edges", "2")
+
+
+@pytest.fixture(scope="module")
+def result_directory(directory, meshes, tmp_path_factory):
+    from jaxsmw.cli.run import run_command
+
+    output = tmp_path_factory.mktemp("results") / "result"
+    landmarks = directory.parent / "shape1.csv"
+    positions = meshes[1].vertices[[3, 50, 400]]
+    write_landmark_file(landmarks, Landmarks(("a", "b", "c"), positions))
+    code = run_command(
+        ["collection", str(directory), "--output", str(output), *OPTIONS, "--landmarks", str(landmarks),
+         "--attributes-of", str(directory / "shape0.ply"), "--template", str(directory / "shape2.obj")]
+    )  # fmt: skip
+    assert code == 0
+    return output
+
+
+def test_the_command_writes_everything(result_directory):
+    names = ["shape0", "shape1", "shape2", "shape3"]
+    summary = json.loads((result_directory / "collection.json").read_text("utf-8"))
+    assert summary["template"] == "shape2"
+    assert [shape["name"] for shape in summary["shapes"]] == names
+    assert list(summary["left_out"]) == ["broken.ply"]
+    assert {edge["decision"] for edge in summary["edges"]} <= {"kept", "replaced", "contradicted"}
+    template = read_mesh(result_directory / "registered" / "shape2.ply")
+    for name in names:
+        registered = read_mesh(result_directory / "registered" / f"{name}.ply")
+        np.testing.assert_array_equal(registered.faces, template.faces)
+        assert len((result_directory / "maps" / f"{name}_from_template.txt").read_text().split()) == len(
+            template.vertices
+        )
+    modes = np.load(result_directory / "modes.npz")
+    assert modes["modes"].shape == (3, len(template.vertices), 3)
+    rows = list(csv.reader((result_directory / "scores.csv").open()))
+    assert [row[0] for row in rows] == ["mesh", *names] and len(rows[1]) == 4
+    assert read_mesh(result_directory / "mean.ply").vertices.shape == template.vertices.shape
+    assert sorted(os.listdir(result_directory / "attributes")) == ["shape1.ply", "shape2.ply", "shape3.ply"]
+    assert "<html" in (result_directory / "index.html").read_text("utf-8")
+
+
+def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
+    _, new = shapes[1]
+    rows = np.argsort(new)[[3, 50, 400]]  # the vertices of the creature
+    for number in (0, 2, 3):
+        mesh, other = shapes[number]
+        carried = read_landmark_file(result_directory / "landmarks" / f"shape{number}.csv")
+        assert carried.names == ("a", "b", "c")
+        offsets = carried.positions - mesh.vertices[other[rows]]
+        assert np.linalg.norm(offsets, axis=1).max() < 0.2 * np.sqrt(mesh.area)
+
+
+def test_the_same_command_continues(result_directory, directory, run, matched):
+    outcome = run("collection", directory, "--output", result_directory, *OPTIONS, "--quiet")
+    assert outcome.code == 0, outcome.errors
+    assert matched == []
+    assert "4 shapes" in outcome.output
+
+
+def test_other_settings_need_another_directory(result_directory, directory, run):
+    outcome = run("collection", directory, "--output", result_directory, *OPTIONS[:-1], "3")
+    assert_refused(outcome, naming="edges = 2")
+
+
+@pytest.mark.parametrize(
+    ("options", "naming"),
+    [
+        (("--suffix", ".docx"), ".docx"),
+        (("--template", "elsewhere.ply"), "--template"),
+        (("--landmarks-of", "shape0.ply"), "--landmarks"),
+        (("--landmarks", "other.csv"), "--landmarks-of"),
+        (("--attributes-of", "shape9.ply"), "--attributes-of"),
+    ],
+)
+def test_bad_options_are_refused(directory, run, tmp_path, options, naming):
+    outcome = run("collection", directory, "--output", tmp_path / "out", *options)
+    assert_refused(outcome, naming=naming)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_directory_without_meshes_is_refused(run, tmp_path):
+    assert_refused(run("collection", tmp_path, "--output", tmp_path / "out"), naming="at least two")
+    assert_refused(run("collection", tmp_path / "none", "--output", tmp_path / "out"), naming="none")
+
+
+def test_the_results_do_not_go_into_the_directory_of_the_meshes(directory, run):
+    before = sorted(os.listdir(directory))
+    assert_refused(run("collection", directory, "--output", directory), naming="another directory")
+    assert sorted(os.listdir(directory)) == before
+
+
+def test_names_with_equal_stems_are_kept_apart(meshes, run, tmp_path):
+    for suffix, mesh in ((".ply", meshes[0]), (".off", meshes[1])):
+        write_mesh(tmp_path / f"a{suffix}", mesh)
+    outcome = run("collection", tmp_path, "--output", tmp_path / "out", *OPTIONS)
+    assert outcome.code == 0, outcome.errors
+    assert sorted(path.name for path in Path(tmp_path / "out" / "registered").iterdir()) == [
+        "a_off.ply",
+        "a_ply.ply",
+    ]
