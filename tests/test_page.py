@@ -174,9 +174,10 @@ def test_the_same_input_gives_the_same_page(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_viewer_bundle_is_current_licensed_and_safe_to_embed() -> None:
+@pytest.mark.parametrize("bundle", ["viewer.js", "collection.js"])
+def test_bundles_are_current_licensed_and_safe_to_embed(bundle: str) -> None:
     assets = ROOT / "jaxsmw" / "report" / "assets"
-    viewer, license = (assets / "viewer.js").read_text("utf-8"), (assets / "THREE-LICENSE").read_text("utf-8")
+    viewer, license = (assets / bundle).read_text("utf-8"), (assets / "THREE-LICENSE").read_text("utf-8")
     assert license.strip() in viewer and "MIT" in license
     # The script must not end the script element early, and must not open a comment that hides the end tag.
     assert "</script" not in viewer.lower() and "<!--" not in viewer

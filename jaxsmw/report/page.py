@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import html
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
@@ -37,6 +33,7 @@ from jaxsmw.report.page_data import (
 )
 from jaxsmw.report.rendering import ELEVATION, choose_azimuth
 from jaxsmw.report.standing import stand_pair
+from jaxsmw.report.template import fill_template
 from jaxsmw.runtime.files import atomic_write
 
 # If the bodies are wider than this multiple of their height, narrow screens show one body above the other.
@@ -188,7 +185,7 @@ def write_page(
         "statistics": _statistics(statistics),
         "figures": _figures(figures),
     }
-    page = _fill_template(data, fragments)
+    page = fill_template("page.html", "viewer.js", data, fragments)
     with atomic_write(path) as temporary:
         temporary.write_bytes(page.encode("utf-8", "replace"))
 
@@ -244,29 +241,6 @@ def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spec
         if any(shown.functional_map is not None for shown in maps.values()):
             modes["eigenfunctions"] = "Eigenfunctions"
     return modes | {"plain": "Plain"}
-
-
-def _fill_template(data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
-    """The HTML of the page: the template, filled with the data, the fragments and the viewer's script."""
-    assets = files("jaxsmw.report") / "assets"
-    script = (assets / "viewer.js").read_text("utf-8")
-    parts = {
-        **fragments,
-        **{f"{name}_gradient": _gradient(colors) for name, colors in COLOR_SCALES.items()},
-        "plain_color": _gradient(PLAIN[None]),
-        # An unescaped "<" could end the script element or open a comment in it.
-        "data": json.dumps(data).replace("<", "\\u003c"),
-        "script": script,
-        "script_hash": f"sha256-{encode_bytes(hashlib.sha256(script.encode()).digest())}",
-    }
-    # All placeholders are replaced in one pass, because inserted text must not be searched for placeholders.
-    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / "page.html").read_text("utf-8"))
-
-
-def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """Up to nine colours of a colour scale, as text for a CSS gradient."""
-    chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
-    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:

@@ -1,5 +1,5 @@
-// Bundles viewer.js and the modules that it imports, with the parts of three.js that they use, into the package's
-// assets. Run `npm ci && npm run build` in this directory.
+// Bundles viewer.js and collection.js and the modules that they import, with the parts of three.js that they use, into
+// the package's assets. Run `npm ci && npm run build` in this directory.
 
 import { createHash } from "node:crypto";
 import { readdirSync, readFileSync, writeFileSync } from "node:fs";
@@ -12,8 +12,8 @@ const digest = hash.digest("hex");
 const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8");
 
 await build({
-  entryPoints: ["viewer.js"],
-  outfile: new URL("viewer.js", assets).pathname,
+  entryPoints: ["viewer.js", "collection.js"],
+  outdir: assets.pathname,
   bundle: true,
   minify: true,
   format: "iife",

@@ -2,42 +2,12 @@
 // functional map. Other modules add landmarks and the registered source. build.mjs bundles all of them with three.js
 // into jaxsmw/report/assets/viewer.js, which page.html embeds.
 
-import {
-  AmbientLight,
-  BackSide,
-  BufferAttribute,
-  BufferGeometry,
-  Color,
-  DirectionalLight,
-  DoubleSide,
-  HemisphereLight,
-  InstancedMesh,
-  Matrix4,
-  Mesh,
-  MeshBasicMaterial,
-  MeshStandardMaterial,
-  PerspectiveCamera,
-  Raycaster,
-  Scene,
-  SphereGeometry,
-  Spherical,
-  SRGBColorSpace,
-  Vector2,
-  Vector3,
-  WebGLRenderer,
-} from "three";
-import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { Vector3 } from "three";
+import { Body, decode, moveByKey, turns } from "./body.js";
 import { startHelp } from "./help.js";
 import { startLandmarks } from "./landmarks.js";
 import { startRegistered } from "./registered.js";
-import { Surface } from "./surface.js";
 
-const FIELD_OF_VIEW = 25;
-// The caption covers the top of the canvas. The body may use this share of the upper half.
-const BELOW_CAPTION = 0.85;
-const KEY_TURN = Math.PI / 18;
-const KEY_ZOOM = 1.15;
-const HIDDEN = 0.01; // a point is hidden if the surface is in front of it by this share of the diagonal
 const CLICK_TOLERANCE = 5; // the most pixels that the pointer moves between press and release of a click
 const NAMED_VERTICES = 12; // the most source vertices that are listed for one target vertex
 const WITHIN_SCALE = 0.98; // the share of values inside the colour scale of a function; the rest is clipped
@@ -45,10 +15,6 @@ const FIRST_ENTRY = [1, 1]; // the entry that the mode "eigenfunctions" opens wi
 
 const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
-const decode = (text, Type) => new Type(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
-
-// The light intensity of each byte of a screen colour. three.js interpolates and shades light intensities.
-const LINEAR = Float32Array.from({ length: 256 }, (_, byte) => new Color().setRGB(byte / 255, 0, 0, SRGBColorSpace).r);
 
 const maps = data.maps.map(({ name, map, errors, functional }) => ({
   name,
@@ -72,199 +38,12 @@ function readBasis({ eigenvectors, responses }) {
 }
 const filters = bases ? bases.x.responses.length / bases.x.k : 0;
 
-// Marks are white with a black rim, visible on every colour, and faint where the body hides them.
-const CORE = new SphereGeometry(1, 20, 14);
-const RIM = new SphereGeometry(1.5, 20, 14);
-const MARK_LOOKS = [
-  [RIM, new MeshBasicMaterial({ color: 0x000000, side: BackSide })],
-  [CORE, new MeshBasicMaterial({ color: 0xffffff })],
-  [CORE, new MeshBasicMaterial({ color: 0xffffff, transparent: true, opacity: 0.4, depthTest: false })],
-];
-
-/** One body in its canvas: the surface, the lights, the camera and the marks. */
-class Body {
-  #areas = null;
-
-  constructor(canvas, { vertices, faces }) {
-    this.canvas = canvas;
-    this.renderer = new WebGLRenderer({ canvas, alpha: true, antialias: true });
-    this.scene = new Scene();
-    this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.05, 100);
-    this.scene.add(this.camera);
-    this.#light();
-
-    this.positions = decode(vertices, Float32Array);
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(this.positions, 3));
-    geometry.setAttribute("color", new BufferAttribute(new Float32Array(this.positions.length), 3));
-    geometry.setIndex(new BufferAttribute(decode(faces, Uint32Array), 1));
-    geometry.computeVertexNormals();
-    geometry.computeBoundingSphere();
-    this.surface = new Mesh(
-      geometry,
-      new MeshStandardMaterial({ vertexColors: true, side: DoubleSide, roughness: 0.62 }),
-    );
-    this.scene.add(this.surface);
-
-    this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.enableDamping = false;
-    this.marked = [];
-    this.marks = [];
-    this.overlays = []; // further objects in the scene, which are placed before each picture
-    this.shape = new Surface(this.positions, geometry.index.array);
-  }
-
-  /** Adds lamps that move with the viewer, so that the visible side is always well lit. */
-  #light() {
-    const lamp = (strength, ...position) => {
-      const light = new DirectionalLight(0xffffff, strength);
-      light.position.set(...position);
-      this.camera.add(light, light.target);
-      light.target.position.set(0, 0, -1);
-    };
-    lamp(2.1, -0.7, 0.9, 0);
-    lamp(0.55, 1.3, 0.2, -0.3);
-    this.scene.add(new HemisphereLight(0xffffff, 0x8a8f99, 0.75), new AmbientLight(0xffffff, 0.35));
-  }
-
-  vertex(index) {
-    return new Vector3().fromArray(this.positions, 3 * index);
-  }
-
-  /** Colours the vertices, with three bytes each. */
-  paint(colors) {
-    this.colors = colors;
-    const attribute = this.surface.geometry.attributes.color;
-    for (let i = 0; i < colors.length; i++) attribute.array[i] = LINEAR[colors[i]];
-    attribute.needsUpdate = true;
-  }
-
-  /** The barycentric areas of the vertices. */
-  get areas() {
-    if (this.#areas) return this.#areas;
-    this.#areas = new Float32Array(this.positions.length / 3);
-    const corners = this.surface.geometry.index.array;
-    for (let f = 0; f < corners.length; f += 3) {
-      const [a, b, c] = [0, 1, 2].map((corner) => this.vertex(corners[f + corner]));
-      const third = b.sub(a).cross(c.sub(a)).length() / 6;
-      for (let corner = 0; corner < 3; corner++) this.#areas[corners[f + corner]] += third;
-    }
-    return this.#areas;
-  }
-
-  /** Marks these vertices and removes all other marks. */
-  mark(indices) {
-    this.marked = indices;
-    for (const mark of this.marks) {
-      this.scene.remove(mark);
-      mark.dispose();
-    }
-    this.marks = MARK_LOOKS.map((look) => new InstancedMesh(...look, indices.length));
-    // Marks move after three.js has decided which objects are in view.
-    for (const mark of this.marks) mark.frustumCulled = false;
-    if (indices.length) this.scene.add(...this.marks);
-  }
-
-  /** The length at a point of the scene that covers one pixel of the screen. */
-  pixelAt(point) {
-    const height = (2 * Math.tan((FIELD_OF_VIEW * Math.PI) / 360)) / this.canvas.clientHeight;
-    return height * this.camera.position.distanceTo(point);
-  }
-
-  /** Places the marks so that they keep their size on the screen at every distance. */
-  #placeMarks() {
-    const pixels = this.marked.length > 1 ? 4.5 : 6;
-    this.marked.forEach((index, i) => {
-      const center = this.vertex(index);
-      const towards = this.camera.position.clone().sub(center);
-      const radius = pixels * this.pixelAt(center);
-      // Move the mark towards the viewer, so that the surface does not cut into it.
-      center.addScaledVector(towards.normalize(), 2 * radius);
-      const matrix = new Matrix4().makeScale(radius, radius, radius).setPosition(center);
-      for (const mark of this.marks) mark.setMatrixAt(i, matrix);
-    });
-    for (const mark of this.marks) mark.instanceMatrix.needsUpdate = true;
-  }
-
-  /** The distance from which the whole body is visible, seen from the direction of `offset`. */
-  distanceToFit(offset) {
-    const camera = this.camera.clone(false);
-    camera.position.copy(offset);
-    camera.lookAt(0, 0, 0);
-    camera.updateMatrixWorld();
-    const axes = [0, 1, 2].map((column) => new Vector3().setFromMatrixColumn(camera.matrixWorld, column));
-    const half = Math.tan((FIELD_OF_VIEW * Math.PI) / 360);
-    const point = new Vector3();
-    let distance = 0;
-    for (let i = 0; i < this.positions.length; i += 3) {
-      const [x, y, z] = axes.map((axis) => point.fromArray(this.positions, i).dot(axis));
-      const height = Math.max(-y, y / BELOW_CAPTION);
-      distance = Math.max(distance, z + height / half, z + Math.abs(x) / (half * this.camera.aspect));
-    }
-    return 1.08 * distance;
-  }
-
-  /** The point of the surface under the pointer, as { face, weights }, or null. */
-  pointAt(event) {
-    const hit = this.#hit(event);
-    return hit && this.shape.onFace(hit.faceIndex, hit.point.toArray());
-  }
-
-  /** The vertex under the pointer, or null. */
-  vertexAt(event) {
-    const point = this.pointAt(event);
-    return point && this.shape.nearestCorner(point);
-  }
-
-  /** Whether the surface hides a point on it from the camera. */
-  hides(position) {
-    const { x, y } = this.projectPoint(position);
-    const hit = this.#hit({ clientX: x, clientY: y });
-    const distance = this.camera.position.distanceTo(new Vector3(...position));
-    return Boolean(hit) && hit.distance < distance - HIDDEN * this.shape.diagonal;
-  }
-
-  #hit(event) {
-    const box = this.canvas.getBoundingClientRect();
-    const x = (2 * (event.clientX - box.left)) / box.width - 1;
-    const y = 1 - (2 * (event.clientY - box.top)) / box.height;
-    const raycaster = new Raycaster();
-    raycaster.setFromCamera(new Vector2(x, y), this.camera);
-    return raycaster.intersectObject(this.surface)[0] ?? null;
-  }
-
-  /** The position of a vertex in the window, in CSS pixels. */
-  project(index) {
-    return this.projectPoint(this.vertex(index).toArray());
-  }
-
-  projectPoint(position) {
-    const box = this.canvas.getBoundingClientRect();
-    this.camera.updateMatrixWorld();
-    const { x, y } = new Vector3(...position).project(this.camera);
-    return { x: box.left + ((x + 1) / 2) * box.width, y: box.top + ((1 - y) / 2) * box.height };
-  }
-
-  resize() {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.renderer.setSize(width, height, false);
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
-  }
-
-  render() {
-    this.#placeMarks();
-    for (const overlay of this.overlays) overlay.place();
-    this.renderer.render(this.scene, this.camera);
-  }
-}
-
 startHelp();
 
 let bodies;
 try {
-  bodies = { x: new Body(byId("canvas-x"), data.x), y: new Body(byId("canvas-y"), data.y) };
+  const body = (side) => new Body(byId(`canvas-${side}`), decode(data[side].vertices, Float32Array), decode(data[side].faces, Uint32Array));
+  bodies = { x: body("x"), y: body("y") };
 } catch (error) {
   byId("readout").textContent = "This browser cannot show the bodies because it does not support WebGL. Please try another browser.";
   throw error;
@@ -588,12 +367,6 @@ function chooseEntry(entry, hovered = null) {
 
 let untouched = true;
 
-function turnTo(body, offset) {
-  body.camera.position.copy(offset);
-  body.controls.target.set(0, 0, 0);
-  body.controls.update();
-}
-
 function resetView() {
   const offset = new Vector3().setFromSphericalCoords(1, Math.PI / 2 - data.elevation, data.azimuth);
   const distance = Math.max(...everyBody.map((body) => body.distanceToFit(offset)));
@@ -601,7 +374,7 @@ function resetView() {
   for (const body of everyBody) {
     body.controls.minDistance = distance / 40;
     body.controls.maxDistance = 4 * distance;
-    turnTo(body, offset);
+    body.lookFrom(offset);
   }
   untouched = true;
 }
@@ -612,7 +385,7 @@ function turnTowards(points) {
     if (!point || (side === "y" && byId("linked").checked)) continue;
     const body = bodies[side];
     const distance = body.camera.position.distanceTo(body.controls.target);
-    turnTo(body, new Vector3(...body.shape.viewOf(point)).setLength(distance));
+    body.lookFrom(new Vector3(...body.shape.viewOf(point)).setLength(distance));
   }
   untouched = false;
 }
@@ -631,24 +404,11 @@ function follow(body) {
   leader = null;
 }
 
-const turns = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-const zooms = { "+": 1 / KEY_ZOOM, "=": 1 / KEY_ZOOM, "-": KEY_ZOOM };
-
 function onKey(body, event) {
   if (event.altKey || event.ctrlKey || event.metaKey) return;
   if (landmarks.onKey(body, event)) return;
-  if (turns[event.key] || zooms[event.key]) {
-    const [around, over] = turns[event.key] ?? [0, 0];
-    const { controls, camera } = body;
-    const spherical = new Spherical().setFromVector3(camera.position.clone().sub(controls.target));
-    spherical.theta += around * KEY_TURN;
-    spherical.phi += over * KEY_TURN;
-    spherical.radius *= zooms[event.key] ?? 1;
-    spherical.makeSafe();
-    camera.position.setFromSpherical(spherical).add(controls.target);
-    controls.update();
-    untouched = false;
-  } else if (event.key === "0" || event.key === "Home") resetView();
+  if (moveByKey(body, event.key)) untouched = false;
+  else if (event.key === "0" || event.key === "Home") resetView();
   else if (event.key === "Escape") {
     pin("x", null);
     chooseEntry(null);
