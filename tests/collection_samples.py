@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.collection.shape_model import shape_model
+from jaxsmw.collection.shape_models import shape_model
 from jaxsmw.geometry.creature import creature
 from jaxsmw.report.collection_page import PageEdge
 

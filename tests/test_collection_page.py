@@ -12,7 +12,7 @@ from collection_samples import HOSTILE, collection
 from report_helpers import decode, embedded
 from scipy.spatial.distance import pdist
 
-from jaxsmw.collection.shape_model import shape_model
+from jaxsmw.collection.shape_models import shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh

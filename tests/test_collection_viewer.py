@@ -11,7 +11,7 @@ from browser_pages import OpenPage, differ
 from collection_samples import HOSTILE, collection
 from report_helpers import embedded
 
-from jaxsmw.collection.shape_model import shape_model
+from jaxsmw.collection.shape_models import shape_model
 from jaxsmw.report.collection_page import PageEdge, write_collection_page
 
 pytestmark = pytest.mark.browser

@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int, Int64, Real
 from scipy.spatial.distance import pdist, squareform
 
 from jaxsmw.choices import Axis
-from jaxsmw.collection.shape_model import ShapeModel, shape_model
+from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import PLAIN, position_colors
