@@ -7,7 +7,7 @@ import logging
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future, wait
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -526,7 +526,8 @@ def match_prepared(
     - `preset`: the stages and the repair.
     - `decision`: the decision between X and its mirror image.
     - `history`: whether to record a `History` of the last stage.
-    - `seconds`: a dictionary to which the times of the steps are added.
+    - `seconds`: a dictionary to which the times of the steps are added. With None, the steps are neither
+      measured nor reported as progress.
     - `compiling`: compilations in the background, which refinement waits for.
     - `alternatives`: whether repair tries alternative initial maps.
     - `refined`: for each start, the outcome of all stages if the stages already ran; see
@@ -536,10 +537,9 @@ def match_prepared(
 
     **Raises:** `ArithmeticError` if refinement fails numerically from every initial map.
     """
-    seconds = {} if seconds is None else seconds
     if starts[0].spectrum_x.descriptors is None:
         preset = preset.without_descriptors()
-    with timed("refinement", seconds), one_blas_thread():
+    with _step("refinement", seconds), one_blas_thread():
         wait(compiling)
         outcomes = [
             refine_in_stages(
@@ -556,15 +556,21 @@ def match_prepared(
         (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
     ] or [(starts[0], outcomes[0])]
     found = [
-        Match(_correspondence(pair, start, preset, outcome, seconds, decision), start, outcome, decision)
+        Match(
+            _correspondence(pair, start, preset, outcome, known_seconds, decision), start, outcome, decision
+        )
         for start, outcome in candidates
     ]
     if len(found) == 1:
         return found[0]
     assert preset.repair is not None
-    with timed("expected error", seconds):
+    with _step("expected error", seconds):
         from_shot, from_aligned = (float(one.correspondence.expected_error().mean()) for one in found)
     return found[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
+
+
+def _step(name: str, seconds: dict[str, float] | None) -> AbstractContextManager[None]:
+    return nullcontext() if seconds is None else timed(name, seconds)
 
 
 def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
