@@ -555,10 +555,9 @@ def match_prepared(
     candidates = [
         (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
     ] or [(starts[0], outcomes[0])]
+    times = {} if seconds is None else seconds
     found = [
-        Match(
-            _correspondence(pair, start, preset, outcome, known_seconds, decision), start, outcome, decision
-        )
+        Match(_correspondence(pair, start, preset, outcome, times, decision), start, outcome, decision)
         for start, outcome in candidates
     ]
     if len(found) == 1:
