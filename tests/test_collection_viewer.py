@@ -228,7 +228,7 @@ def test_keys_turn_bodies_and_move_between_shapes(page: CollectionPage) -> None:
             f"return [...document.querySelectorAll('{selector}')].filter((e) => e.tabIndex === 0).length"
         )
         assert stops == 1
-    page.run("document.querySelectorAll('#scores .node')[0].focus()")
+    page.run("document.querySelector('#scores .node').focus()")
     for key in (Keys.END, Keys.ARROW_LEFT):
         page.browser.switch_to.active_element.send_keys(key)
     assert page.tip.startswith(NAMES[3])
@@ -251,9 +251,9 @@ def test_graph_marks_doubtful_pairs_and_opens_pairs(page: CollectionPage) -> Non
     page.find("summary").click()
     page.find(".pair[data-edge='3']").click()
     assert page.shown == (1, 4)
-    page.point_at(*page.center("#graph .node", 3), click=False)
+    page.point_at(*page.center("#graph [data-shape='3']"), click=False)
     assert page.tip.startswith("sit")
-    page.point_at(*page.center("#graph .node", 3), click=True)
+    page.point_at(*page.center("#graph [data-shape='3']"), click=True)
     assert page.shown == (1, 3)
     # The page scrolls up to the shapes.
     top = page.run("return document.getElementById('stage').getBoundingClientRect().top")
@@ -313,7 +313,7 @@ def test_modes_can_be_played(page: CollectionPage) -> None:
 
 def test_scores_are_plotted(page: CollectionPage) -> None:
     scores = np.array(embedded(page.path.read_text("utf-8"))["model"]["scores"])
-    script = "return [...document.querySelectorAll('#scores .dot')].map((e) => { const b = e.getBoundingClientRect(); return [b.x, b.y]; })"
+    script = "return [...document.querySelectorAll('#scores .node')].sort((a, b) => a.dataset.shape - b.dataset.shape).map((node) => node.querySelector('.dot')).map((e) => { const b = e.getBoundingClientRect(); return [b.x, b.y]; })"
 
     def fit(chosen: tuple[int, int]) -> float:
         """The largest distance between the plotted places and an affine map of the scores, in pixels."""
@@ -327,10 +327,15 @@ def test_scores_are_plotted(page: CollectionPage) -> None:
     page.run("const s = document.getElementById('across'); s.value = 1; s.dispatchEvent(new Event('change'))")
     page.run("const s = document.getElementById('upward'); s.value = 0; s.dispatchEvent(new Event('change'))")
     assert fit((1, 0)) < 0.5
-    page.point_at(*page.center("#scores .node", 4), click=False)
+    page.point_at(*page.center("#scores [data-shape='4']"), click=False)
     assert page.tip.split("\n")[0] == "blend" and "σ across" in page.tip
-    page.point_at(*page.center("#scores .node", 4), click=True)
+    page.point_at(*page.center("#scores [data-shape='4']"), click=True)
     assert page.shown == (0, 4)
+    # Nodes of the shapes that are shown are drawn over the other nodes.
+    order = page.run(
+        "return [...document.querySelectorAll('#scores .node')].map((node) => node.dataset.shape)"
+    )
+    assert order[:3] == ["1", "2", "3"] and set(order[3:]) == {"0", "4"}
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -371,7 +376,7 @@ def test_page_is_useful_without_webgl(browser: Any, page_file: Path) -> None:
     thumbs[2].click()
     assert page.shown == (0, 2)
     assert len(page.browser.find_elements("css selector", "#graph .node")) == len(NAMES)
-    page.point_at(*page.center("#scores .node", 3), click=False)
+    page.point_at(*page.center("#scores [data-shape='3']"), click=False)
     assert page.tip.startswith("sit")
     browser.get_log("browser")  # three.js reports the missing context
 

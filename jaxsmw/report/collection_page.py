@@ -119,7 +119,7 @@ def write_collection_page(
     in_view = [replace(standing, vertices=shapes[i], faces=chosen_faces) for i in some]
     data: dict[str, Any] = {
         "names": [_plain(name) for name in names],
-        "template": template,
+        "template": int(template),
         "faces": encode(chosen_faces, "<u4"),
         "vertices": None if len(chosen) == len(first.vertices) else encode(chosen, "<u4"),
         "colors": encode_colors(position_colors(standing)[chosen]),
@@ -130,8 +130,8 @@ def write_collection_page(
         "elevation": ELEVATION,
         "edges": [
             {
-                "source": edge.source,
-                "target": edge.target,
+                "source": int(edge.source),
+                "target": int(edge.target),
                 "error": float(edge.expected_error) if np.isfinite(edge.expected_error) else None,
                 "doubtful": bool(edge.doubtful),
                 "note": _plain(edge.note),

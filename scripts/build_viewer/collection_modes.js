@@ -99,7 +99,7 @@ export function startDeformation({ data, colors, faces, direction, readPositions
 
   let untouched = true;
   const resetView = () => {
-    body.lookFrom(direction.clone().setLength(1.12 * body.distanceToFit(direction)));
+    body.lookFrom(direction.clone().setLength(body.distanceToFit(direction)));
     untouched = true;
     draw();
   };

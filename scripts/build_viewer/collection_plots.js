@@ -62,7 +62,7 @@ export function startPlots({ data, open, compare }) {
   function addNodes(picture, places, radius, { withPictures, describe }) {
     const nodes = names.map((name, index) => {
       const [x, y] = places[index];
-      const node = svg("g", { class: "node", role: "button", "aria-label": name, transform: `translate(${x} ${y})` });
+      const node = svg("g", { class: "node", role: "button", "data-shape": index, "aria-label": name, transform: `translate(${x} ${y})` });
       if (withPictures) {
         node.append(svg("circle", { class: "disc", r: radius }));
         if (pictures[index]) addPicture(node, index, radius);
@@ -74,7 +74,7 @@ export function startPlots({ data, open, compare }) {
       explain(node, () => [name, describe(index), pictures[index]]);
       return node;
     });
-    picture.append(...nodes);
+    picture.append(svg("g", {}, ...nodes));
     rove(nodes, open);
     return nodes;
   }
@@ -184,6 +184,12 @@ export function startPlots({ data, open, compare }) {
 
   // ---- Drawing
 
+  /** Marks the nodes of the shapes that are shown, and draws these nodes over the other nodes. */
+  function markNodes(nodes) {
+    nodes.forEach((node, index) => node.classList.toggle("open", marks[index]));
+    nodes[0].parentNode.prepend(...nodes.filter((_, index) => !marks[index]));
+  }
+
   function start(id, make) {
     const plot = { container: byId(id), make, width: 0, drawn: null };
     plot.draw = () => {
@@ -191,7 +197,7 @@ export function startPlots({ data, open, compare }) {
       hush();
       plot.drawn = make(plot.width);
       plot.container.replaceChildren(plot.drawn.picture);
-      plot.drawn.nodes.forEach((node, index) => node.classList.toggle("open", marks[index]));
+      markNodes(plot.drawn.nodes);
     };
     new ResizeObserver(() => {
       const width = Math.round(plot.container.clientWidth);
@@ -218,7 +224,7 @@ export function startPlots({ data, open, compare }) {
   return {
     mark: (shown) => {
       marks = shown;
-      for (const { drawn } of plots) drawn?.nodes.forEach((node, index) => node.classList.toggle("open", marks[index]));
+      for (const { drawn } of plots) if (drawn) markNodes(drawn.nodes);
     },
     moveCursor: (values) => {
       cursor = values.slice();

@@ -1,4 +1,4 @@
-/* Built from the viewer's sources with SHA-256 211289884b4f9c322740695f40a46633cd49b0a38b3b36e0c669b2e3b28e71ba.
+/* Built from the viewer's sources with SHA-256 32737f89f277bb2c0b78a4ea5203811ab1ffa287798bcb6105e86475a6a39e43.
 Contains three.js:
 
 The MIT License
