@@ -45,7 +45,7 @@ from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
-from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.repair.settings import WITHOUT_REPAIR, RepairSettings
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
@@ -81,10 +81,10 @@ class Correspondence:
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
-      and larger for worse maps; None if the preset has no repair.
-    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. Also True
-      if `match` is uncertain whether X or its mirror image corresponds to Y, for example if `mirror_evidence`
-      is between 0 and 0.1. If the preset has no repair, only this second condition is checked.
+      and larger for worse maps.
+    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. If the
+      preset has no repair, True if the distortion is at least 1.25. Also True if `match` is uncertain whether
+      X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. In both cases, entry i of `pointwise_map` is the match of
       vertex i of X.
@@ -364,8 +364,9 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    The function issues a `UserWarning` if the map still looks wrong after repair, if X and its mirror image
-    match Y about equally well, or if a mesh is too coarse for the descriptors of the preset.
+    The function issues a `UserWarning` if the map looks wrong (after repair, if the preset has repair), if X
+    and its mirror image match Y about equally well, or if a mesh is too coarse for the descriptors of the
+    preset.
 
     **Arguments:**
 
@@ -497,7 +498,6 @@ class Match(NamedTuple):
     def warn_if_suspicious(self) -> None:
         """Issue a `UserWarning` if the map looks wrong, or if the hand of X is doubtful."""
         if self.outcome.suspicious:
-            assert self.correspondence.preset.repair is not None
             warning = _warning(self.prepared, self.correspondence.preset.repair, self.outcome)
             warnings.warn(warning, stacklevel=3)
         if self.decision.doubtful:
@@ -638,15 +638,18 @@ def _doubt(pair: Pair, decision: Decision) -> str:
     )
 
 
-def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -> str:
+def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Outcome) -> str:
     """Return the text of the warning that a map looks wrong."""
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
+    settings = repair or WITHOUT_REPAIR
     found = np.asarray(outcome.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
     areas = pair.mesh_x.vertex_areas / pair.mesh_x.area
-    mirrored = areas[orientation_reversal(pair, found, spectrum_x, repair.scores)].sum()
-    cut_off = areas[discontinuous_parts(pair, found, repair.scores)].sum()
+    mirrored = areas[orientation_reversal(pair, found, spectrum_x, settings.scores)].sum()
+    cut_off = areas[discontinuous_parts(pair, found, settings.scores)].sum()
     more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
     cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
+    if repair is None:
+        cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
     if pair.partial:
         cure += ", and check that both meshes have the same unit of length"
     else:
@@ -655,7 +658,7 @@ def _warning(prepared: PreparedPair, repair: RepairSettings, outcome: Outcome) -
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
         f"distortion {outcome.distortion:.3f}, reverses the orientation of {mirrored:.0%} of the source's "
         f"area, and separates {cut_off:.0%} of the source's area by discontinuities. Correct maps between "
-        f"poses of one body have distortions up to {repair.suspicious}. Correct maps can have larger "
+        f"poses of one body have distortions up to {settings.suspicious}. Correct maps can have larger "
         "distortions between non-isometric shapes, with topological noise, or if one shape is mirrored. "
         "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
         f"the map is wrong, {cure}."

@@ -140,6 +140,19 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     assert right.distortion < 1.1 and not right.suspicious
 
 
+def test_maps_of_presets_without_repair_are_judged(body, mirrored, identity):
+    mesh, _ = body
+    with pytest.warns(
+        UserWarning, match=r"reverses the orientation of .* use preset=\"accurate\" \(--preset"
+    ):
+        wrong = match(mesh, mesh, preset=Preset((STAGE,)), init=mirrored, mirror="no")
+    assert wrong.suspicious and wrong.distortion > 1.25
+    facts = summarize(wrong, {}, wrong.expected_error())
+    assert f"{wrong.distortion:.2f}; above 1.25 limbs may be swapped" in facts.values()
+    right = match(mesh, mesh, preset=Preset((STAGE,)), init=identity, mirror="no")
+    assert right.distortion < 1.1 and not right.suspicious
+
+
 def test_default_repair_settings_are_those_of_the_preset_and_documented():
     settings = RepairSettings()
     assert settings == PRESETS["accurate"].repair

@@ -25,7 +25,7 @@ class Outcome(NamedTuple):
     - `refinements`: one `Refinement` per stage, up to the first stage that failed.
     - `initial_map`: the initial map of the first stage (m,), 0-based vertices of Y. The initial map and the
       maps of the refinements may be padded.
-    - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed.
+    - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
     """
 

@@ -16,7 +16,7 @@ from jaxsmw.preparation import PreparedPair
 from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.scores import distinct
-from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.repair.settings import WITHOUT_REPAIR, RepairSettings
 from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
@@ -57,7 +57,7 @@ def refine_in_stages(
 
     - `prepared`: the pair with its spectra and its initial map.
     - `stages`: the stages, in the order in which they run.
-    - `repair`: the settings of the repair, or None for no repair.
+    - `repair`: the settings of the repair. With None, the outcome is judged but not repaired.
     - `alternatives`: alternative initial maps (m,), as an iterable that is consumed only if needed. By
       default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
       initial maps, there are no alternatives by default.
@@ -72,11 +72,12 @@ def refine_in_stages(
     views = [prepared.view(stage) for stage in stages]
     runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
     first = prepared.padded_map(prepared.initial_map)
-    if repair is None:
-        return refined or runner.run(0, Outcome([], first))
     finest = max((of_x for of_x, _ in views), key=lambda of_x: of_x.eigenvalues.shape[0])
-    repairer = _Repairer(runner, Judge(prepared.pair, finest, repair), repair)
-    best = repairer.judge.judged(refined) if refined else repairer.finished(repairer.begun(first))
+    judge = Judge(prepared.pair, finest, repair or WITHOUT_REPAIR)
+    if repair is None:
+        return judge.judged(refined or runner.run(0, Outcome([], first)))
+    repairer = _Repairer(runner, judge, repair)
+    best = judge.judged(refined) if refined else repairer.finished(repairer.begun(first))
     if best.successful and best.suspicious:
         best = repairer.repaired(best)
     if not (best.successful and best.suspicious):

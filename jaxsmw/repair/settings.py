@@ -166,6 +166,10 @@ class RepairSettings:
     scores: ScoreSettings = ScoreSettings()
 
 
+WITHOUT_REPAIR = RepairSettings(suspicious=1.25)
+"""The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
+
+
 @dataclass(frozen=True)
 class ChiralitySettings:
     """The settings of `jaxsmw.repair.chirality`, which decides whether X or its mirror image matches Y.

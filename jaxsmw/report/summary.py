@@ -26,6 +26,7 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence
 from jaxsmw.pair import Pair, paired_spectra
+from jaxsmw.repair.settings import WITHOUT_REPAIR
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -399,9 +400,9 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
-        repair, suspicion = correspondence.preset.repair, ""
-        if correspondence.suspicious and repair is not None:
-            suspicion = f"; above {repair.suspicious} limbs may be swapped"
+        settings, suspicion = correspondence.preset.repair or WITHOUT_REPAIR, ""
+        if correspondence.suspicious:
+            suspicion = f"; above {settings.suspicious} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
     steps = correspondence.seconds if seconds is None else seconds
