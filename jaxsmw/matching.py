@@ -221,7 +221,7 @@ class Correspondence:
         return register_mesh(
             self.mesh_x,
             self.mesh_y,
-            self._surface_points,
+            self.surface_points(),
             stiffness=stiffness,
             same_unit=self.pair.partial,
         )

@@ -19,6 +19,8 @@ from jaxsmw.transfer import (
     transfer_attributes,
     transfer_landmarks,
 )
+from jaxsmw.transfer.neighborhoods import Neighborhoods, nearest_rotations
+from jaxsmw.transfer.registered_mesh import _follow
 
 TURN = Rotation.from_euler("zyx", [40, -70, 110], degrees=True).as_matrix()
 MIRROR = TURN @ np.diag([-1.0, 1, 1])
@@ -130,6 +132,52 @@ class TestRegisteredMesh:
             offsets.append(in_percent((registered.vertices - mesh_y.vertices)[used], mesh_y).max())
         assert scales[0] < 1e-4 and offsets[0] < 1e-3
         assert scales[1] > 0.1  # the size of the whole would be the size of the part
+
+    @pytest.mark.parametrize("flatness", [1, 1e-2, 1e-6, 0])
+    def test_the_nearest_rotations_are_those_of_the_singular_value_decomposition(self, flatness):
+        moments = np.random.default_rng(0).normal(size=(500, 3, 3)) * [1, 1, flatness]
+        moments[0] = 0
+        moments[1] = np.outer([1, 2, 3], [1, 0, 1])  # many rotations maximise the trace
+        left, singular, right = np.linalg.svd(moments)
+        signs = np.sign(np.linalg.det(left @ right))
+        expected = (left * np.stack([np.ones(500), np.ones(500), signs], axis=1)[:, None]) @ right
+        rotations, traces = nearest_rotations(moments)
+        np.testing.assert_allclose(rotations[2:], expected[2:], atol=1e-9)
+        np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-9)
+        np.testing.assert_allclose(traces, singular[:, :2].sum(axis=1) + signs * singular[:, 2], atol=1e-12)
+        np.testing.assert_allclose(np.einsum("nij,nij->n", rotations, moments), traces, atol=1e-9)
+
+    def test_a_deformation_solves_its_linear_system(self):
+        mesh, generator = bumpy_mesh(3), np.random.default_rng(0)
+        targets = mesh.vertices + 0.05 * generator.normal(size=mesh.vertices.shape)
+        weights = mesh.vertex_areas * np.where(mesh.vertices[:, 2] > 0.5, 1e-3, 1.0)
+        around, stiffness = Neighborhoods(mesh), 0.1
+        similarities = around.similarities(targets)
+        found = _follow(around, similarities, weights, targets, stiffness, targets)
+        # The same system, written with the edges.
+        first, second = mesh.edges.T
+        matrices = similarities.rotations * similarities.scales[:, None, None]
+        turned = np.einsum("eij,ej->ei", 0.5 * (matrices[first] + matrices[second]), around.vectors)
+        right = weights[:, None] * targets
+        np.add.at(right, first, stiffness**2 * around.weights[:, None] * turned)
+        np.subtract.at(right, second, stiffness**2 * around.weights[:, None] * turned)
+        system = np.diag(weights)
+        for i, j in ((first, first), (second, second)):
+            np.add.at(system, (i, j), stiffness**2 * around.weights)
+        for i, j in ((first, second), (second, first)):
+            np.subtract.at(system, (i, j), stiffness**2 * around.weights)
+        expected = np.linalg.solve(system, right)
+        assert np.abs(found - expected).max() < 0.05 * stiffness < 0.1 * np.abs(targets - expected).max()
+        # Few vertices move after the change of one target.
+        targets[0] += 0.5
+        again = _follow(around, similarities, weights, targets, stiffness, found)
+        still = (again == found).all(axis=1)
+        assert 0.5 < still.mean() < 1
+        # Each deformation reaches further vertices.
+        for _ in range(5):
+            again = _follow(around, similarities, weights, targets, stiffness, again)
+        right[0] += weights[0] * 0.5
+        assert np.abs(again - np.linalg.solve(system, right)).max() < 0.05 * stiffness
 
     def test_a_flat_mesh_is_rotated_and_not_mirrored(self):
         mesh_x = make_mesh(*grid_mesh(9, 9))

@@ -23,24 +23,43 @@ def nearest_surface_points(
     **Returns:** The nearest points, p `SurfacePoints`, and the Euclidean distances to them (p,), in the
     unit of the mesh.
     """
-    if not len(points):
-        return SurfacePoints(np.empty(0, np.int64), np.empty((0, 3))), np.empty(0)
-    # Coordinates relative to the middle of the mesh reduce rounding errors if the mesh is far from the
-    # origin.
-    middle = mesh.vertices[mesh.referenced_vertices].mean(axis=0)
-    vertices = mesh.vertices - middle
-    squared, faces, nearest = igl.point_mesh_squared_distance(points - middle, vertices, mesh.faces)
-    faces = np.atleast_1d(faces).astype(np.int64)
-    corners = (np.ascontiguousarray(vertices[mesh.faces[faces, corner]]) for corner in range(3))
-    weights = np.atleast_2d(igl.barycentric_coordinates(np.atleast_2d(nearest), *corners))
-    # A triangle without area has no barycentric coordinates: its nearest corner represents the point.
-    undefined = ~np.isfinite(weights).all(axis=1)
-    if undefined.any():
-        offsets = vertices[mesh.faces[faces[undefined]]] - np.atleast_2d(nearest)[undefined, None]
-        weights[undefined] = np.eye(3)[np.linalg.norm(offsets, axis=2).argmin(axis=1)]
-    weights = np.maximum(weights, 0)  # rounding errors can make weights negative
-    weights /= weights.sum(axis=1, keepdims=True)
-    return SurfacePoints(faces, weights), np.sqrt(np.maximum(np.atleast_1d(squared), 0))
+    return SurfaceTree(mesh).nearest(points)
+
+
+class SurfaceTree:
+    """A tree of the triangles of a mesh, for several searches of nearest points.
+
+    **Arguments:**
+
+    - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._faces = mesh.faces
+        # Coordinates relative to the middle of the mesh reduce rounding errors if the mesh is far from the
+        # origin.
+        self._middle = mesh.vertices[mesh.referenced_vertices].mean(axis=0)
+        self._vertices = mesh.vertices - self._middle
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+
+    def nearest(self, points: Float64[np.ndarray, "p 3"]) -> tuple[SurfacePoints, Float64[np.ndarray, " p"]]:
+        """Find the nearest point on the triangles for each point in space; see `nearest_surface_points`."""
+        if not len(points):
+            return SurfacePoints(np.empty(0, np.int64), np.empty((0, 3))), np.empty(0)
+        vertices = self._vertices
+        squared, faces, nearest = self._tree.squared_distance(vertices, self._faces, points - self._middle)
+        faces = np.atleast_1d(faces).astype(np.int64)
+        corners = (np.ascontiguousarray(vertices[self._faces[faces, corner]]) for corner in range(3))
+        weights = np.atleast_2d(igl.barycentric_coordinates(np.atleast_2d(nearest), *corners))
+        # A triangle without area has no barycentric coordinates: its nearest corner represents the point.
+        undefined = ~np.isfinite(weights).all(axis=1)
+        if undefined.any():
+            offsets = vertices[self._faces[faces[undefined]]] - np.atleast_2d(nearest)[undefined, None]
+            weights[undefined] = np.eye(3)[np.linalg.norm(offsets, axis=2).argmin(axis=1)]
+        weights = np.maximum(weights, 0)  # rounding errors can make weights negative
+        weights /= weights.sum(axis=1, keepdims=True)
+        return SurfacePoints(faces, weights), np.sqrt(np.maximum(np.atleast_1d(squared), 0))
 
 
 def distances_to_surface(points: Float64[np.ndarray, "p 3"], mesh: Mesh) -> Float64[np.ndarray, " p"]:

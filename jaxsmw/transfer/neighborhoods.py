@@ -13,6 +13,12 @@ from scipy.sparse import csr_array, diags_array
 
 from jaxsmw.geometry.mesh import Mesh
 
+# The number of averagings of moments. More averagings enlarge the neighbourhood of each vertex. With fewer
+# averagings, the similarity transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
+_AVERAGINGS = 8
+# Newton's method for the trace converges in 4 to 14 steps if the divisor exceeds `_AMBIGUOUS`. The error of a
+# rotation is then below 1e-10.
+_NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
 # to the range from 1/_WEIGHT_RANGE to _WEIGHT_RANGE times the median weight.
 _WEIGHT_RANGE = 10.0
@@ -74,17 +80,37 @@ class Neighborhoods:
         return np.clip(weights, median / _WEIGHT_RANGE, median * _WEIGHT_RANGE)
 
     @cached_property
-    def incidence(self) -> csr_array:
-        """The matrix (n, e) that takes values on edges to signed sums at vertices."""
-        e = np.arange(len(self.edges))
-        signs = np.repeat([1.0, -1.0], len(e))
-        shape = len(self.mesh.vertices), len(e)
-        return csr_array((signs, (self.edges.T.ravel(), np.tile(e, 2))), shape=shape)
-
-    @cached_property
     def laplacian(self) -> csr_array:
         """The Laplacian of the weighted edges (n, n), positive semi-definite."""
-        return csr_array(self.incidence @ diags_array(self.weights) @ self.incidence.T)
+        adjacency = self._matrix(self.weights, self.weights)
+        return csr_array(diags_array(adjacency.sum(axis=1)) - adjacency)
+
+    @cached_property
+    def components(self) -> tuple[csr_array, csr_array, csr_array]:
+        """The weighted x, y and z components of all edge vectors, each a matrix (n, n).
+
+        The entry (i, j) is a component of the vector from vertex j to vertex i, times the weight of the edge.
+        """
+        x, y, z = (self.weights * component for component in self.vectors.T)
+        return self._matrix(x, -x), self._matrix(y, -y), self._matrix(z, -z)
+
+    @cached_property
+    def component_sums(self) -> Float64[np.ndarray, "n 3"]:
+        """The sums of the rows of `components`."""
+        return np.stack([matrix.sum(axis=1) for matrix in self.components], axis=1)
+
+    @cached_property
+    def squared_lengths(self) -> Float64[np.ndarray, " n"]:
+        """The weighted squared lengths of the edges at each vertex, averaged like the moments."""
+        of_edges = self.weights * (self.vectors**2).sum(axis=1)
+        return self._averaged(self._matrix(of_edges, of_edges).sum(axis=1))
+
+    def _matrix(self, forward: Float64[np.ndarray, " e"], backward: Float64[np.ndarray, " e"]) -> csr_array:
+        """Return the matrix (n, n) with an entry for each edge in both directions."""
+        first, second = self.edges.T
+        at = np.concatenate([first, second]), np.concatenate([second, first])
+        n = len(self.mesh.vertices)
+        return csr_array((np.concatenate([forward, backward]), at), shape=(n, n))
 
     @cached_property
     def averaging(self) -> csr_array:
@@ -93,35 +119,93 @@ class Neighborhoods:
         inverse = np.divide(1, totals, out=np.zeros_like(totals), where=totals > 0)
         return csr_array(diags_array(np.ones(len(totals))) - 0.5 * diags_array(inverse) @ self.laplacian)
 
+    def _averaged(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
+        """Average the values at each vertex with those of its neighbourhood."""
+        for _ in range(_AVERAGINGS):
+            values = self.averaging @ values
+        return values
+
     def differences(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "e ..."]:
         """Return the value at the first vertex minus the value at the second vertex of each edge."""
         return values[self.edges[:, 0]] - values[self.edges[:, 1]]
 
-    def similarities(self, positions: Float64[np.ndarray, "n 3"], averagings: int) -> Similarities:
+    def similarities(self, positions: Float64[np.ndarray, "n 3"]) -> Similarities:
         """Fit a similarity transformation to each neighbourhood, from the mesh to other positions.
 
-        More averagings enlarge the neighbourhood of each vertex. The fit is that of as-rigid-as-possible
-        deformation (Sorkine, Alexa 2007), extended by a scale. If most neighbourhoods are reflected, all
-        rotations include a reflection.
+        The fit is that of as-rigid-as-possible deformation (Sorkine, Alexa 2007), extended by a scale. If
+        most neighbourhoods are reflected, all rotations include a reflection.
         """
-        vectors = self.vectors
-        products = self.weights[:, None, None] * self.differences(positions)[:, :, None] * vectors[:, None, :]
-        lengths = self.weights * (vectors**2).sum(axis=1)
-        sums = abs(self.incidence) @ np.column_stack([products.reshape(-1, 9), lengths])
-        for _ in range(averagings):
-            sums = self.averaging @ sums
-        moments, lengths = sums[:, :9].reshape(-1, 3, 3), sums[:, 9]
-        left, singular, right = np.linalg.svd(moments)
+        components = zip(self.components, self.component_sums.T, strict=True)
+        columns = [total[:, None] * positions - matrix @ positions for matrix, total in components]
+        moments = np.stack(columns, axis=2)
+        moments = self._averaged(moments.reshape(-1, 9)).reshape(-1, 3, 3)
         # The determinants of a flat mesh are rounding errors, so their signs mean nothing.
-        hand = -1.0 if np.linalg.det(moments).sum() < -_FLAT * (singular[:, 0] ** 3).sum() else 1.0
-        flip = np.where(np.linalg.det(left @ right) * hand < 0, -1.0, 1.0)
-        left[:, :, 2] *= flip[:, None]
-        singular[:, 2] *= flip
-        scales = np.divide(singular.sum(axis=1), lengths, out=np.ones(len(lengths)), where=lengths > 0)
-        return Similarities(left @ right, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
+        determinants = (moments[:, 0] * np.cross(moments[:, 1], moments[:, 2])).sum(axis=1)
+        largest = ((moments**2).sum(axis=(1, 2)) ** 1.5).sum()
+        hand = -1.0 if determinants.sum() < -_FLAT * largest else 1.0
+        rotations, traces = nearest_rotations(hand * moments)
+        lengths = self.squared_lengths
+        scales = np.divide(traces, lengths, out=np.ones(len(lengths)), where=lengths > 0)
+        return Similarities(hand * rotations, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
 
-    def transformed(self, similarities: Similarities) -> Float64[np.ndarray, "e 3"]:
-        """Return the vector of each edge, transformed by the mean of the transformations of its vertices."""
+    def divergence(self, similarities: Similarities) -> Float64[np.ndarray, "n 3"]:
+        """Return the weighted sum of the transformed vectors of the edges at each vertex.
+
+        Each edge vector is transformed by the mean of the transformations of its ends, and points to the
+        vertex at which it is summed.
+        """
         matrices = similarities.rotations * similarities.scales[:, None, None]
-        means = 0.5 * (matrices[self.edges[:, 0]] + matrices[self.edges[:, 1]])
-        return np.einsum("eij,ej->ei", means, self.vectors)
+        sums = np.zeros((len(matrices), 3))
+        for axis, (matrix, total) in enumerate(zip(self.components, self.component_sums.T, strict=True)):
+            columns = np.ascontiguousarray(matrices[:, :, axis])
+            sums += total[:, None] * columns + matrix @ columns
+        return 0.5 * sums
+
+
+def nearest_rotations(
+    moments: Float64[np.ndarray, "n 3 3"],
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"]]:
+    """Find for each matrix M the rotation R that maximises the trace of Rᵀ M.
+
+    The maximal trace is the largest root of a polynomial of degree four, which Newton's method finds. The
+    rotation then has a closed form (Markley, "Attitude determination using vector observations: a fast
+    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition, which
+    only replaces it where the rotation is nearly ambiguous.
+
+    **Returns:** The rotations (n, 3, 3), with determinants 1, and the maximal traces (n,).
+    """
+    norms = np.sqrt((moments**2).sum(axis=(1, 2)))
+    scaled = moments / np.where(norms > 0, norms, 1)[:, None, None]
+    # The vertices are the last axis, along which NumPy computes fastest.
+    m = np.ascontiguousarray(scaled.transpose(1, 2, 0))
+    cofactors = np.stack([_cross(m[1], m[2]), _cross(m[2], m[0]), _cross(m[0], m[1])])
+    determinants = (m[0] * cofactors[0]).sum(axis=0)
+    constant = 1 - 4 * (cofactors**2).sum(axis=(0, 1))
+    # Newton's method starts from an upper bound of the trace, and descends to the largest root.
+    trace = np.full(len(moments), np.sqrt(3.0))
+    for _ in range(_NEWTON_STEPS):
+        square = trace**2
+        slope = 4 * trace * (square - 1) - 8 * determinants
+        value = (square - 2) * square - 8 * determinants * trace + constant
+        trace -= value / np.maximum(slope, np.finfo(float).tiny)
+    half = 0.5 * (trace**2 - 1)
+    # The divisor is the product of the sums of two singular values, of which the last has the sign of the
+    # determinant.
+    divisor = half * trace - determinants
+    unique = divisor > _AMBIGUOUS
+    gram = np.einsum("ian,jan->ijn", m, m)
+    rotations = (half + 1) * m + trace * cofactors - np.einsum("ijn,jkn->ikn", gram, m)
+    rotations = np.ascontiguousarray((rotations / np.where(unique, divisor, 1)).transpose(2, 0, 1))
+    traces = trace * norms
+    if not unique.all():
+        left, singular, right = np.linalg.svd(moments[~unique])
+        signs = np.sign(np.linalg.det(left @ right))
+        left[:, :, 2] *= signs[:, None]
+        singular[:, 2] *= signs
+        rotations[~unique], traces[~unique] = left @ right, singular.sum(axis=1)
+    return rotations, traces
+
+
+def _cross(u: Float64[np.ndarray, "3 n"], v: Float64[np.ndarray, "3 n"]) -> Float64[np.ndarray, "3 n"]:
+    """Return the cross products of the columns."""
+    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])

@@ -15,7 +15,8 @@ from scipy.sparse.linalg import cg
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import Mesh, count_of, extend_to_unreferenced
-from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_surface_points
+from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 
 DEFAULT_STIFFNESS = 0.003
@@ -23,9 +24,6 @@ DEFAULT_STIFFNESS = 0.003
 
 # The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
 _STIFFNESS_OF_MAPS = 0.01
-# The number of averagings that `Neighborhoods.similarities` makes. With fewer averagings, the similarity
-# transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
-_AVERAGINGS = 8
 
 
 class _Round(NamedTuple):
@@ -50,8 +48,10 @@ class _Round(NamedTuple):
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
 # target, and folds that come back are removed. (Entry R22)
 _ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.2), _Round(6, 0.4, 1))
-# The relative residual at which the linear solver stops.
+# The residual at which the linear solver stops, relative to the right side.
 _TOLERANCE = 1e-5
+# A deformation keeps positions whose errors are at most this fraction of the stiffness. (Entry R22)
+_KEPT = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,8 @@ class RegisteredMesh:
         The normal of such a face makes an angle of more than 90 degrees with its normal on X, after the
         normal on X is rotated with the face's neighbourhood.
         """
-        return _flipped_faces(self.mesh_x, self.vertices, self.similarities)
+        normals = _normals(self.mesh_x.vertices, self.mesh_x)
+        return _flipped_faces(self.mesh_x, normals, self.vertices, self.similarities)
 
     @cached_property
     def area_ratios(self) -> Float64[np.ndarray, " f"]:
@@ -218,21 +219,22 @@ def register_mesh(
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
-    positions, similarities = targets, around.similarities(targets, _AVERAGINGS)
+    positions, similarities = targets, around.similarities(targets)
     weights, number = areas.copy(), 0
+    normals = _normals(mesh_x.vertices, mesh_x)
     for of_round in _ROUNDS:
         loose = weights < areas
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
+            surface = SurfaceTree(mesh_y)
         for _ in range(of_round.deformations):
             if of_round.pull:
-                nearest, _ = nearest_surface_points(positions[loose] + middle, mesh_y)
+                nearest, _ = surface.nearest(positions[loose] + middle)
                 targets[loose] = nearest.positions(mesh_y) - middle
-            edge_vectors = around.transformed(similarities)
-            positions = _follow(around, edge_vectors, weights, targets, (stiffness * root) ** 2, positions)
-            similarities = around.similarities(positions, _AVERAGINGS)
+            positions = _follow(around, similarities, weights, targets, stiffness * root, positions)
+            similarities = around.similarities(positions)
             number += 1
-            flipped = _flipped_faces(mesh_x, positions, similarities)
+            flipped = _flipped_faces(mesh_x, normals, positions, similarities)
             # The first deformation uses transformations that are fitted to the map itself, which is noisy.
             if not (of_round.pull or flipped.any()) and number > 1:
                 break
@@ -284,40 +286,65 @@ def points_of_map(
 
 def _follow(
     around: Neighborhoods,
-    edge_vectors: Float64[np.ndarray, "e 3"],
+    similarities: Similarities,
     weights: Float64[np.ndarray, " m"],
     targets: Float64[np.ndarray, "m 3"],
-    squared_stiffness: float,
-    guess: Float64[np.ndarray, "m 3"],
+    stiffness: float,
+    positions: Float64[np.ndarray, "m 3"],
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the positions that follow weighted targets and edge vectors in the least-squares sense."""
-    system = csr_array(diags_array(weights) + squared_stiffness * around.laplacian)
-    forces = squared_stiffness * (around.incidence @ (around.weights[:, None] * edge_vectors))
-    right = forces + weights[:, None] * targets
+    """Return the positions that follow weighted targets and edge vectors in the least-squares sense.
+
+    The edge vectors are those of X, transformed by `similarities`. The linear system is solved for the
+    vertices at which the given positions are not accurate, and for their neighbours. All other vertices stay
+    where they are. If they are no longer accurate then, the next deformation moves them.
+    """
+    system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
+    right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
+    residual = right - system @ positions
+    # The rows of the system have the sums `weights`, and all entries outside of the diagonal are negative.
+    # Therefore no position has a larger error than the largest quotient of a residual and a weight. The
+    # criterion stays correct where small weights make the system ill-conditioned.
+    moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
+    rows = np.flatnonzero(around.averaging @ moving)
+    if not len(rows):
+        return positions
+    if len(rows) < len(weights):
+        system, residual = system[rows][:, rows], residual[rows]
     preconditioner = diags_array(1 / system.diagonal())
-    columns = [
-        cg(system, b, x0=x, rtol=_TOLERANCE, M=preconditioner, maxiter=10 * len(weights))[0]
-        for b, x in zip(right.T, guess.T, strict=True)
-    ]
-    return np.stack(columns, axis=1)
+    tolerances = _TOLERANCE * np.linalg.norm(right, axis=0)
+    moved = positions.copy()
+    with one_blas_thread():
+        for axis, tolerance in enumerate(tolerances):
+            # An absolute tolerance stops at the same accuracy if few vertices move.
+            found, _ = cg(
+                system, residual[:, axis], rtol=0, atol=tolerance, M=preconditioner, maxiter=10 * len(weights)
+            )
+            moved[rows, axis] += found
+    return moved
 
 
 def _flipped_faces(
-    mesh_x: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
+    mesh_x: Mesh,
+    normals: Float64[np.ndarray, "f 3"],
+    positions: Float64[np.ndarray, "m 3"],
+    similarities: Similarities,
 ) -> Bool[np.ndarray, " f"]:
-    """Return True for faces whose normal opposes the rotated normal of the source's face."""
+    """Return True for faces whose normal opposes the rotated normal of the source's face.
+
+    `normals` are the normals of the source's faces.
+    """
     rotations = similarities.rotations
     hand = np.sign(np.linalg.det(rotations[0]))
-    expected = hand * np.einsum(
-        "fij,fj->fi", rotations[mesh_x.faces].sum(axis=1), _normals(mesh_x.vertices, mesh_x)
-    )
-    return (expected * _normals(positions, mesh_x)).sum(axis=1) < 0
+    first, second, third = mesh_x.faces.T
+    sums = rotations[first] + rotations[second] + rotations[third]
+    return hand * np.einsum("fi,fij,fj->f", _normals(positions, mesh_x), sums, normals) < 0
 
 
 def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:
     """Return the face normals of a mesh at other vertex positions. The normals are not unit vectors."""
-    corners = vertices[mesh.faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    first, second, third = mesh.faces.T
+    origins = vertices[first]
+    return np.cross(vertices[second] - origins, vertices[third] - origins)
 
 
 def _angles(corners: Float64[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, "f 3"]:
