@@ -545,6 +545,7 @@ class _Matcher:
         points |= {(j, i): found.backward for (i, j), found in self.maps.items()}
         vertex_maps = {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()}
         prior = np.array([found.expected_error for found in self.maps.values()])
+        prior += self.settings.distortion_weight * self._distortions()
         estimated, self.cycles, _ = estimate_edge_errors(
             edges,
             vertex_maps,
@@ -552,14 +553,18 @@ class _Matcher:
             [self._cycle_samples(number) for number in range(len(meshes))],
             prior,
         )
-        # A map that looks good by itself, and only differs from the others by chance, is no better than it
-        # expects to be.
-        errors = np.maximum(estimated, prior / 2)
+        # A small cycle error can arise by chance, so a map is not trusted much more than it expects. Wrong
+        # maps can be consistent with each other. Their distortions are then larger.
+        errors = np.maximum(estimated, prior / 2) + self.settings.distortion_weight * self._distortions()
         network = Network(
             meshes, points, dict(zip(edges, errors.tolist(), strict=True)), self.settings.synchronization
         )
         chosen = network.medoid() if template is None else template
         return network, chosen, synchronize(network, chosen)
+
+    def _distortions(self) -> Float64[np.ndarray, " e"]:
+        """Return the logarithm of the distortion of each edge's map, zero for isometries."""
+        return np.log([max(found.distortion or 1.0, 1.0) for found in self.maps.values()])
 
     def _cycle_samples(self, number: int) -> Int64[np.ndarray, " s"]:
         samples = self.shapes[number].samples
@@ -593,14 +598,19 @@ class _Matcher:
     def _better(
         self, again: Mapping[Edge, EdgeMap], network: Network, points: Sequence[SurfacePoints]
     ) -> dict[Edge, EdgeMap]:
-        """Return the new maps that are closer to the consistent maps than the old maps are."""
+        """Return the new maps that are closer to the consistent maps than the old maps, and no worse.
+
+        If the consistent map is wrong, a new map that follows it has a larger distortion than the old map.
+        """
         better = {}
         for (i, j), found in again.items():
             before = self._residual(network, points, i, j) if (i, j) in self.maps else np.inf
             maps = {(i, j): found.forward, (j, i): found.backward}
             errors = {(min(i, j), max(i, j)): found.expected_error}
             now = self._residual(Network(self.meshes, maps, errors, network.settings), points, i, j)
-            if now < before:
+            old = self.maps[i, j].distortion if (i, j) in self.maps else None
+            limit = np.inf if old is None else old * self.settings.distortion_tolerance
+            if now < before and (found.distortion or 1.0) <= limit:
                 better[i, j] = found
         return better
 

@@ -11,17 +11,21 @@ from jaxsmw.collection.synchronization import SynchronizationSettings
 class CollectionSettings:
     """The settings of the graph and of the consistency of a collection.
 
-    Lengths are in units of the square root of the area of each shape. Table R25 is in
+    Lengths are in units of the square root of the area of each shape. Table R26 is in
     `docs/research_log.md`.
 
     **Attributes:**
 
-    - `edges_per_shape` (Table R25): the number of matched pairs divided by the number of shapes.
-    - `random_share` (Table R25): the share of random edges; see `choose_edges`.
+    - `edges_per_shape` (Table R26): the number of matched pairs divided by the number of shapes.
+    - `random_share` (Table R26): the share of random edges; see `choose_edges`.
     - `cycle_samples`: the number of samples of each shape at which cycles are compared.
-    - `contradicted_from` (Table R25): an edge contradicts the collection if the mean distance between its
+    - `contradicted_from` (Table R26): an edge contradicts the collection if the mean distance between its
       maps and the maps through the template is at least this value. The edge is then matched again, from the
       consistent map.
+    - `distortion_weight` (Table R26): the error of an edge grows by this number times the logarithm of the
+      distortion of its map.
+    - `distortion_tolerance`: a new map replaces the old map of an edge only if its distortion is at most this
+      multiple of the old distortion.
     - `rounds`: the largest number of times that contradicted edges are matched again.
     - `synchronization`: the settings of `synchronize`.
     """
@@ -30,5 +34,7 @@ class CollectionSettings:
     random_share: float = 0.25
     cycle_samples: int = 200
     contradicted_from: float = 0.05
+    distortion_weight: float = 0.25
+    distortion_tolerance: float = 1.02
     rounds: int = 2
     synchronization: SynchronizationSettings = SynchronizationSettings()  # noqa: RUF009 (immutable)

@@ -26,8 +26,8 @@ class SynchronizationSettings:
 
     **Attributes:**
 
-    - `iterations` (Table R25): the number of averagings.
-    - `robust_scale` (Table R25): the distance at which a point has half of the weight of a point at distance
+    - `iterations` (Table R26): the number of averagings.
+    - `robust_scale` (Table R26): the distance at which a point has half of the weight of a point at distance
       zero. Points of wrong maps are much farther away.
     - `discontinuity_distance`: if the matches of the corners of a triangle are farther apart, a point inside
       the triangle follows the match of the nearest corner instead of an average.
