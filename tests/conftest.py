@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,13 @@ import jax
 import jaxtyping
 import pytest
 from threadpoolctl import threadpool_limits
+
+# Each worker, and each command that the tests start, loads the bytecode that the first of them writes. Without
+# bytecode, each process would compile the package and all tests anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# Imports create many objects and no garbage. `pytest_collection_finish` enables garbage collection again.
+gc.disable()
 
 # The tests spend most of their time compiling small programs that run once. XLA's older loop emitters reduce
 # the compilation time to a third. The flags are set only for versions of JAX that have them, because XLA ends the
@@ -35,6 +43,7 @@ hypothesis.settings.load_profile("default")
 
 def pytest_collection_finish() -> None:
     """Exempt all objects that exist before the first test from garbage collection, which saves test time."""
+    gc.enable()
     gc.collect()
     gc.freeze()
 
@@ -106,12 +115,17 @@ def one_thread_each() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Share one cache of compiled programs among all commands that the tests start."""
+    """Share one cache of compiled programs among all commands that the tests start.
+
+    The commands compile as fast as the tests do.
+    """
     base = tmp_path_factory.getbasetemp()
     programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(programs))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
+        patch.setenv("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "false")
         yield
 
 
@@ -128,6 +142,13 @@ def forget_programs() -> Iterator[None]:
     """Release compiled programs after each test module, because the programs of all tests take gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw pictures with a ninth of the usual pixels, to save time."""
+    monkeypatch.setattr("jaxsmw.report.figures._DPI", 67)
+    monkeypatch.setattr("jaxsmw.report.figures._BODY_SIZE", (267, 267))
 
 
 @pytest.fixture

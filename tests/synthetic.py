@@ -77,9 +77,9 @@ def bumpy_mesh(subdivisions: int = 4) -> Mesh:
     return make_mesh(vertices * (1 + waves)[:, None], faces)
 
 
-def body_with_arms() -> Mesh:
+def body_with_arms(subdivisions: int = 4) -> Mesh:
     """The sphere of `bumpy_mesh` with an arm on the left and an arm on the right."""
-    sphere = bumpy_mesh(4)
+    sphere = bumpy_mesh(subdivisions)
     directions = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
     length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))
     return make_mesh(directions * length[:, None], sphere.faces)

@@ -46,7 +46,7 @@ from jaxsmw.runtime.workers import open_executor
 def scape(tmp_path_factory) -> Path:
     """Three deformed copies of a bumpy sphere, in the directory layout of the data set SCAPE."""
     directory = tmp_path_factory.mktemp("bodies")
-    mesh = bumpy_mesh(4)
+    mesh = bumpy_mesh(3)
     for number, stretch in enumerate(([1, 1, 1], [1.05, 1, 0.97], [1, 0.95, 1.04])):
         write_mesh(directory / f"mesh{number:03}.off", make_mesh(mesh.vertices * stretch, mesh.faces))
     return directory
@@ -262,8 +262,8 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     for kind, wrong in (("rough", 0.3), ("perfect", 0.0)):
         (tmp_path / kind).mkdir()
         for x, y in permutations(("mesh000", "mesh001", "mesh002"), 2):
-            truth = np.arange(2562)
-            shuffled = np.where(generator.random(2562) < wrong, generator.permutation(truth), truth)
+            truth = np.arange(642)
+            shuffled = np.where(generator.random(642) < wrong, generator.permutation(truth), truth)
             np.savetxt(tmp_path / kind / f"{x}_{y}.map", shuffled + 1, fmt="%d")
     output = tmp_path / "output"
     output.mkdir()

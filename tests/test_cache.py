@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import SMALL
 from synthetic import sphere_mesh
 
 from jaxsmw.errors import InputError
@@ -233,7 +234,7 @@ def test_many_processes_share_a_directory(directory, monkeypatch):
 def test_commands_cache_compiled_programs(tmp_path):
     mesh = tmp_path / "mesh.off"
     write_mesh(mesh, make_mesh(*sphere_mesh(2)))
-    command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), "--eigenvectors", "20"]
+    command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), *SMALL]
     command += ["--init", "wks", "--output", str(tmp_path / "map.txt")]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX")}
 

@@ -79,7 +79,8 @@ def test_the_given_hand_is_used(lump):
     np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
 
 
-def test_a_mirrored_result_is_in_terms_of_the_source(lump):
+def test_a_mirrored_result_is_in_terms_of_the_source():
+    lump = bumpy_mesh(3)
     target = turned(lump.mirrored())
     found = match(lump, target, mirror="yes")
     assert found.mesh_x is lump
@@ -94,6 +95,7 @@ def test_a_mirrored_result_is_in_terms_of_the_source(lump):
     assert found.distortion < 1.1
 
 
+@pytest.mark.slow
 def test_a_creature_is_its_own_mirror_image(lump):
     pair = creature_pair(vertices=1500)
     found = match(pair.source, pair.target, preset="fast", mirror="auto")

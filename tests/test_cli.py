@@ -38,6 +38,8 @@ from jaxsmw.matching import match
 from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.stage import Stage
 
+pytestmark = pytest.mark.usefixtures("small_pictures")
+
 
 @pytest.fixture
 def run(capsys):

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import write_pair
+from command_line import SMALL, write_pair
 from synthetic import bumpy_mesh
 
 from jaxsmw.io.mesh_files import write_mesh
@@ -124,7 +124,16 @@ def test_interrupted_work_leaves_no_files(pair, tmp_path, program):
 @pytest.mark.slow
 def test_an_interrupted_refinement_ends_at_once(pair, tmp_path):
     """SIGINT ends compiled code that would run for hours."""
-    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--iterations", "10000000")
+    call = (
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        tmp_path / "m",
+        *SMALL,
+        "--iterations",
+        10**7,
+    )
     process = started("", *call)
     for line in process.stderr:
         if line.startswith("refinement"):
@@ -182,7 +191,8 @@ def test_a_shell_ends_its_loop_at_an_interruption(pair, tmp_path):
         "--output",
         tmp_path / "m",
     )
-    loop = f"for i in 1 2; do {shlex.join(map(str, call))} --iterations 10000000; echo next; done"
+    command = shlex.join(map(str, (*call, *SMALL, "--iterations", 10**7)))
+    loop = f"for i in 1 2; do {command}; echo next; done"
     shell = f"os.execvp('bash', ['bash', '-c', {loop!r}])"
     program = PROLOGUE + "signal.signal(signal.SIGINT, signal.SIG_DFL)\n" + shell
     process = subprocess.Popen(

@@ -10,6 +10,8 @@ import jaxsmw
 from jaxsmw.io import Landmarks, read_landmark_file, read_mesh_data, write_landmark_file, write_mesh_data
 from jaxsmw.io.mesh_data import MeshData
 
+pytestmark = pytest.mark.usefixtures("small_pictures")
+
 
 @pytest.fixture
 def run(capsys):

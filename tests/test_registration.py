@@ -174,6 +174,7 @@ def test_the_orientation_of_faces_does_not_matter(pair):
     )
 
 
+@pytest.mark.slow
 def test_is_more_accurate_than_refiners_that_use_only_eigenfunctions():
     """The target has another pose and another triangulation than the source."""
     pair = creature_pair(vertices=1200, seed=3)

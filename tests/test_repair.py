@@ -31,7 +31,7 @@ REPAIR = RepairSettings(stage=0, fallback_levels=LEVELS)
 @pytest.fixture(scope="module")
 def body():
     """A mesh and its spectrum."""
-    mesh = body_with_arms()
+    mesh = body_with_arms(3)
     return mesh, compute_spectrum(mesh, 40)
 
 
@@ -125,6 +125,7 @@ def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, ide
     outcome(body, swapped, None, alternatives=none())
 
 
+@pytest.mark.slow
 def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     mesh, _ = body
     preset = Preset((STAGE,), REPAIR)

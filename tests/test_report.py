@@ -22,6 +22,9 @@ SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.verti
 TARGET, NUMBER = renumbered(replace(SOURCE, name="Y.off"), seed=1)
 
 
+pytestmark = pytest.mark.usefixtures("small_pictures")
+
+
 @pytest.fixture(scope="module")
 def found() -> Correspondence:
     stage = Stage(WaveletPreservation(convention="pushforward"), number_of_eigenvectors=20, iterations=1)

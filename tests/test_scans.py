@@ -56,6 +56,7 @@ def test_components_stay_if_none_has_half_of_the_area():
     assert len(mesh.faces) == len(faces) and not mesh.notes
 
 
+@pytest.mark.slow
 def test_specks_are_matched_like_the_nearest_vertex():
     vertices, faces = scan()
     target = bumpy_mesh(4)

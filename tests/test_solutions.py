@@ -55,6 +55,8 @@ def as_type(spectrum, dtype):
     return jax.tree.map(lambda a: a.astype(dtype) if a.dtype == float else a, spectrum)
 
 
+# Without compilation as a whole, each solution compiles about 100 small programs.
+@eqx.filter_jit
 def solve(solution, pair, pointwise_map, *, bank=None, convention="pullback", previous=None):
     bank = CubicSpline(4) if bank is None else bank
     problem = WaveletPreservation(bank=bank, solution=solution, convention=convention).problem(*pair)
@@ -147,6 +149,7 @@ def test_orthogonality_is_minimised_to_first_order(pair, pointwise_map, descript
     c, result = solve(with_weights(weights, descriptors), pair, pointwise_map, convention=convention)
     assert result == RESULTS.successful
 
+    @jax.jit
     def loss(c):
         return objective(c, pair, pointwise_map, weights, descriptors, convention=convention)
 
@@ -159,11 +162,15 @@ def test_orthogonality_is_minimised_to_first_order(pair, pointwise_map, descript
 @pytest.mark.slow
 @pytest.mark.parametrize("term", TERMS[1:])
 def test_every_weight_changes_the_result_and_lowers_its_term(pair, pointwise_map, descriptors, term):
+    @jax.jit
+    def term_of(c):
+        return objective(c, pair, pointwise_map, {term: 1.0}, descriptors)
+
     def minimiser(weight):
         weights = {"wavelet_preservation": 1.0, term: weight}
         c, result = solve(with_weights(weights, descriptors), pair, pointwise_map)
         assert result == RESULTS.successful
-        return c, objective(c, pair, pointwise_map, {term: 1.0}, descriptors)
+        return c, term_of(c)
 
     (weak, cost_weak), (strong, cost_strong) = minimiser(0.01), minimiser(3.0)
     assert jnp.max(jnp.abs(weak - strong)) > 1e-3
@@ -222,6 +229,7 @@ def test_derivatives_with_respect_to_weights_and_spectra(pair, pointwise_map, de
 
 
 def test_derivative_of_the_closed_form(pair, pointwise_map):
+    @jax.jit
     def loss(eigenvectors):
         x = eqx.tree_at(lambda s: s.eigenvectors, pair[0], jnp.asarray(eigenvectors))
         return jnp.sum(jnp.sin(3 * solve(LeastSquares(), (x, pair[1]), pointwise_map)[0]))
@@ -351,6 +359,7 @@ def test_nan_in_a_spectrum_is_reported(pair, pointwise_map):
         assert refined.result == RESULTS.nonfinite_spectrum
 
 
+@pytest.mark.slow
 def test_an_invalid_weight_is_reported_also_in_a_batch(pair, pointwise_map):
     def result(weight):
         solution = RegularizedLeastSquares(orthogonality=weight)
