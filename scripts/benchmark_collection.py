@@ -192,7 +192,8 @@ def _cycles(found: Collection) -> dict[str, float]:
         position, before = mesh.vertices[vertex], i
         for after in (j, k, i):
             points, _ = nearest_surface_points(position, found.registered[before].mesh)
-            position, before = found.registered[after].carry(points), after
+            points, _ = nearest_surface_points(found.registered[after].carry(points), found.meshes[after])
+            position, before = points.positions(found.meshes[after]), after
         errors.append(np.linalg.norm(position - mesh.vertices[vertex], axis=1).mean() / mesh.area**0.5)
     graph = found.cycle_errors or (np.array([]), np.array([]))
     return {
