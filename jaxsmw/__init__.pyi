@@ -1,4 +1,6 @@
-from . import banks, evaluation, functional_maps, geometry, io, learning, transfer
+from . import banks, collection, evaluation, functional_maps, geometry, io, learning, transfer
+from .collection.matching import match_collection
+from .collection.pairs import match_pairs
 from .core.banks import CubicSpline, FilterBank, Meyer
 from .core.functional_map import encode
 from .core.pointwise_map import decode
@@ -54,6 +56,7 @@ __all__ = [
     "Stage",
     "WaveletPreservation",
     "banks",
+    "collection",
     "compiler_options",
     "compute_spectrum",
     "creature_pair",
@@ -71,6 +74,8 @@ __all__ = [
     "learning",
     "make_mesh",
     "match",
+    "match_collection",
+    "match_pairs",
     "paired_spectra",
     "prepare",
     "read_ground_truth",

@@ -269,6 +269,12 @@ def directory(meshes, tmp_path_factory):
     return place
 
 
+def test_the_help_states_the_defaults_of_the_library(run):
+    text = " ".join(run("collection", "--help").output.split())
+    assert f"(default: {CollectionSettings().edges_per_shape})" in text
+    assert "(default: accurate)" in text
+
+
 OPTIONS = ("--preset", "paper", "--mirror", "no", "--edges", "2")
 
 
