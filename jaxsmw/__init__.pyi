@@ -12,14 +12,12 @@ from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
 from .core.solutions import Filtering, LeastSquares
 from .core.spectrum import Spectrum
-from .descriptors import describe
 from .errors import InputError
 from .evaluation.ground_truth import read_ground_truth
 from .evaluation.metrics import geodesic_error
 from .geometry.creature import creature_pair
 from .geometry.eigenbasis import compute_spectrum
-from .geometry.geodesics import geodesic_distances
-from .geometry.mesh import Mesh, diagnose, make_mesh
+from .geometry.mesh import Mesh, make_mesh
 from .initial_maps import initial_map
 from .io.map_files import read_pointwise_map, write_pointwise_map
 from .io.mesh_files import read_mesh, write_mesh
@@ -61,12 +59,9 @@ __all__ = [
     "compute_spectrum",
     "creature_pair",
     "decode",
-    "describe",
-    "diagnose",
     "encode",
     "evaluation",
     "functional_maps",
-    "geodesic_distances",
     "geodesic_error",
     "geometry",
     "initial_map",

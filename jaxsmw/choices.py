@@ -33,7 +33,7 @@ Search = Literal["auto", "exhaustive", "patches"]
 """The methods of nearest-neighbour search, with equal results; `"auto"` chooses the faster method."""
 
 GeodesicMethod = Literal["strips", "exact"]
-"""The methods that compute geodesic distances; see `jaxsmw.geodesic_distances`."""
+"""The methods that compute geodesic distances; see `jaxsmw.geometry.geodesic_distances`."""
 
 IndexBase = Literal[0, 1]
 """The possible indices of the first vertex in a file."""

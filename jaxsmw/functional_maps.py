@@ -1,4 +1,4 @@
-"""Functional maps: solutions, energies, nearest-neighbour searches and spectral signatures.
+"""Functional maps: solutions, energies, nearest-neighbour searches, descriptors and spectral signatures.
 
 `docs/mathematics.md` explains the equations behind these functions and classes.
 """
@@ -16,6 +16,7 @@ from jaxsmw.core.solutions import (
     Solution,
 )
 from jaxsmw.core.triangles import nearest_point_on_triangles
+from jaxsmw.descriptors import describe
 
 __all__ = [
     "DescriptorPair",
@@ -28,6 +29,7 @@ __all__ = [
     "WaveletProblem",
     "decode",
     "decode_to_triangles",
+    "describe",
     "encode",
     "heat_kernel_signature",
     "multiscale_kernel",
