@@ -3,6 +3,9 @@
 import csv
 import json
 import os
+import subprocess
+import sys
+import time
 from itertools import permutations
 from pathlib import Path
 
@@ -326,6 +329,29 @@ def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
         assert carried.names == ("a", "b", "c")
         offsets = carried.positions - mesh.vertices[other[rows]]
         assert np.linalg.norm(offsets, axis=1).max() < 0.2 * np.sqrt(mesh.area)
+
+
+@pytest.mark.slow
+def test_killed_runs_lose_nothing(result_directory, directory, tmp_path):
+    """The command is killed several times, each time a little later."""
+    command = [sys.executable, "-m", "jaxsmw", "collection", str(directory), "--output", str(tmp_path / "r")]
+    command += [*OPTIONS, "--template", str(directory / "shape2.obj"), "--quiet"]
+    work, finished = tmp_path / "r" / "work", 0
+    for _ in range(6):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        while process.poll() is None and len(list(work.glob("edge-*.npz"))) <= finished:
+            time.sleep(0.02)
+        process.kill()
+        process.wait()
+        before, finished = finished, len(list(work.glob("edge-*.npz")))
+        assert finished > before
+    subprocess.run(command, check=True, capture_output=True)
+    for name in ("shape0", "shape1", "shape3"):
+        found, expected = (
+            read_mesh(place / "registered" / f"{name}.ply") for place in (tmp_path / "r", result_directory)
+        )
+        np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-5)
+    assert not list(work.glob(".*.npz"))
 
 
 def test_the_same_command_continues(result_directory, directory, run, matched):

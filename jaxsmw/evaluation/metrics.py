@@ -173,7 +173,8 @@ def geodesic_error(
 
     **Raises:** `InputError` if the map or the ground truth contains a vertex or face that Y does not have; if
     the map has no entry for a vertex of X in the ground truth; if the ground truth is empty; if
-    `number_of_samples` is less than 1; or if `"exact"` cannot be used (see `jaxsmw.geometry.geodesic_distances`).
+    `number_of_samples` is less than 1; or if `"exact"` cannot be used (see
+    `jaxsmw.geometry.geodesic_distances`).
     """
     images = check_points(pointwise_map, mesh_y, "pointwise map")
     targets = check_points(ground_truth.targets, mesh_y, "ground truth")
