@@ -151,6 +151,8 @@ def run(options: argparse.Namespace) -> None:
         f"finished pairs are kept in {options.output}, and the same command continues from there"
     )
     with claimed_directory(directory, _provenance(options)), _executor(options) as executor:
+        for unfinished in work.glob(".*.npz"):  # a killed run left these files
+            unfinished.unlink(missing_ok=True)
         collection = _match(options, data, work, executor)
         collection.left_out.update(unreadable)
         stopwatch.add(collection.seconds)
