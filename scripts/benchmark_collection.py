@@ -196,10 +196,9 @@ def _cycles(found: Collection) -> dict[str, float]:
             position, before = points.positions(found.meshes[after]), after
         errors.append(np.linalg.norm(position - mesh.vertices[vertex], axis=1).mean() / mesh.area**0.5)
     graph = found.cycle_errors or (np.array([]), np.array([]))
-    return {
-        name: float(1e3 * np.mean(values)) if len(values) else float("nan")
-        for name, values in (("template", errors), ("graph_first", graph[0]), ("graph_final", graph[1]))
-    }
+    parts = (("template", errors), ("graph_first", graph[0]), ("graph_final", graph[1]))
+    found = {name: float(1e3 * np.mean(values)) if len(values) else float("nan") for name, values in parts}
+    return found | {"template_median": float(1e3 * np.median(errors))}
 
 
 def _summary(errors: Float64[np.ndarray, " p"]) -> dict[str, float]:

@@ -253,7 +253,7 @@ def three():
 
 @pytest.fixture(scope="module")
 def one_by_one(three):
-    return dict(match_pairs(three, PAIRS))
+    return dict(match_pairs(three, PAIRS, preset="paper"))
 
 
 PAIRS = list(permutations(range(3), 2))[:4]
@@ -266,13 +266,18 @@ def test_pairs_are_matched_as_by_match(three, one_by_one):
         assert found.mesh_x is three[i] and found.mesh_y is three[j]
         # All poses have the same triangulation.
         error = three[j].vertices[found.pointwise_map] - three[j].vertices
-        direct = match(three[i], three[j], mirror="no", init="shot")
+        direct = match(three[i], three[j], preset="paper", mirror="no")
         reference = three[j].vertices[direct.pointwise_map] - three[j].vertices
         assert np.linalg.norm(error, axis=1).mean() < 1.2 * np.linalg.norm(reference, axis=1).mean() + 1e-3
 
 
-def test_batches_give_the_same_maps(three, one_by_one):
-    for number, found in match_pairs(three, PAIRS, batch_size=3):
+@pytest.mark.parametrize(
+    ("preset", "batch_size"), [("paper", 3), pytest.param("accurate", 1, marks=pytest.mark.slow)]
+)
+def test_batches_give_the_same_maps(three, one_by_one, preset, batch_size):
+    if preset != "paper":
+        one_by_one = dict(match_pairs(three, PAIRS, preset=preset))
+    for number, found in match_pairs(three, PAIRS, preset=preset, batch_size=batch_size):
         expected = one_by_one[number]
         assert (found.pointwise_map == expected.pointwise_map).mean() > 0.999
         assert found.distortion == pytest.approx(expected.distortion, rel=1e-3)
@@ -285,7 +290,7 @@ def test_bad_pairs_are_refused(three):
 
 def test_reverse_surface_points_come_from_the_same_embeddings():
     pair = creature_pair(vertices=600, seed=1)
-    found = match(pair.source, pair.target, mirror="no")
+    found = match(pair.source, pair.target, preset="paper", mirror="no")
     reverse = found.reverse_surface_points()
     assert len(reverse) == len(pair.target.vertices)
     # A vertex that is carried there and back returns near to itself.
