@@ -563,9 +563,8 @@ class _Matcher:
         return network, chosen, synchronize(network, chosen)
 
     def _distortions(self) -> Float64[np.ndarray, " e"]:
-        """Return for each edge the logarithm by which its distortion exceeds that of most right maps."""
-        usual = self.settings.usual_distortion
-        return np.log([max((found.distortion or 1.0) / usual, 1.0) for found in self.maps.values()])
+        """Return the squared logarithm of the distortion of each edge's map; zero for isometries."""
+        return np.log([max(found.distortion or 1.0, 1.0) for found in self.maps.values()]) ** 2
 
     def _cycle_samples(self, number: int) -> Int64[np.ndarray, " s"]:
         samples = self.shapes[number].samples

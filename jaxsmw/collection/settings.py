@@ -22,9 +22,8 @@ class CollectionSettings:
     - `contradicted_from` (Table R26): an edge contradicts the collection if the mean distance between its
       maps and the maps through the template is at least this value. The edge is then matched again, from the
       consistent map.
-    - `usual_distortion`: most right maps have distortions below this value.
-    - `distortion_weight` (Table R26): the error of an edge grows by this number times the logarithm of the
-      ratio between the distortion of its map and `usual_distortion`, if the distortion is larger.
+    - `distortion_weight` (Table R26): the error of an edge grows by this number times the squared logarithm
+      of the distortion of its map.
     - `distortion_tolerance`: a new map replaces the old map of an edge only if its distortion is at most this
       multiple of the old distortion.
     - `rounds`: the largest number of times that contradicted edges are matched again.
@@ -35,8 +34,7 @@ class CollectionSettings:
     random_share: float = 0.25
     cycle_samples: int = 200
     contradicted_from: float = 0.05
-    usual_distortion: float = 1.1
-    distortion_weight: float = 1.0
+    distortion_weight: float = 2.0
     distortion_tolerance: float = 1.02
     rounds: int = 2
     synchronization: SynchronizationSettings = SynchronizationSettings()  # noqa: RUF009 (immutable)
