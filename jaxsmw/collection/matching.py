@@ -314,7 +314,9 @@ class _Matcher:
         with timed("hands", self.seconds):
             decisions = self._compare_hands() if mirror else {}
             mirrored = choose_hands(len(self.shapes), decisions)
-            self.aligned = any(decision.asymmetric for decision in decisions.values())
+            asymmetric = any(decision.asymmetric for decision in decisions.values())
+            # Without repair, expected errors do not tell which of two maps is better.
+            self.aligned = asymmetric and self.preset.repair is not None
             if mirrored.any():
                 self._mirror(mirrored)
         with timed("descriptors", self.seconds):
