@@ -387,7 +387,7 @@ class _Matcher:
 
     def _compare_hands(self) -> dict[Edge, Decision]:
         """Compare the hands along the edges of a sparse graph, if the first comparisons show asymmetry."""
-        edges = choose_edges(shape_distances(self.shapes), edges_per_shape=2.0, seed=self.seed)
+        edges = choose_edges(shape_distances(self.shapes), edges_per_shape=_HANDS_PER_SHAPE, seed=self.seed)
         first = edges[:: max(1, len(edges) // _FIRST_HANDS)][:_FIRST_HANDS]
         decisions = {edge: self._hand(edge) for edge in first}
         if not any(decision.asymmetric for decision in decisions.values()):
@@ -638,6 +638,8 @@ class _Matcher:
         )
 
 
+# The number of pairs whose hands are compared, divided by the number of shapes.
+_HANDS_PER_SHAPE = 1.5
 # The number of pairs whose hands are compared first. If none of them is asymmetric, as bodies are not, hands
 # are not compared any further.
 _FIRST_HANDS = 5
