@@ -136,7 +136,7 @@ def _measure(
         "replaced": sum(edge.decision == "replaced" for edge in found.edges),
         "contradicted": sum(edge.decision == "contradicted" for edge in found.edges),
         "through_template": _summary(np.array(through)),
-        "cycles": _cycles(found),
+        "cycles": _cycles(found) if settings == _DEFAULT else {},
         "seconds": seconds,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }
