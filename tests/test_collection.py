@@ -205,6 +205,21 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
     assert first.mean() > 3 * final.mean()
 
 
+def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
+    original = matching.match_edges
+
+    def failing(tasks, *arguments):
+        for task in tasks:
+            if "shape4" in (task.x.mesh.name, task.y.mesh.name):
+                yield ArithmeticError(f"{task.x.mesh.name} to {task.y.mesh.name}: failed")
+            else:
+                yield from original(iter([task]), *arguments)
+
+    monkeypatch.setattr(matching, "match_edges", failing)
+    with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
+        match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False)
+
+
 def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
     store = Store(tmp_path)
     store.save("edge", (np.arange(3), "a"), {"x": np.eye(2)})

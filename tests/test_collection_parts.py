@@ -73,6 +73,14 @@ def test_added_shapes_add_only_their_own_edges():
     assert choose_edges(distances, edges_per_shape=3, given=after) == after
 
 
+def test_a_removed_shape_does_not_split_the_graph():
+    distances = random_distances(6)
+    star = [(0, 1), (0, 2), (0, 3)]
+    assert is_connected(choose_edges(distances[:4, :4], given=star), 4)
+    # Shape 0 was removed, and with it all edges of the star; shapes 3 and 4 are still matched with each other.
+    assert is_connected(choose_edges(distances, edges_per_shape=2, given=[(1, 2), (3, 4)]), 6)
+
+
 def test_random_edges_depend_on_the_seed_only():
     distances = random_distances(30)
     first, same, other = (choose_edges(distances, seed=seed) for seed in (0, 0, 1))

@@ -85,11 +85,15 @@ def choose_edges(
     new = number - len(known)
     most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
     added: set[Edge] = set()
-    # Distances of zero would be missing edges in a sparse graph.
-    tree = minimum_spanning_tree(np.triu(distances + 1e-9 * (1 + distances.max(initial=0)), 1)).tocoo()
+    # The tree prefers edges that are already matched. Thus it joins known shapes by a new edge only if a
+    # shape that connected them was removed. Distances of zero would be missing edges in a sparse graph.
+    lengths = distances + 1e-6 * (1 + distances.max(initial=0))
+    for edge in chosen:
+        lengths[edge] *= 1e-6
+    tree = minimum_spanning_tree(np.triu(lengths, 1)).tocoo()
     added |= {
         (min(i, j), max(i, j)) for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True)
-    } & set(wanted)
+    } - chosen
     generator = np.random.default_rng(seed)
     random = [wanted[row] for row in generator.permutation(len(wanted))]
     added |= set(random[: round(random_share * most)])

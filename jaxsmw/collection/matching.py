@@ -35,7 +35,7 @@ from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.geometry.mesh import Mesh, MeshLike, connected_components, make_mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
@@ -235,6 +235,7 @@ def match_collection(
     **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`.
 
     **Raises:** `InputError` if fewer than two meshes can be matched, or if the template is left out.
+    `ArithmeticError` if all matches of a mesh fail numerically.
     """
     given = [_as_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
     return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, devices, progress).run(
@@ -324,7 +325,10 @@ class _Matcher:
         with timed("graph", self.seconds):
             edges = self._edges()
         with timed("edges", self.seconds):
-            self.maps = dict(self._match(dict.fromkeys(edges), "edges"))
+            found = dict(self._match(dict.fromkeys(edges), "edges"))
+            # Workers finish edges in any order, but the order determines rounding errors.
+            self.maps = {edge: found[edge] for edge in edges if edge in found}
+            self._check_connected()
         replaced: set[Edge] = set()
         with timed("synchronization", self.seconds):
             network, chosen, points = self._synchronize(template)
@@ -341,7 +345,7 @@ class _Matcher:
                 self.maps |= better
                 replaced |= set(better)
                 network, chosen, points = self._synchronize(template)
-        found = [self._describe_edge(edge, network, points, replaced) for edge in edges]
+        described = [self._describe_edge(edge, network, points, replaced) for edge in edges]
         meshes = [self.given[number] for number in kept]
         # The mirror image of a mesh has the same faces, with the corners in reverse order.
         points = [
@@ -358,7 +362,7 @@ class _Matcher:
             points=tuple(points),
             mirrored=mirrored,
             registered=tuple(registered),
-            edges=tuple(found),
+            edges=tuple(described),
             axes=self.axes,
             cycle_errors=(first_cycles, self.cycles),
             left_out=self.left_out,
@@ -538,6 +542,20 @@ class _Matcher:
             if store.load("shape", keys[number]) is None:
                 store.save("shape", keys[number], arrays)
         return keys
+
+    def _check_connected(self) -> None:
+        """Check that the matched edges connect all shapes.
+
+        **Raises:** `ArithmeticError` that names the shapes that are not connected to most other shapes.
+        """
+        component = connected_components(np.array(list(self.maps)).reshape(-1, 2), len(self.shapes))[1]
+        largest = np.bincount(component).argmax()
+        if (apart := np.flatnonzero(component != largest)).size:
+            names = ", ".join(self.meshes[number].name for number in apart)
+            raise ArithmeticError(
+                f"the matches of these meshes with all other meshes failed numerically: {names}. Repair "
+                "these meshes, or leave them out."
+            )
 
     def _synchronize(self, template: int | None) -> tuple[Network, int, list[SurfacePoints]]:
         """Estimate the errors of all edges from cycles, choose the template, and synchronise the maps."""
