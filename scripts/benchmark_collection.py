@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmark_transfer import read_scan_landmarks
 from jaxtyping import Float64
 from tqdm import tqdm
 
@@ -37,7 +38,6 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.geometry import nearest_surface_points
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
-from jaxsmw.io import Landmarks
 from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import transfer_landmarks
@@ -160,7 +160,7 @@ def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single:
 
 def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
     """Return the mean distance of carried landmarks to manual landmarks, in thousandths of the diagonal."""
-    marks_x, marks_y = (_landmarks(files[shape]) for shape in (i, j))
+    marks_x, marks_y = (read_scan_landmarks(files[shape]) for shape in (i, j))
     names = [name for name in marks_x.names if name in set(marks_y.names)]
     marks_x, marks_y = marks_x.select(names), marks_y.select(names)
     if single is None:
@@ -172,12 +172,6 @@ def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, sin
         carried = transfer_landmarks(marks_x, single.registered_mesh()).landmarks.positions
     distances = np.linalg.norm(carried - marks_y.positions, axis=1)
     return 1e3 * float(distances.mean()) / bounding_box_diagonal(found.meshes[j])
-
-
-def _landmarks(file: Path) -> Landmarks:
-    from benchmark_transfer import _landmarks as read
-
-    return read(file)
 
 
 def _cycles(found: Collection) -> dict[str, float]:

@@ -127,7 +127,7 @@ def _register(
 def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]:
     """Measure the distances of carried landmarks to manual landmarks, by several methods."""
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
-    marks_x, marks_y = _landmarks(source), _landmarks(target)
+    marks_x, marks_y = read_scan_landmarks(source), read_scan_landmarks(target)
     names = [name for name in marks_x.names if name in set(marks_y.names)]
     marks_x, marks_y = marks_x.select(names), marks_y.select(names)
     mirrored = _side(source) != _side(target)
@@ -149,7 +149,7 @@ def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]
     return {**row, "manual_noise": float(np.mean(noise)), **seconds}
 
 
-def _landmarks(file: Path) -> Landmarks:
+def read_scan_landmarks(file: Path) -> Landmarks:
     """Read the manual landmarks of a scan from `SCAN.mrk.json`, `SCAN.csv` or `landmarks.csv`."""
     markups = file.with_suffix(".mrk.json")
     if markups.exists():
