@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HELP = "match all meshes of a directory consistently; register a template on each; compute a shape model"
 
 _MirrorCollection = Literal["auto", "no"]
-# More edges cost time, but hardly improve the maps. (Table R25 of docs/research_log.md)
+# More edges cost time, but hardly improve the maps. (Table R26 of docs/research_log.md)
 _MOST_EDGES = 6
 
 
