@@ -39,6 +39,7 @@ def test_stages_after_the_first_do_not_repair():
     assert choose_preset(WITHOUT_REPAIR).repair is None
 
 
+@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
 def test_a_mirrored_map_has_a_worse_distortion():
     pair = creature_pair(vertices=1100)
     found = match(pair.source, pair.target, preset="fast")

@@ -430,6 +430,7 @@ def test_seams_are_reported_and_welded(run, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
 def test_demo_writes_a_pair_and_a_better_map(run, tmp_path):
     small = ["--vertices", "1000", "--preset", "paper", "--eigenvectors", "40"]
     outcome = run("demo", "--output", tmp_path / "demo", *small)

@@ -202,6 +202,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
 def test_pairs_of_similar_size_share_compiled_programs(caplog):
     pairs = [creature_pair(vertices=vertices) for vertices in (700, 720)]
     assert len({len(mesh.vertices) for pair in pairs for mesh in (pair.source, pair.target)}) == 4
