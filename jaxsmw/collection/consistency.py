@@ -65,7 +65,6 @@ def cycle_error(
 
 
 def edge_errors(
-    edges: Int[Array, "e 2"],
     cycles: Int[Array, "c 3"],
     errors: Float[Array, " c"],
     prior: Float[Array, " e"],
@@ -80,14 +79,13 @@ def edge_errors(
 
     **Arguments:**
 
-    - `edges`: the edges (e, 2), for their number only.
-    - `cycles`: the three edges of each cycle (c, 3), as rows of `edges`.
+    - `cycles`: the three edges of each cycle (c, 3), as rows of `prior`.
     - `errors`: the error of each cycle (c,), from `cycle_error`.
     - `prior`: the first estimate of each edge's error (e,), for example the expected error.
 
     **Returns:** The estimated errors (e,), in the unit of `errors`. An edge in no cycle keeps its prior.
     """
-    number = edges.shape[0]
+    number = prior.shape[0]
     # Each cycle sends one message to each of its edges, from the two other edges.
     receiver = cycles.T.reshape(-1)
     others = jnp.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
@@ -140,7 +138,5 @@ def estimate_edge_errors(
     ).reshape(-1)
     if not len(found):
         return prior, errors, cycles
-    estimated = edge_errors(
-        jnp.asarray(np.array(edges)), jnp.asarray(cycles), jnp.asarray(errors), jnp.asarray(prior)
-    )
+    estimated = edge_errors(jnp.asarray(cycles), jnp.asarray(errors), jnp.asarray(prior))
     return np.asarray(estimated, np.float64), errors, cycles

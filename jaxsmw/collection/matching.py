@@ -561,8 +561,7 @@ class _Matcher:
         """Estimate the errors of all edges from cycles, choose the template, and synchronise the maps."""
         edges = list(self.maps)
         meshes, units = self.meshes, [mesh.area**0.5 for mesh in self.meshes]
-        points = {edge: found.forward for edge, found in self.maps.items()}
-        points |= {(j, i): found.backward for (i, j), found in self.maps.items()}
+        points = _both_directions(self.maps)
         vertex_maps = {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()}
         prior = np.array([found.expected_error for found in self.maps.values()])
         prior += self.settings.distortion_weight * self._distortions()
@@ -623,11 +622,11 @@ class _Matcher:
         If the consistent map is wrong, a new map that follows it has a larger distortion than the old map.
         """
         better = {}
+        errors = {edge: found.expected_error for edge, found in again.items()}
+        new = Network(self.meshes, _both_directions(again), errors, network.settings)
         for (i, j), found in again.items():
             before = self._residual(network, points, i, j) if (i, j) in self.maps else np.inf
-            maps = {(i, j): found.forward, (j, i): found.backward}
-            errors = {(min(i, j), max(i, j)): found.expected_error}
-            now = self._residual(Network(self.meshes, maps, errors, network.settings), points, i, j)
+            now = self._residual(new, points, i, j)
             old = self.maps[i, j].distortion if (i, j) in self.maps else None
             limit = np.inf if old is None else old * self.settings.distortion_tolerance
             if now < before and (found.distortion or 1.0) <= limit:
@@ -654,6 +653,12 @@ class _Matcher:
         return MatchedEdge(
             *edge, found.expected_error, found.distortion, network.error(*edge), residual, decision
         )
+
+
+def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], SurfacePoints]:
+    """Return the maps of all edges (i, j) with the keys (i, j) and (j, i)."""
+    forward = {edge: found.forward for edge, found in maps.items()}
+    return forward | {(j, i): found.backward for (i, j), found in maps.items()}
 
 
 # The number of pairs whose hands are compared, divided by the number of shapes.
