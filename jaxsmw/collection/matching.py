@@ -26,6 +26,7 @@ from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.collection.shapes import (
     PreparedShape,
+    as_mesh,
     describe_shape,
     descriptor_axes,
     prepare_shape,
@@ -35,7 +36,7 @@ from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, connected_components, make_mesh
+from jaxsmw.geometry.mesh import Mesh, MeshLike, connected_components
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
@@ -237,17 +238,16 @@ def match_collection(
     **Raises:** `InputError` if fewer than two meshes can be matched, or if the template is left out.
     `ArithmeticError` if all matches of a mesh fail numerically.
     """
-    given = [_as_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
+    given = [_named_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
     return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, devices, progress).run(
         template, mirror, stiffness
     )
 
 
-def _as_mesh(mesh: Mesh | MeshLike, number: int, names: Sequence[str] | None) -> Mesh:
-    name = f"mesh {number}" if names is None else names[number]
-    if not isinstance(mesh, Mesh):
-        return make_mesh(mesh, name=name)
-    return mesh if names is None else replace(mesh, name=name)
+def _named_mesh(mesh: Mesh | MeshLike, number: int, names: Sequence[str] | None) -> Mesh:
+    if names is None:
+        return as_mesh(mesh, f"mesh {number}")
+    return replace(as_mesh(mesh, names[number]), name=names[number])
 
 
 class _StoredTask(NamedTuple):

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from jaxsmw.choices import DEFAULT_PRESET
-from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
+from jaxsmw.collection.shapes import as_mesh, fitted_preset, prepare_pair, prepare_shapes
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.matching import Correspondence, match_prepared
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset
@@ -51,10 +51,7 @@ def match_pairs(
     **Raises:** `InputError` if a mesh cannot be used or a pair names no shape. While the iterator runs,
     `ArithmeticError` if the refinement of a pair fails numerically.
     """
-    given = [
-        mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=f"mesh {number}")
-        for number, mesh in enumerate(meshes)
-    ]
+    given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
     for number, pair in enumerate(pairs):
         if len(pair) != 2 or not all(0 <= shape < len(given) for shape in pair):
             raise InputError(
