@@ -279,7 +279,7 @@ def test_pairs_are_matched_as_by_match(three, one_by_one):
 
 
 @pytest.mark.parametrize(
-    ("preset", "batch_size"), [("paper", 3), pytest.param("accurate", 1, marks=pytest.mark.slow)]
+    ("preset", "batch_size"), [("paper", 3), pytest.param("accurate", 3, marks=pytest.mark.slow)]
 )
 def test_batches_give_the_same_maps(three, one_by_one, preset, batch_size):
     if preset != "paper":

@@ -110,9 +110,7 @@ class Hands:
 
     def _asymmetry(self, shape: _Shape) -> float:
         shot = self._shot(shape, self.settings.asymmetry_radii)
-        # All descriptors have the same length, so the nearest descriptor has the largest inner product.
-        mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
-        found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
+        found = _nearest(np.hstack(shot), np.hstack([mirrored_descriptors(one) for one in shot]))
         random = np.random.default_rng(0).permutation(len(found))
         return _distance_error(shape, shape, found) / _distance_error(shape, shape, random)
 
@@ -177,7 +175,7 @@ class Hands:
 
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
-        first = np.argmin(cdist(x.shot, y.shot), axis=1)
+        first = _nearest(x.shot, y.shot)
         spectra = [hand.shape.described(hand.components) for hand in (x, y)]
         size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
         views = [spectrum.pad(size) for spectrum in self.stage.view(*spectra)]
@@ -231,6 +229,12 @@ class _Hand(NamedTuple):
     shape: _Shape
     shot: Float[np.ndarray, "s r"]
     components: Float[np.ndarray, "s d"]
+
+
+def _nearest(x: Float[np.ndarray, "s r"], y: Float[np.ndarray, "t r"]) -> Int64[np.ndarray, " s"]:
+    """Return the nearest SHOT descriptor of Y for each SHOT descriptor of X."""
+    # All descriptors have the same length, so the nearest descriptor has the largest inner product.
+    return np.argmax(x @ y.T, axis=1)
 
 
 def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple, TypedDict, TypeVar
 
 import equinox as eqx
@@ -278,9 +279,14 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
+    # In some programs of `jax.vmap`, XLA's threads for CPUs wait for each other forever.
+    each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
+    if mesh.size == 1:
+        return each(batch)
     # `shard_map` is not used, because the solvers of optimistix do not run within it. The compiler still
     # divides the batch among the devices, because the pairs do not depend on each other.
-    refined = lax.map(one, batch) if len(batch.initial_maps) == 1 else jax.vmap(one)(batch)
+    of_devices = jax.tree.map(lambda leaf: leaf.reshape(mesh.size, -1, *leaf.shape[1:]), batch)
+    refined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), jax.vmap(each)(of_devices))
     return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
 
 
