@@ -548,8 +548,9 @@ def match_prepared(
                 preset.repair,
                 alternatives=None if alternatives else (),
                 history=history,
+                refined=known,
             )
-            for start in starts
+            for start, known in zip(starts, refined or [None] * len(starts), strict=True)
         ]
         jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
     candidates = [

@@ -10,7 +10,7 @@ from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
-from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.runtime.threads import side_by_side
 
 # With fewer vertices, presets would use fewer than two eigenvectors, because they use at most half as many
@@ -56,8 +56,7 @@ class Pair:
         if not isinstance(partial, bool | np.bool):
             raise InputError(f"partial is {partial!r}: give True or False.")
         mesh_x, mesh_y = (
-            mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
-            for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
+            as_mesh(mesh, name) for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
         )
         return cls(mesh_x, mesh_y, bool(partial))
 

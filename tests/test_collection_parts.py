@@ -24,6 +24,7 @@ from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_po
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.repair.chirality import Decision
+from jaxsmw.stage import Stage
 
 
 def random_distances(number, seed=0):
@@ -288,6 +289,15 @@ def test_batches_give_the_same_maps(three, one_by_one, preset, batch_size):
         expected = one_by_one[number]
         assert (found.pointwise_map == expected.pointwise_map).mean() > 0.999
         assert found.distortion == pytest.approx(expected.distortion, rel=1e-3)
+
+
+def test_batches_are_not_refined_a_second_time(three, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("a stage ran on a single pair")
+
+    monkeypatch.setattr(Stage, "run", refuse)
+    found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
+    assert len(dict(found)) == len(PAIRS)
 
 
 def test_bad_pairs_are_refused(three):

@@ -29,14 +29,14 @@ class EdgeMap:
     - `backward`: the match of every vertex of Y, n `SurfacePoints` on X.
     - `expected_error`: the mean expected error, in units of the square root of the area; see
       `jaxsmw.repair.expected_error`.
-    - `distortion`: the distortion of the map, or None if the preset has no repair.
+    - `distortion`: the distortion of the map; see `jaxsmw.repair.scores.distortion`.
     - `suspicious`: whether the map looks wrong by itself, without the other shapes.
     """
 
     forward: SurfacePoints
     backward: SurfacePoints
     expected_error: float
-    distortion: float | None
+    distortion: float
     suspicious: bool
 
     @classmethod
@@ -47,24 +47,22 @@ class EdgeMap:
             for name in ("forward", "backward")
         )
         expected, distortion, suspicious = arrays["scores"].tolist()
-        return cls(
-            forward, backward, expected, None if np.isnan(distortion) else distortion, bool(suspicious)
-        )
+        return cls(forward, backward, expected, distortion, bool(suspicious))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the maps as arrays, for a file."""
-        distortion = np.nan if self.distortion is None else self.distortion
         return {
             "forward_faces": self.forward.faces.astype(np.int32),
             "forward_weights": self.forward.weights,
             "backward_faces": self.backward.faces.astype(np.int32),
             "backward_weights": self.backward.weights,
-            "scores": np.array([self.expected_error, distortion, self.suspicious], np.float64),
+            "scores": np.array([self.expected_error, self.distortion, self.suspicious], np.float64),
         }
 
     @classmethod
     def of(cls, found: Correspondence) -> EdgeMap:
-        """Return the maps of a correspondence in both directions."""
+        """Return the maps of a correspondence of `match` in both directions."""
+        assert found.distortion is not None
         return cls(
             found.surface_points(),
             found.reverse_surface_points(),

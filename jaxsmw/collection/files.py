@@ -156,7 +156,7 @@ def write_summary(
                 "target": names[edge.target],
                 "decision": edge.decision,
                 "expected_error": _finite(edge.expected_error),
-                "distortion": edge.distortion,
+                "distortion": _finite(edge.distortion),
                 "cycle_error": _finite(edge.cycle_error),
                 "distance_from_consistent_map": _finite(edge.residual),
             }

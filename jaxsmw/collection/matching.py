@@ -26,7 +26,6 @@ from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.collection.shapes import (
     PreparedShape,
-    as_mesh,
     describe_shape,
     descriptor_axes,
     prepare_shape,
@@ -36,7 +35,7 @@ from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, connected_components
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
@@ -61,7 +60,7 @@ class MatchedEdge:
 
     - `source`, `target`: the numbers of the two shapes.
     - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
-    - `distortion`: the distortion of the map, or None.
+    - `distortion`: the distortion of the map; infinite if the match failed.
     - `cycle_error`: the error of the map that the cycles of the graph show; see `edge_errors`.
     - `residual`: the mean distance between the map and the map through the template.
     - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
@@ -71,7 +70,7 @@ class MatchedEdge:
     source: int
     target: int
     expected_error: float
-    distortion: float | None
+    distortion: float
     cycle_error: float
     residual: float
     decision: str
@@ -404,19 +403,17 @@ class _Matcher:
 
     def _hand(self, edge: Edge) -> Decision:
         i, j = edge
-        inputs = (*self._key(i), *self._key(j))
-        stored = None if self.store is None else self.store.load("hand", inputs)
-        if stored is not None:
-            mirrored, evidence, doubtful, asymmetric = stored["decision"].tolist()
-            return Decision(
-                bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)
-            )
-        found = compare_hands(self.shapes[i], self.shapes[j])
-        if self.store is not None:
+
+        def compute() -> dict[str, np.ndarray]:
+            found = compare_hands(self.shapes[i], self.shapes[j])
             evidence = np.nan if found.evidence is None else found.evidence
-            values = np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], np.float64)
-            self.store.save("hand", inputs, {"decision": values})
-        return found
+            return {"decision": np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], float)}
+
+        arrays = self._stored("hand", (*self._key(i), *self._key(j)), compute)
+        mirrored, evidence, doubtful, asymmetric = arrays["decision"].tolist()
+        return Decision(
+            bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)
+        )
 
     def _mirror(self, mirrored: Bool[np.ndarray, " N"]) -> None:
         for number in np.flatnonzero(mirrored).tolist():
@@ -430,21 +427,19 @@ class _Matcher:
         self.axes: DescriptorAxes | None = None
         if not self.preset.number_of_descriptors:
             return
-        inputs = (repr(self.preset),)
-        stored = None if self.store is None else self.store.load("descriptor-axes", inputs)
-        if stored is not None:
-            self.axes = DescriptorAxes(
-                tuple(stored["radii"].tolist()), PrincipalAxes(stored["mean"], stored["axes"])
-            )
-        else:
-            self.axes = descriptor_axes(self.shapes, self.preset)
-            if self.store is not None:
-                arrays = {
-                    "radii": np.array(self.axes.radii),
-                    "mean": self.axes.principal.mean,
-                    "axes": self.axes.principal.axes,
-                }
-                self.store.save("descriptor-axes", inputs, arrays)
+
+        def compute() -> dict[str, np.ndarray]:
+            axes = descriptor_axes(self.shapes, self.preset)
+            return {
+                "radii": np.array(axes.radii),
+                "mean": axes.principal.mean,
+                "axes": axes.principal.axes,
+            }
+
+        arrays = self._stored("descriptor-axes", (repr(self.preset),), compute)
+        self.axes = DescriptorAxes(
+            tuple(arrays["radii"].tolist()), PrincipalAxes(arrays["mean"], arrays["axes"])
+        )
         self.shapes = [describe_shape(shape, self.axes) for shape in self.shapes]
 
     def _edges(self) -> list[Edge]:
@@ -469,6 +464,17 @@ class _Matcher:
             listed = np.array([[names[i], names[j]] for i, j in edges])
             self.store.save("graph", inputs, {"edges": listed})
         return edges
+
+    def _stored(
+        self, kind: str, inputs: tuple[Any, ...], compute: Callable[[], dict[str, np.ndarray]]
+    ) -> dict[str, np.ndarray]:
+        """Return a result of an earlier call with the same directory, or compute and keep it."""
+        found = None if self.store is None else self.store.load(kind, inputs)
+        if found is None:
+            found = compute()
+            if self.store is not None:
+                self.store.save(kind, inputs, found)
+        return found
 
     def _key(self, number: int) -> tuple[Any, ...]:
         mesh = self.shapes[number].mesh
@@ -583,7 +589,7 @@ class _Matcher:
 
     def _distortions(self) -> Float64[np.ndarray, " e"]:
         """Return the squared logarithm of the distortion of each edge's map; zero for isometries."""
-        return np.log([max(found.distortion or 1.0, 1.0) for found in self.maps.values()]) ** 2
+        return np.log([max(found.distortion, 1.0) for found in self.maps.values()]) ** 2
 
     def _cycle_samples(self, number: int) -> Int64[np.ndarray, " s"]:
         samples = self.shapes[number].samples
@@ -627,9 +633,8 @@ class _Matcher:
         for (i, j), found in again.items():
             before = self._residual(network, points, i, j) if (i, j) in self.maps else np.inf
             now = self._residual(new, points, i, j)
-            old = self.maps[i, j].distortion if (i, j) in self.maps else None
-            limit = np.inf if old is None else old * self.settings.distortion_tolerance
-            if now < before and (found.distortion or 1.0) <= limit:
+            old = self.maps[i, j].distortion if (i, j) in self.maps else np.inf
+            if now < before and found.distortion <= old * self.settings.distortion_tolerance:
                 better[i, j] = found
         return better
 
@@ -646,7 +651,7 @@ class _Matcher:
         self, edge: Edge, network: Network, points: Sequence[SurfacePoints], replaced: set[Edge]
     ) -> MatchedEdge:
         if edge not in self.maps:
-            return MatchedEdge(*edge, np.inf, None, np.inf, np.inf, "contradicted")
+            return MatchedEdge(*edge, np.inf, np.inf, np.inf, np.inf, "contradicted")
         found, residual = self.maps[edge], self._residual(network, points, *edge)
         wrong = residual >= self.settings.contradicted_from
         decision = "contradicted" if wrong else "replaced" if edge in replaced else "kept"

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from jaxsmw.choices import DEFAULT_PRESET
-from jaxsmw.collection.shapes import as_mesh, fitted_preset, prepare_pair, prepare_shapes
+from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, MeshLike
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching import Correspondence, match_prepared
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset

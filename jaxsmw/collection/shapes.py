@@ -13,7 +13,7 @@ from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import DescriptorAxes, SampledPair, SampledShape, compared_samples
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
-from jaxsmw.geometry.mesh import Mesh, MeshLike, make_mesh
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps.nearest import nearest_map
@@ -61,14 +61,6 @@ class PreparedShape:
         samples = jax.device_put(arrays["samples"]) if "samples" in arrays else None
         mesh = Mesh(arrays["mesh_vertices"], arrays["mesh_faces"], name)
         return cls(mesh, spectrum, compared_samples(mesh), samples)
-
-
-def as_mesh(mesh: Mesh | MeshLike, name: str) -> Mesh:
-    """Return a `Mesh` unchanged, and any other mesh as a `Mesh` with the given name.
-
-    **Raises:** `InputError` if `make_mesh` refuses the mesh.
-    """
-    return mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
 
 
 def prepare_shape(

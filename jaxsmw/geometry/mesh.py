@@ -478,6 +478,14 @@ def make_mesh(
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 
+def as_mesh(mesh: Mesh | MeshLike, name: str) -> Mesh:
+    """Return a `Mesh` unchanged, and any other mesh as a `Mesh` with the given name.
+
+    **Raises:** `InputError` if `make_mesh` refuses the mesh.
+    """
+    return mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
+
+
 def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarray, " g"], list[str]]:
     """Return the indices of the faces to keep (g,), and notes about the dropped faces.
 
