@@ -3,12 +3,13 @@
 // which collection.html embeds.
 
 import { Vector3 } from "three";
-import { Body, decode, moveByKey } from "./body.js";
+import { Body, decode } from "./body.js";
+import { Cameras } from "./cameras.js";
 import { startDeformation } from "./collection_modes.js";
 import { startPlots } from "./collection_plots.js";
 import { drawThumbnails, makeGallery } from "./collection_gallery.js";
+import { watchPointer } from "./pointer.js";
 
-const CLICK_TOLERANCE = 5; // the most pixels that the pointer moves between press and release of a click
 const WITHIN_SCALE = 0.98; // the share of distances inside the colour scale; the rest is clipped
 const WIDE = 0.9; // narrow screens show bodies one above the other if they are wider than this multiple of their height
 
@@ -60,6 +61,7 @@ try {
   byId("no-webgl").hidden = false;
 }
 const everyBody = bodies ? Object.values(bodies) : [];
+const cameras = new Cameras(everyBody, { direction, linked: byId("linked"), onMove: () => draw() });
 
 const canvases = makeGallery(data, (index) => open(index));
 const plots = startPlots({ data, open: (index) => open(index), compare });
@@ -132,7 +134,7 @@ function pick(vertex, pinned = false) {
 function open(index, side = state.view === "one" ? "b" : state.side) {
   state[side] = index;
   bodies?.[side].move(centeredShape(index));
-  if (bodies && untouched) resetView();
+  if (cameras.untouched) cameras.reset();
   update();
   const box = byId("stage").getBoundingClientRect();
   if (box.bottom < 120 || box.top > innerHeight - 120) byId("stage").scrollIntoView({ block: "nearest" });
@@ -167,71 +169,19 @@ function setView(view) {
   update();
 }
 
-// ---- Cameras
-
-let untouched = true;
-
-function resetView() {
-  const visible = everyBody.filter((body) => body.canvas.clientWidth);
-  if (!visible.length) return;
-  const distance = Math.max(...visible.map((body) => body.distanceToFit(direction)));
-  for (const body of everyBody) {
-    body.controls.minDistance = distance / 40;
-    body.controls.maxDistance = 4 * distance;
-    body.lookFrom(direction.clone().setLength(distance));
-  }
-  untouched = true;
-}
-
-let leader = null; // the body that the other body follows at the moment
-function follow(body) {
-  draw();
-  if (!byId("linked").checked || (leader && leader !== body)) return;
-  leader = body;
-  for (const other of everyBody) {
-    if (other === body) continue;
-    other.camera.position.copy(body.camera.position);
-    other.controls.target.copy(body.controls.target);
-    other.controls.update();
-  }
-  leader = null;
-}
-
 // ---- Mouse, touch and keys
 
 for (const body of everyBody) {
-  const { canvas, controls } = body;
-  controls.addEventListener("change", () => follow(body));
-  controls.addEventListener("start", () => (untouched = false));
-  canvas.addEventListener("keydown", (event) => {
+  body.canvas.addEventListener("keydown", (event) => {
     if (event.altKey || event.ctrlKey || event.metaKey) return;
-    if (moveByKey(body, event.key)) untouched = false;
-    else if (event.key === "0" || event.key === "Home") resetView();
-    else if (event.key === "Escape") pick(null);
-    else return;
+    if (event.key === "Escape") pick(null);
+    else if (!cameras.onKey(body, event.key)) return;
     event.preventDefault();
   });
-
-  let pressed = { x: 0, y: 0 };
-  canvas.addEventListener("pointerdown", (event) => (pressed = { x: event.clientX, y: event.clientY }));
-  canvas.addEventListener("click", (event) => {
-    if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) <= CLICK_TOLERANCE) pick(body.vertexAt(event), true);
-  });
-
-  let hovered = null; // the latest position of the pointer that has not been handled yet
-  canvas.addEventListener("pointermove", (event) => {
-    if (state.pinned || event.buttons || event.pointerType === "touch") return;
-    if (!hovered) {
-      requestAnimationFrame(() => {
-        if (hovered && !state.pinned) pick(body.vertexAt(hovered));
-        hovered = null;
-      });
-    }
-    hovered = event;
-  });
-  canvas.addEventListener("pointerleave", () => {
-    hovered = null;
-    if (!state.pinned) pick(null);
+  watchPointer(body, {
+    hovers: () => !state.pinned,
+    hover: (event) => pick(event && body.vertexAt(event)),
+    click: (event) => pick(body.vertexAt(event), true),
   });
 }
 
@@ -249,8 +199,7 @@ onChoice("mode", (mode) => {
   state.mode = mode;
   paint();
 });
-byId("reset").addEventListener("click", resetView);
-byId("linked").addEventListener("change", () => bodies && follow(bodies.a));
+byId("reset").addEventListener("click", () => cameras.reset());
 for (const button of document.querySelectorAll(".pair")) {
   button.addEventListener("click", () => compare(Number(button.dataset.edge)));
 }
@@ -261,7 +210,7 @@ document.body.dataset.shape = Math.max(extent(0), extent(2)) > WIDE * extent(1) 
 if (bodies) {
   const observer = new ResizeObserver(() => {
     for (const body of everyBody) if (body.canvas.clientWidth) body.resize();
-    if (untouched) resetView();
+    if (cameras.untouched) cameras.reset();
     render(); // at once, because resizing has emptied the canvas
   });
   for (const body of everyBody) observer.observe(body.canvas);

@@ -3,12 +3,13 @@
 // into jaxsmw/report/assets/viewer.js, which page.html embeds.
 
 import { Vector3 } from "three";
-import { Body, decode, moveByKey, turns } from "./body.js";
+import { Body, decode, turns } from "./body.js";
+import { Cameras } from "./cameras.js";
 import { startHelp } from "./help.js";
 import { startLandmarks } from "./landmarks.js";
+import { watchPointer } from "./pointer.js";
 import { startRegistered } from "./registered.js";
 
-const CLICK_TOLERANCE = 5; // the most pixels that the pointer moves between press and release of a click
 const NAMED_VERTICES = 12; // the most source vertices that are listed for one target vertex
 const WITHIN_SCALE = 0.98; // the share of values inside the colour scale of a function; the rest is clipped
 const FIRST_ENTRY = [1, 1]; // the entry that the mode "eigenfunctions" opens with; eigenfunction 0 is constant
@@ -365,19 +366,8 @@ function chooseEntry(entry, hovered = null) {
 
 // ---- Cameras
 
-let untouched = true;
-
-function resetView() {
-  const offset = new Vector3().setFromSphericalCoords(1, Math.PI / 2 - data.elevation, data.azimuth);
-  const distance = Math.max(...everyBody.map((body) => body.distanceToFit(offset)));
-  offset.setLength(distance);
-  for (const body of everyBody) {
-    body.controls.minDistance = distance / 40;
-    body.controls.maxDistance = 4 * distance;
-    body.lookFrom(offset);
-  }
-  untouched = true;
-}
+const direction = new Vector3().setFromSphericalCoords(1, Math.PI / 2 - data.elevation, data.azimuth);
+const cameras = new Cameras(everyBody, { direction, linked: byId("linked"), onMove: draw });
 
 /** Turns the bodies so that these surface points, { x, y }, face the viewer. */
 function turnTowards(points) {
@@ -387,66 +377,30 @@ function turnTowards(points) {
     const distance = body.camera.position.distanceTo(body.controls.target);
     body.lookFrom(new Vector3(...body.shape.viewOf(point)).setLength(distance));
   }
-  untouched = false;
-}
-
-let leader = null; // the body that the other body follows at the moment
-function follow(body) {
-  draw();
-  if (!byId("linked").checked || (leader && leader !== body)) return;
-  leader = body;
-  for (const other of everyBody) {
-    if (other === body) continue;
-    other.camera.position.copy(body.camera.position);
-    other.controls.target.copy(body.controls.target);
-    other.controls.update();
-  }
-  leader = null;
+  cameras.untouched = false;
 }
 
 function onKey(body, event) {
   if (event.altKey || event.ctrlKey || event.metaKey) return;
   if (landmarks.onKey(body, event)) return;
-  if (moveByKey(body, event.key)) untouched = false;
-  else if (event.key === "0" || event.key === "Home") resetView();
-  else if (event.key === "Escape") {
+  if (event.key === "Escape") {
     pin("x", null);
     chooseEntry(null);
-  }
-  else return;
+  } else if (!cameras.onKey(body, event.key)) return;
   event.preventDefault();
 }
 
 // ---- Mouse, touch and keys
 
 for (const [side, body] of Object.entries(bodies)) {
-  const { canvas, controls } = body;
-  controls.addEventListener("change", () => follow(body));
-  controls.addEventListener("start", () => (untouched = false));
-  canvas.addEventListener("keydown", (event) => onKey(body, event));
-
-  let pressed = { x: 0, y: 0 };
-  canvas.addEventListener("pointerdown", (event) => (pressed = { x: event.clientX, y: event.clientY }));
-  canvas.addEventListener("click", (event) => {
-    if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) > CLICK_TOLERANCE) return;
-    if (landmarks.active) landmarks.onClick(side, body.pointAt(event));
-    else pin(side, body.vertexAt(event));
-  });
-
-  let hovered = null; // the latest position of the pointer that has not been handled yet
-  canvas.addEventListener("pointermove", (event) => {
-    if (state.pinned || landmarks.active || event.buttons || event.pointerType === "touch") return;
-    if (!hovered) {
-      requestAnimationFrame(() => {
-        if (hovered && !state.pinned) pick(side, body.vertexAt(hovered));
-        hovered = null;
-      });
-    }
-    hovered = event;
-  });
-  canvas.addEventListener("pointerleave", () => {
-    hovered = null;
-    if (!state.pinned) pick(side, null);
+  body.canvas.addEventListener("keydown", (event) => onKey(body, event));
+  watchPointer(body, {
+    hovers: () => !state.pinned && !landmarks.active,
+    hover: (event) => pick(side, event && body.vertexAt(event)),
+    click: (event) => {
+      if (landmarks.active) landmarks.onClick(side, body.pointAt(event));
+      else pin(side, body.vertexAt(event));
+    },
   });
 }
 
@@ -490,8 +444,7 @@ matrix.addEventListener("keydown", (event) => {
 });
 darkness.addEventListener("change", drawMatrix);
 
-byId("reset").addEventListener("click", resetView);
-byId("linked").addEventListener("change", () => follow(bodies.x));
+byId("reset").addEventListener("click", () => cameras.reset());
 byId("vertex").addEventListener("change", ({ target }) => {
   if (target.value === "") pin("x", null);
   else if (target.reportValidity()) pin("x", target.valueAsNumber);
@@ -502,7 +455,7 @@ document.body.dataset.shape = data.wide ? "wide" : "tall";
 
 const observer = new ResizeObserver(() => {
   for (const body of everyBody) body.resize();
-  if (untouched) resetView();
+  if (cameras.untouched) cameras.reset();
   // Draw at once, because resizing has emptied the canvas.
   for (const body of everyBody) body.render();
 });
