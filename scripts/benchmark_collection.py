@@ -5,6 +5,7 @@
     python scripts/benchmark_collection.py DATA_DIRECTORY tosca_r/cat tosca_r/dog
     python scripts/benchmark_collection.py DATA_DIRECTORY primate_molars mouse_mandibles --pairs 40
     python scripts/benchmark_collection.py DATA_DIRECTORY smal_r --ablations
+    python scripts/benchmark_collection.py DATA_DIRECTORY faust_r --growth 35 70 140 280
 
 Each data set is matched as one collection. `SET/CLASS` selects the shapes whose names begin with CLASS. On
 random ordered pairs (seed 0), the errors of the maps through the template are compared with the errors of
@@ -12,6 +13,10 @@ random ordered pairs (seed 0), the errors of the maps through the template are c
 the square root of the target's area. For sets with landmarks, the error is the mean distance of carried
 landmarks to manual landmarks, in thousandths of the diagonal of the target's bounding box; `match` then
 carries the landmarks with its registered mesh, as `scripts/benchmark_transfer.py` does.
+
+`--growth` measures the time and the memory of collections with the given numbers of shapes. The shapes are
+those of the data set, decimated to about 1500 vertices. If more shapes are needed, each shape is repeated
+with other numbers of vertices, so that all triangulations differ.
 
 Finished pairs are kept in OUTPUT, so that an interrupted benchmark can be continued.
 """
@@ -21,19 +26,23 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import multiprocessing
 import resource
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import igl
 import numpy as np
 from benchmark_transfer import read_scan_landmarks
 from jaxtyping import Float64
 from tqdm import tqdm
 
-from jaxsmw import geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw import geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.collection import Collection, CollectionSettings, match_collection
+from jaxsmw.collection.synchronization import vertex_map_between
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.geometry import nearest_surface_points
@@ -72,10 +81,17 @@ def main() -> None:
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument("--pairs", type=int, default=200, help="number of compared pairs (default: 200)")
     parser.add_argument("--ablations", action="store_true", help="also measure all ablations")
+    parser.add_argument(
+        "--growth", type=int, nargs="+", metavar="N", help="measure N shapes instead of errors"
+    )
     parser.add_argument("--no-direct", action="store_true", help="leave out the matches of single pairs")
     parser.add_argument("--output", type=Path, default=Path("collections"), help="directory of the results")
     options = parser.parse_args()
     for name in options.sets:
+        for number in options.growth or ():
+            print(f"{name}: {json.dumps(_growth(options.directory, name, number))}", flush=True)
+        if options.growth:
+            continue
         chosen = ABLATIONS if options.ablations else {"default": _DEFAULT}
         for ablation, settings in chosen.items():
             found = _measure(options, name, settings, direct=not options.no_direct and ablation == "default")
@@ -143,11 +159,47 @@ def _measure(
     if single:
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
+    if options.ablations and settings == _DEFAULT:
+        points = [_measure_truth(found, files, i, j, _Unregistered(found, i, j)) for i, j in pairs]
+        result["without_registered_meshes"] = _summary(np.array(points))
     return result
+
+
+def _growth(directory: Path, name: str, number: int) -> dict[str, float]:
+    """Measure the time and the memory of a collection of small meshes, in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_matched_growth, _files(directory, name), number).result()
+
+
+def _matched_growth(files: list[Path], number: int) -> dict[str, float]:
+    meshes = []
+    for row, file in zip(range(number), itertools.cycle(files), strict=False):
+        mesh = read_mesh(file)
+        vertices = 1500 + 7 * row % 400
+        positions, faces, *_ = igl.decimate(mesh.vertices, mesh.faces, 2 * vertices)
+        meshes.append(make_mesh(positions, faces, name=f"{file.stem} {row}"))
+    start, start_cpu = time.perf_counter(), time.process_time()
+    found = match_collection(meshes)
+    return {
+        "shapes": len(found.meshes),
+        "edges": len(found.edges),
+        "seconds": time.perf_counter() - start,
+        "cpu_seconds": time.process_time() - start_cpu,
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    } | found.seconds
 
 
 def _matched(found: Collection, i: int, j: int, mirrored: bool) -> Any:
     return match(found.meshes[i], found.meshes[j], mirror="yes" if mirrored else "no")
+
+
+class _Unregistered:
+    """The map of a pair by the consistent points alone, without registered meshes."""
+
+    def __init__(self, found: Collection, i: int, j: int):
+        self.pointwise_map = vertex_map_between(
+            found.points[i], found.points[j], found.meshes[found.template], found.meshes[i], found.meshes[j]
+        )
 
 
 def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:

@@ -135,8 +135,9 @@ class Collection:
         found = [
             f"{len(self.meshes)} shapes, {len(self.edges)} matched pairs; the template is "
             f"{self.names[self.template]}.",
-            f"{decisions['kept']} maps agree with the others, {decisions['replaced']} were wrong and were "
-            f"replaced, {decisions['contradicted']} still contradict the others and hardly count.",
+            f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
+            f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
+            f"{decisions['contradicted']}.",
         ]
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
