@@ -41,12 +41,14 @@ from jaxtyping import Float64
 from tqdm import tqdm
 
 from jaxsmw import geodesic_error, make_mesh, match, read_ground_truth, read_mesh
+from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection import Collection, CollectionSettings, match_collection
 from jaxsmw.collection.synchronization import vertex_map_between
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.geometry import nearest_surface_points
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
+from jaxsmw.presets import PRESETS
 from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import transfer_landmarks
@@ -79,6 +81,7 @@ def main() -> None:
     )
     parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
+    parser.add_argument("--preset", choices=tuple(PRESETS), default=DEFAULT_PRESET)
     parser.add_argument("--pairs", type=int, default=200, help="number of compared pairs (default: 200)")
     parser.add_argument("--ablations", action="store_true", help="also measure all ablations")
     parser.add_argument(
@@ -128,7 +131,12 @@ def _measure(
 
         start = time.perf_counter()
         found = match_collection(
-            meshes, names=[file.stem for file in files], settings=settings, directory=work, progress=progress
+            meshes,
+            names=[file.stem for file in files],
+            preset=options.preset,
+            settings=settings,
+            directory=work,
+            progress=progress,
         )
     seconds = time.perf_counter() - start
     measure = _measure_truth if (files[0].parents[1] / "corres").is_dir() else _measure_landmarks
@@ -143,7 +151,10 @@ def _measure(
         key = (files[i].stem, files[j].stem)
         if key not in journal:
             mirrored = bool(found.mirrored[i] != found.mirrored[j])
-            error = measure(found, files, i, j, _matched(found, i, j, mirrored))
+            one = match(
+                found.meshes[i], found.meshes[j], preset=options.preset, mirror="yes" if mirrored else "no"
+            )
+            error = measure(found, files, i, j, one)
             journal.append([{"source": key[0], "target": key[1], "error": error}])
         single.append(float(journal[key]["error"]))
     result: dict[str, Any] = {
@@ -187,10 +198,6 @@ def _matched_growth(files: list[Path], number: int) -> dict[str, float]:
         "cpu_seconds": time.process_time() - start_cpu,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     } | found.seconds
-
-
-def _matched(found: Collection, i: int, j: int, mirrored: bool) -> Any:
-    return match(found.meshes[i], found.meshes[j], mirror="yes" if mirrored else "no")
 
 
 class _Unregistered:

@@ -1,16 +1,22 @@
-"""The scripts that measure speed print complete tables for small shapes."""
+"""The scripts that measure speed and errors print complete tables for small shapes."""
 
+import json
 import sys
 from argparse import Namespace
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import benchmark_batches
+import benchmark_collection
 import benchmark_speed
+
+from jaxsmw.geometry.creature import creature
+from jaxsmw.io import write_mesh
 
 pytestmark = pytest.mark.study
 
@@ -43,3 +49,26 @@ def test_each_part_of_the_speed_benchmark_measures_positive_times(part, monkeypa
     for title, note, (header, *rows), numbers in measured:
         assert title and note and rows and all(len(row) == len(header) for row in rows)
         assert min(numbers["seconds"].values()) > 0
+
+
+def test_maps_of_a_collection_are_compared_with_direct_maps(tmp_path, monkeypatch, capsys):
+    for folder in ("off", "corres"):
+        (tmp_path / "tiny" / folder).mkdir(parents=True)
+    for pose in ("rest", "stand", "walk"):
+        mesh = creature(vertices=700, pose=pose)  # the same triangulation in all poses
+        write_mesh(tmp_path / "tiny" / "off" / f"{pose}.off", mesh)
+        np.savetxt(tmp_path / "tiny" / "corres" / f"{pose}.vts", np.arange(1, 701), fmt="%d")
+    arguments = [str(tmp_path), "tiny", "--preset", "paper", "--pairs", "2", "--ablations"]
+    monkeypatch.setattr(sys, "argv", ["benchmark_collection.py", *arguments, "--output", str(tmp_path)])
+    monkeypatch.setattr(benchmark_collection, "_TRIANGLES", 5)
+    monkeypatch.setattr(
+        benchmark_collection, "ABLATIONS", dict([*benchmark_collection.ABLATIONS.items()][:2])
+    )
+    benchmark_collection.main()
+    lines = capsys.readouterr().out.splitlines()
+    default, fewer = (json.loads(line.split(": ", 1)[1]) for line in lines[:2])
+    assert default["edges"] == 3 and fewer["edges"] == 3
+    assert default["through_template"]["mean"] < 60 and default["direct"]["lost"] == 0
+    assert default["without_registered_meshes"]["mean"] < 60
+    assert 0 <= default["cycles"]["template"] < default["cycles"]["graph_first"]
+    assert len((tmp_path / "tiny" / "direct.csv").read_text().splitlines()) == 3
