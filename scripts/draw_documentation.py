@@ -1,4 +1,4 @@
-"""Draws the pictures of the tutorial, the failures and the transfers, and prints the table of failures.
+"""Draws the pictures of the documentation, and prints the table of failures.
 
     pip install -e ".[report]"
     python scripts/draw_documentation.py [DATA_DIRECTORY]
@@ -29,6 +29,9 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
+from jaxsmw.collection import Collection, CollectionSettings
+from jaxsmw.geometry.creature import creature
+from jaxsmw.report.colors import position_colors
 from jaxsmw.report.figures import draw_correspondence, draw_mesh
 from jaxsmw.runtime.files import atomic_write
 
@@ -232,6 +235,49 @@ def draw_transfers() -> None:
     draw_side_by_side("attributes", {"Source": (mesh_x, stripes), "Target": (mesh_y, moved)})
 
 
+def draw_another_kind() -> None:
+    """Draws a collection of quadrupeds and one biped, each with the colours of the template."""
+    kinds = [
+        ("quadruped", pose, seed) for pose, seed in (("rest", 0), ("stand", 1), ("walk", 2), ("rest", 7))
+    ]
+    meshes = [
+        creature(kind, vertices=1500 + 30 * number, pose=pose, seed=seed)
+        for number, (kind, pose, seed) in enumerate([*kinds, ("biped", "rest", 0)])
+    ]
+    collection = jaxsmw.match_collection(meshes, mirror=False)
+    print(*collection.sentences(), sep="\n")
+    colors = position_colors(collection.meshes[collection.template])
+    shown = [collection.template, *(n for n in (2, 3, 4) if n != collection.template)]
+    panels = {str(n): (collection.meshes[n], colors[collection.to_template(n)]) for n in shown}
+    draw_side_by_side("failure_another_kind", panels)
+
+
+def draw_few_edges(data: Path) -> None:
+    """Draw three animals of SMAL, matched as a collection with two and with four edges per shape.
+
+    One animal is the template, and the two others have the largest errors with two edges per shape.
+    """
+    files = sorted((data / "smal_r" / "off").glob("*.off"))
+    meshes = [jaxsmw.read_mesh(file) for file in files]
+    truth = [np.loadtxt(data / "smal_r" / "corres" / f"{file.stem}.vts", int) - 1 for file in files]
+    four, two = (
+        jaxsmw.match_collection(meshes, template=0, settings=CollectionSettings(edges_per_shape=edges))
+        for edges in (4, 2)
+    )
+
+    def error(collection: Collection, shape: int) -> float:
+        images = collection.registered[shape].vertices[truth[0]] - meshes[shape].vertices[truth[shape]]
+        return float(np.linalg.norm(images, axis=1).mean() / meshes[shape].area ** 0.5)
+
+    colors = position_colors(meshes[0])
+    panels = {"template": (meshes[0], colors)}
+    for shape in sorted(range(len(meshes)), key=lambda shape: -error(two, shape))[:2]:
+        print(f"{files[shape].stem}: {error(two, shape):.3f}, with four edges {error(four, shape):.3f}")
+        for name, collection in (("two", two), ("four", four)):
+            panels[f"{shape} {name}"] = meshes[shape], colors[collection.to_template(shape)]
+    draw_side_by_side("failure_few_edges", panels)
+
+
 def spots(
     mesh: jaxsmw.Mesh, points: Float[np.ndarray, "l 3"], hues: Float[np.ndarray, "l 3"]
 ) -> Float[np.ndarray, "n 3"]:
@@ -275,7 +321,7 @@ def main() -> None:
         "--only",
         nargs="+",
         metavar="NAME",
-        help="draw only these pictures: `tutorial`, `transfers`, or names of cases",
+        help="draw only these: `tutorial`, `transfers`, `another_kind`, `few_edges`, or names of cases",
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
@@ -283,6 +329,10 @@ def main() -> None:
         draw_tutorial()
     if not options.only or "transfers" in options.only:
         draw_transfers()
+    if not options.only or "another_kind" in options.only:
+        draw_another_kind()
+    if options.data and (not options.only or "few_edges" in options.only):
+        draw_few_edges(options.data)
     cases = [*procedural_cases(), *(real_cases(options.data) if options.data else ())]
     print("| case | error | expected | error, cured | expected, cured |\n| --- | --- | --- | --- | --- |")
     for case in cases:

@@ -19,7 +19,7 @@ from jaxsmw.collection import (
     match_pairs,
     synchronize,
 )
-from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, triangles
+from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
@@ -227,6 +227,13 @@ def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
     points = vertices_as_points(body)
     maps = {key: points for edge in edges for key in (edge, edge[::-1])}
     assert Network([body] * 5, maps, edges).medoid() == 2
+
+
+def test_shapes_without_any_good_map_are_outliers():
+    errors = {(0, 1): 0.01, (1, 2): 0.3, (0, 2): 0.1, (2, 3): 0.2, (0, 3): 0.09}
+    assert find_outliers(errors, 0.1) == (2,)
+    assert find_outliers(errors, 0.005) == (0, 1, 2, 3)
+    assert find_outliers({}, 0.1) == ()
 
 
 def test_points_inside_torn_triangles_follow_the_nearest_corner(body):

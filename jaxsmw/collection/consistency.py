@@ -140,3 +140,18 @@ def estimate_edge_errors(
         return prior, errors, cycles
     estimated = edge_errors(jnp.asarray(cycles), jnp.asarray(errors), jnp.asarray(prior))
     return np.asarray(estimated, np.float64), errors, cycles
+
+
+def find_outliers(errors: Mapping[Edge, float], limit: float) -> tuple[int, ...]:
+    """Return the shapes whose maps all have large errors, in ascending order.
+
+    **Arguments:**
+
+    - `errors`: the error of the map of each edge (i, j).
+    - `limit`: the smallest large error, in the unit of `errors`.
+    """
+    least: dict[int, float] = {}
+    for edge, error in errors.items():
+        for shape in edge:
+            least[shape] = min(error, least.get(shape, error))
+    return tuple(sorted(shape for shape, error in least.items() if error >= limit))

@@ -149,6 +149,7 @@ def write_summary(
             {"name": name, "vertices": len(mesh.vertices), "mirrored": bool(mirrored)}
             for name, mesh, mirrored in zip(names, collection.meshes, collection.mirrored, strict=True)
         ],
+        "outliers": [names[shape] for shape in collection.outliers],
         "left_out": collection.left_out,
         "edges": [
             {

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.choices import DEFAULT_PRESET
-from jaxsmw.collection.consistency import Edge, estimate_edge_errors
+from jaxsmw.collection.consistency import Edge, estimate_edge_errors, find_outliers
 from jaxsmw.collection.edges import EdgeMap, EdgeTask, compare_hands, match_edges
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.hands import choose_hands
@@ -102,6 +102,8 @@ class Collection:
     - `axes`: the axes of the descriptors, or None.
     - `cycle_errors`: the errors of all triangles of the graph, with the first and with the final maps of its
       edges, as two arrays in units of the square root of the area.
+    - `outliers`: the numbers of shapes that differ much from all other shapes: all their maps have large
+      errors or distortions. Such a shape may be another kind of body.
     - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds.
     """
@@ -114,6 +116,7 @@ class Collection:
     edges: tuple[MatchedEdge, ...]
     axes: DescriptorAxes | None = None
     cycle_errors: tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " d"]] | None = None
+    outliers: tuple[int, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -130,7 +133,7 @@ class Collection:
         return tuple(mesh.name for mesh in self.meshes)
 
     def sentences(self) -> tuple[str, ...]:
-        """Return sentences about the template, the graph, its decisions, the hands and the missing meshes."""
+        """Return sentences about the template, the decisions, the hands, the outliers and missing meshes."""
         decisions = Counter(edge.decision for edge in self.edges)
         found = [
             f"{len(self.meshes)} shapes, {len(self.edges)} matched pairs; the template is "
@@ -142,6 +145,11 @@ class Collection:
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
             found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
+        found += [
+            f"{self.names[shape]} differs much from all other shapes, so its maps are uncertain. Look at its "
+            "colours, and leave it out if it is another kind of body."
+            for shape in self.outliers
+        ]
         found += [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return tuple(found)
 
@@ -365,6 +373,10 @@ class _Matcher:
             edges=tuple(described),
             axes=self.axes,
             cycle_errors=(first_cycles, self.cycles),
+            outliers=find_outliers(
+                {(edge.source, edge.target): edge.cycle_error for edge in described},
+                self.settings.outlier_from,
+            ),
             left_out=self.left_out,
             seconds=self.seconds,
         )
