@@ -162,6 +162,7 @@ def _measure(
         "edges": len(found.edges),
         "replaced": sum(edge.decision == "replaced" for edge in found.edges),
         "contradicted": sum(edge.decision == "contradicted" for edge in found.edges),
+        "outliers": [found.names[shape] for shape in found.outliers],
         "through_template": _summary(np.array(through)),
         "cycles": _cycles(found) if settings == _DEFAULT else {},
         "seconds": seconds,
