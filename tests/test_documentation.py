@@ -79,7 +79,7 @@ def pair():
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
-def test_code_blocks_run(page, pair, tmp_path, monkeypatch):
+def test_code_blocks_run(page, pair, tmp_path, monkeypatch, small_pictures):
     write_mesh(tmp_path / "source.off", pair.source)
     write_mesh(tmp_path / "target.ply", pair.target)
     monkeypatch.chdir(tmp_path)
