@@ -177,17 +177,17 @@ def _measure(
     return result
 
 
-def _growth(directory: Path, name: str, number: int) -> dict[str, float]:
+def _growth(directory: Path, name: str, number: int) -> dict[str, Any]:
     """Measure the time and the memory of a collection of small meshes, in a process of its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(_matched_growth, _files(directory, name), number).result()
 
 
-def _matched_growth(files: list[Path], number: int) -> dict[str, float]:
+def _matched_growth(files: list[Path], number: int) -> dict[str, Any]:
     meshes = []
     for row, file in zip(range(number), itertools.cycle(files), strict=False):
         mesh = read_mesh(file)
-        vertices = 1500 + 7 * row % 400
+        vertices = 1450 + 7 * row % 80
         positions, faces, *_ = igl.decimate(mesh.vertices, mesh.faces, 2 * vertices)
         meshes.append(make_mesh(positions, faces, name=f"{file.stem} {row}"))
     start, start_cpu = time.perf_counter(), time.process_time()
@@ -198,7 +198,8 @@ def _matched_growth(files: list[Path], number: int) -> dict[str, float]:
         "seconds": time.perf_counter() - start,
         "cpu_seconds": time.process_time() - start_cpu,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-    } | found.seconds
+        "seconds_of_steps": found.seconds,
+    }
 
 
 class _Unregistered:

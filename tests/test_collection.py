@@ -3,9 +3,11 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 
@@ -18,9 +20,10 @@ from synthetic import bumpy_mesh
 import jaxsmw.collection.matching as matching
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
 from jaxsmw.collection import CollectionSettings, match_collection
+from jaxsmw.collection.files import write_registered
 from jaxsmw.geometry.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io import Landmarks, read_landmark_file, write_landmark_file
+from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_file
 from jaxsmw.runtime.cache import Store
 
 VERTICES = 1000
@@ -228,6 +231,35 @@ def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
     assert store.load("graph", (np.arange(3), "a")) is None
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"names": ["a", "b"]}, "2 different names for 5 meshes"),
+        ({"names": list("abcda")}, "4 different names"),
+        ({"mirror": "no"}, "give True or False"),
+        ({"template": 5}, "from 0 to 4"),
+        ({"template": "a"}, "from 0 to 4"),
+        ({"directory": "no/such/directory"}, "is not a directory"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_arguments_are_refused(meshes, arguments, message):
+    with pytest.raises(InputError, match=message):
+        match_collection(meshes, preset="paper", **arguments)
+
+
+def test_sentences_name_shapes_that_do_not_fit(found):
+    names = found.names
+    (sentence,) = (text for text in replace(found, outliers=(1,)).sentences() if names[1] in text)
+    assert "differ much" in sentence
+    (sentence,) = (text for text in replace(found, outliers=(1, 3, 4)).sentences() if names[3] in text)
+    assert "No good map was found for 3 of 5 shapes" in sentence
+    nothing = replace(found, cycle_errors=(np.array([]), np.array([])))
+    assert any("no cycles" in text for text in nothing.sentences())
+    with pytest.raises(InputError, match="there is no shape 5"):
+        found.pointwise_map(0, 5)
+
+
 @pytest.mark.cluster
 def test_workers_give_the_same_maps(meshes, found, tmp_path):
     from jaxsmw.runtime.workers import open_executor
@@ -240,8 +272,13 @@ def test_workers_give_the_same_maps(meshes, found, tmp_path):
         assert (result.pointwise_map(i, j) == found.pointwise_map(i, j)).mean() > 0.99
 
 
+def signed_volume(mesh: Mesh) -> float:
+    corners = mesh.vertices[mesh.faces]
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+
+
 @pytest.mark.slow
-def test_shapes_of_the_other_hand_are_recognised():
+def test_shapes_of_the_other_hand_are_recognised(tmp_path):
     """Of four noisy asymmetric lumps, one is a mirror image."""
     lump = bumpy_mesh(3)
     lumps = []
@@ -256,6 +293,10 @@ def test_shapes_of_the_other_hand_are_recognised():
     for i, j in permutations(range(4), 2):
         offsets = lumps[j].vertices[result.pointwise_map(i, j)] - lumps[j].vertices
         assert np.linalg.norm(offsets, axis=1).mean() < 0.02 * np.sqrt(lumps[j].area)
+    # Faces of mirror images are written such that their normals point to the same side as on the meshes.
+    files = write_registered(result, MeshData(lumps[result.template], lump.faces), tmp_path, ".ply")
+    for file, mesh in zip(files, lumps, strict=True):
+        assert 0.9 < signed_volume(read_mesh(file)) / signed_volume(mesh) < 1.1
     # In the shape model, all lumps are of the template's hand, so they differ only by noise.
     model = result.shape_model()
     assert np.sqrt(model.total_variance) < 0.02 * np.sqrt(lump.area)
@@ -387,9 +428,29 @@ def test_the_same_command_continues(result_directory, directory, run, matched):
 
 
 def test_other_settings_need_another_directory(result_directory, directory, run):
-    outcome = run("collection", directory, "--output", result_directory, *OPTIONS[:-1], "3")
+    outcome = run("collection", directory, "--output", result_directory, *OPTIONS, "--seed", "3")
     # The first line names the broken mesh.
-    assert_refused(outcome._replace(errors=outcome.errors.split("\n", 1)[1]), naming="edges = 2")
+    assert_refused(outcome._replace(errors=outcome.errors.split("\n", 1)[1]), naming="seed = 0")
+
+
+def test_files_of_earlier_meshes_and_options_are_removed(result_directory, directory, meshes, run, tmp_path):
+    output = tmp_path / "result"
+    shutil.copytree(result_directory, output)
+    (output / "registered" / "mine.txt").write_text("not a result")
+    far = tmp_path / "far.csv"
+    write_landmark_file(far, Landmarks(("a",), 10 * meshes[1].vertices[:1]))
+    outcome = run(
+        "collection", directory, "--output", output, *OPTIONS, "--exclude", "shape3.stl", "--suffix", "obj",
+        "--landmarks", far, "--landmarks-of", "shape1.off",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    assert "3 shapes" in outcome.output and "from the surface" in outcome.errors
+    names = ["shape0", "shape1", "shape2"]
+    assert sorted(os.listdir(output / "registered")) == ["mine.txt", *(f"{name}.obj" for name in names)]
+    assert sorted(os.listdir(output / "landmarks")) == ["shape0.csv", "shape2.csv"]
+    assert os.listdir(output / "attributes") == []
+    assert not any("shape3" in file for file in os.listdir(output / "maps"))
+    assert not (output / "mean.ply").exists() and (output / "mean.obj").exists()
 
 
 @pytest.mark.parametrize(
@@ -397,8 +458,9 @@ def test_other_settings_need_another_directory(result_directory, directory, run)
     [
         (("--suffix", ".docx"), ".docx"),
         (("--template", "elsewhere.ply"), "--template"),
+        (("--exclude", "elsewhere.ply"), "--exclude"),
         (("--landmarks-of", "shape0.ply"), "--landmarks"),
-        (("--landmarks", "other.csv"), "--landmarks-of"),
+        (("--landmarks", "none.csv"), "none.csv: does not exist"),
         (("--attributes-of", "shape9.ply"), "--attributes-of"),
     ],
 )
@@ -409,7 +471,7 @@ def test_bad_options_are_refused(directory, run, tmp_path, options, naming):
 
 
 def test_a_directory_without_meshes_is_refused(run, tmp_path):
-    assert_refused(run("collection", tmp_path, "--output", tmp_path / "out"), naming="at least two")
+    assert_refused(run("collection", tmp_path, "--output", tmp_path / "out"), naming="needs two")
     assert_refused(run("collection", tmp_path / "none", "--output", tmp_path / "out"), naming="none")
 
 

@@ -229,6 +229,22 @@ def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
     assert Network([body] * 5, maps, edges).medoid() == 2
 
 
+@pytest.mark.parametrize(
+    ("distances", "options", "message"),
+    [
+        (np.zeros((3, 2)), {}, "square matrix"),
+        (np.full((3, 3), np.nan), {}, "finite"),
+        (np.ones((3, 3)), {"edges_per_shape": -1}, "positive"),
+        (np.ones((3, 3)), {"random_share": 2}, "share"),
+        (np.ones((3, 3)), {"given": [(0, 3)]}, "3 shapes"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_graphs_are_refused(distances, options, message):
+    with pytest.raises(InputError, match=message):
+        choose_edges(distances, **options)
+
+
 def test_shapes_without_any_good_map_are_outliers():
     errors = {(0, 1): 0.01, (1, 2): 0.3, (0, 2): 0.1, (2, 3): 0.2, (0, 3): 0.09}
     assert find_outliers(errors, 0.1) == (2,)

@@ -368,7 +368,8 @@ def test_invalid_shapes_and_options_are_refused(shapes: object, options: dict, m
 def test_invalid_uses_of_a_model_are_refused() -> None:
     model = shape_model(random_shapes())
     for call, message in (
-        (lambda: model.shape(np.zeros(N)), "there are 8 scores, but the model has 7 modes"),
+        (lambda: model.shape(np.zeros(N)), "the scores have shape (8,): give at most 7 finite numbers"),
+        (lambda: model.shape(np.array([np.nan])), "finite numbers"),
         (lambda: model.project(np.eye(3)), "the shape has 3 vertices, but the model has 60"),
         (lambda: model.project(bad(0, np.nan)[0]), "not finite"),
         (lambda: model.project(np.full((VERTICES, 3), 0.1)), "a single point"),

@@ -56,6 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "similar to all others)",
     )
     parser.add_argument(
+        "--exclude",
+        metavar="FILE",
+        nargs="+",
+        type=path,
+        default=[],
+        help="meshes of DIRECTORY to leave out, for example other kinds of bodies",
+    )
+    parser.add_argument(
         "--preset",
         choices=get_args(PresetName),
         default=DEFAULT_PRESET,
@@ -136,13 +144,13 @@ def run(options: argparse.Namespace) -> None:
     """
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
-        files = _mesh_files(options.directory)
+        files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.runtime.files import make_directory
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
-        data, unreadable = _read(files, weld=options.weld)
         landmarks = _read_landmarks(options)
+        data, unreadable = _read(files, weld=options.weld)
     if options.template and Path(options.template).name not in data:
         raise InputError(f"{options.template}: the template cannot be used: choose another template.")
     directory = make_directory(options.output)
@@ -161,18 +169,21 @@ def run(options: argparse.Namespace) -> None:
             measures = _measures(model)
         with stopwatch.step("writing"):
             _write(options, collection, data, landmarks, model, measures, directory)
-    _show(collection, measures)
+    _show(collection, measures, scale=options.scale)
     show(f"time: {stopwatch.summary()} (compilation included)")
     report_progress(f"the results are in {options.output}")
 
 
-def _mesh_files(directory: str) -> dict[str, Path]:
-    """Return the mesh files of a directory: a dictionary from file names to paths, in natural order.
+def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
+    """Return the mesh files of a collection: a dictionary from file names to paths, in natural order.
 
-    **Raises:** `InputError` if the directory cannot be read, or contains fewer than two mesh files.
+    **Raises:** `InputError` if the directory cannot be read, contains fewer than two mesh files, or does not
+    contain an excluded file.
     """
+    from jaxsmw.geometry.mesh import count_of
     from jaxsmw.io.mesh_data import MESH_SUFFIXES
 
+    directory = options.directory
     try:
         found = sorted(
             entry.name
@@ -183,12 +194,29 @@ def _mesh_files(directory: str) -> dict[str, Path]:
         raise InputError(
             f"{directory}: cannot be read as a directory ({error.strerror}): give a directory with meshes."
         ) from error
-    if len(found) < 2:
+    files = {name: Path(directory) / name for name in found}
+    for name in {Path(_inside(options, "exclude", file, files)).name for file in options.exclude}:
+        del files[name]
+    if len(files) < 2:
         raise InputError(
-            f"{directory}: contains {len(found)} mesh files, but a collection needs at least two: give a "
-            f"directory with meshes ({', '.join(MESH_SUFFIXES)})."
+            f"{directory}: contains {count_of(len(files), 'mesh file')}, but a collection needs two: give "
+            f"a directory with meshes ({', '.join(MESH_SUFFIXES)})."
         )
-    return {name: Path(directory) / name for name in found}
+    return files
+
+
+def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[str, Path]) -> str:
+    """Return the path of a mesh of the directory, which can be given by its path or by its name alone.
+
+    **Raises:** `InputError` if there is no such mesh.
+    """
+    for given in (file, os.path.join(options.directory, file)):
+        if Path(file).name in files and _same(given, files[Path(file).name]):
+            return given
+    raise InputError(
+        f"--{option.replace('_', '-')}: {file} is not a mesh file in {options.directory}: give one of its "
+        "files."
+    )
 
 
 def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
@@ -197,17 +225,17 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     from jaxsmw.io.mesh_data import check_mesh_suffix
 
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
+    if not options.suffix.startswith("."):
+        options.suffix = f".{options.suffix}"
     check_mesh_suffix(f"mesh{options.suffix}")
     if options.suffix.count(".") != 1 or "/" in options.suffix:
         raise InputError(f"--suffix: {options.suffix!r} is not a suffix: give for example .ply or .obj.")
     for option in ("template", "landmarks_of", "attributes_of"):
-        file = getattr(options, option)
-        if file and not (Path(file).name in files and _same(file, files[Path(file).name])):
-            raise InputError(
-                f"--{option.replace('_', '-')}: {file} is not a mesh file in {options.directory}: give the "
-                "path of one of its files."
-            )
+        if file := getattr(options, option):
+            setattr(options, option, _inside(options, option, file, files))
     if options.landmarks:
+        if not os.path.exists(options.landmarks):
+            raise InputError(f"{options.landmarks}: does not exist: check the path.")
         check_readable_suffix(options.landmarks)
         check_landmark_suffix(f"landmarks{_landmark_suffix(options.landmarks)}")
         options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, files)
@@ -294,7 +322,7 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Return the settings and versions that all runs with the same output must share."""
     from jaxsmw.runtime.provenance import code_digest, measured_code, versions
 
-    settings = {name: getattr(options, name) for name in ("preset", "mirror", "edges", "weld", "seed")}
+    settings = {name: getattr(options, name) for name in ("preset", "mirror", "weld", "seed")}
     return {"settings": settings, "versions": versions() | {"code": code_digest(measured_code())}}
 
 
@@ -357,6 +385,9 @@ def _measures(model: ShapeModel) -> dict[str, Any]:
     return found
 
 
+# If sizes differ by a larger factor, the meshes probably have different units of length.
+_DIFFERENT_SIZES = 4
+
 # Generalisation and specificity are reported for these numbers of modes, as far as the model has them.
 _REPORTED_MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 
@@ -383,16 +414,23 @@ def _write(
 
     by_name = dict(zip(_names(data), data.values(), strict=True))
     kept = [by_name[name] for name in collection.names]
-    write_maps(collection, directory)
-    write_registered(collection, kept[collection.template], directory, options.suffix)
-    write_model(collection, model, directory, options.suffix)
+    files = write_maps(collection, directory)
+    files += write_registered(collection, kept[collection.template], directory, options.suffix)
+    files += write_model(collection, model, directory, options.suffix)
     if landmarks is not None:
         source = _number(collection, options.landmarks_of, "the mesh with the landmarks")
-        write_landmarks(collection, source, landmarks, directory, _landmark_suffix(options.landmarks))
+        suffix = _landmark_suffix(options.landmarks)
+        written, notes = write_landmarks(collection, source, landmarks, directory, suffix)
+        files += written
+        for note in notes:
+            say(f"note: {note}")
     if options.attributes_of:
         source = _number(collection, options.attributes_of, "the mesh with the attributes")
-        write_attributes(collection, source, kept, directory, options.suffix)
-    write_summary(collection, measures, directory, {**_provenance(options), "machine": machine()})
+        files += write_attributes(collection, source, kept, directory, options.suffix)
+    shared = _provenance(options)
+    settings = shared["settings"] | {"edges": options.edges, "scale": options.scale}
+    provenance = {**shared, "settings": settings, "machine": machine()}
+    write_summary(collection, measures, directory, provenance, files)
     template = collection.meshes[collection.template]
     write_collection_page(
         directory / "index.html",
@@ -405,7 +443,7 @@ def _write(
                 edge.source,
                 edge.target,
                 1e3 * edge.expected_error,
-                edge.decision == "contradicted",
+                edge.doubtful,
                 edge.sentence(collection.names),
             )
             for edge in collection.edges
@@ -424,9 +462,20 @@ def _number(collection: Collection, file: str, what: str) -> int:
     raise InputError(f"{file}: {what} was left out of the collection: choose another mesh.")
 
 
-def _show(collection: Collection, measures: Mapping[str, Any]) -> None:
+def _show(collection: Collection, measures: Mapping[str, Any], *, scale: bool) -> None:
+    from jaxsmw.geometry.mesh import count_of
+
     for sentence in collection.sentences():
         show(sentence)
+    sizes = [mesh.area**0.5 for mesh in collection.meshes]
+    if not scale and (ratio := max(sizes) / min(sizes)) > _DIFFERENT_SIZES:
+        show(
+            f"the largest mesh is {ratio:.3g} times as large as the smallest, which dominates the shape "
+            "model: use --scale, or convert all meshes to one unit of length."
+        )
     if shares := measures["compactness"]:
         first = ", ".join(f"{share:.0%}" for share in shares[:3])
-        show(f"shape model: {len(shares)} modes; the first modes together have {first} of the variance.")
+        show(
+            f"shape model: {count_of(len(shares), 'mode')}; the first modes together have {first} of the "
+            "variance."
+        )

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +25,30 @@ from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
 
 
-def write_maps(collection: Collection, directory: Path) -> None:
+def write_maps(collection: Collection, directory: Path) -> list[Path]:
     """Write the maps between the template and all shapes, as 0-based vertices.
 
     The file `NAME_from_template.txt` has one vertex of the shape NAME for each vertex of the template. The
     file `NAME_to_template.txt` has one vertex of the template for each vertex of the shape.
 
+    **Returns:** The written files.
+
     **Raises:** `InputError` if a file cannot be written.
     """
     folder = make_directory(directory / "maps")
+    written = []
     for shape, name in enumerate(collection.names):
-        write_pointwise_map(folder / f"{name}_from_template.txt", collection.from_template(shape))
-        write_pointwise_map(folder / f"{name}_to_template.txt", collection.to_template(shape))
+        files = [folder / f"{name}_{way}_template.txt" for way in ("from", "to")]
+        write_pointwise_map(files[0], collection.from_template(shape))
+        write_pointwise_map(files[1], collection.to_template(shape))
+        written += files
+    return written
 
 
-def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> None:
+def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> list[Path]:
     """Write the registered mesh of each shape: the template's triangulation, with positions on the shape.
+
+    On shapes of the other hand, the corners of the faces are reversed, so that normals point outward.
 
     **Arguments:**
 
@@ -46,16 +57,31 @@ def write_registered(collection: Collection, template: MeshData, directory: Path
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files, such as `.ply`.
 
+    **Returns:** The written files.
+
     **Raises:** `InputError` if a file cannot be written.
     """
     folder = make_directory(directory / "registered")
-    for name, registered in zip(collection.names, collection.registered, strict=True):
-        write_mesh_data(folder / f"{name}{suffix}", registered_data(template, registered))
+    written = []
+    for shape, registered in enumerate(collection.registered):
+        data = registered_data(template, registered)
+        if collection.mirrored[shape] != collection.mirrored[collection.template]:
+            data = _turned(data)
+        written.append(folder / f"{collection.names[shape]}{suffix}")
+        write_mesh_data(written[-1], data)
+    return written
+
+
+def _turned(data: MeshData) -> MeshData:
+    """Return the mesh with reversed corners of all faces, so that normals of a mirror image point outward."""
+    texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
+    mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
+    return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)
 
 
 def write_attributes(
     collection: Collection, source: int, data: Sequence[MeshData], directory: Path, suffix: str
-) -> None:
+) -> list[Path]:
     """Write each mesh with the attributes of one mesh; see `jaxsmw.transfer.transfer_attributes`.
 
     **Arguments:**
@@ -66,19 +92,24 @@ def write_attributes(
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files.
 
+    **Returns:** The written files.
+
     **Raises:** `InputError` if a file cannot be written.
     """
     folder = make_directory(directory / "attributes")
+    written = []
     for target, name in enumerate(collection.names):
         if target != source:
             registered = collection.registered_mesh(source, target)
             carried = transfer_attributes(data[source], registered, data[target])
-            write_mesh_data(folder / f"{name}{suffix}", carried)
+            written.append(folder / f"{name}{suffix}")
+            write_mesh_data(written[-1], carried)
+    return written
 
 
 def write_landmarks(
     collection: Collection, source: int, landmarks: Landmarks, directory: Path, suffix: str
-) -> None:
+) -> tuple[list[Path], tuple[str, ...]]:
     """Write the landmarks of one shape on all other shapes.
 
     **Arguments:**
@@ -89,20 +120,29 @@ def write_landmarks(
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files, such as `.mrk.json`.
 
+    **Returns:** The written files, and sentences about landmarks that are far from the surface.
+
     **Raises:** `InputError` if a landmark is not on the shape, or a file cannot be written.
     """
     folder = make_directory(directory / "landmarks")
+    written: list[Path] = []
+    notes: tuple[str, ...] = ()
     for target, name in enumerate(collection.names):
         if target != source:
             found = transfer_landmarks(landmarks, collection.registered_mesh(source, target))
-            write_landmark_file(folder / f"{name}{suffix}", found.landmarks)
+            notes = found.notes  # about the landmarks on the source, so equal for all targets
+            written.append(folder / f"{name}{suffix}")
+            write_landmark_file(written[-1], found.landmarks)
+    return written, notes
 
 
-def write_model(collection: Collection, model: ShapeModel, directory: Path, suffix: str) -> None:
+def write_model(collection: Collection, model: ShapeModel, directory: Path, suffix: str) -> list[Path]:
     """Write the mean shape, the modes (`modes.npz`) and the scores (`scores.csv`).
 
     The file `modes.npz` contains `mean` (n, 3), `modes` (k, n, 3), `variances` (k,), `faces` (f, 3) and
     `weights` (n,). The file `scores.csv` has one row per mesh and one column per mode.
+
+    **Returns:** The written files.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -123,6 +163,7 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
         writer.writerow(["mesh", *(f"mode_{number + 1}" for number in range(len(model.modes)))])
         for name, scores in zip(collection.names, model.scores, strict=True):
             writer.writerow([name, *map(repr, scores.tolist())])
+    return [directory / f"mean{suffix}", directory / "modes.npz", directory / "scores.csv"]
 
 
 def write_summary(
@@ -130,8 +171,12 @@ def write_summary(
     measures: Mapping[str, Any],
     directory: Path,
     provenance: Mapping[str, Any],
+    files: Sequence[Path] = (),
 ) -> None:
     """Write `collection.json`: the graph, the decisions, the errors, the times and the provenance.
+
+    Files that an earlier `collection.json` lists, but `files` does not contain, are removed. They belong to
+    meshes or options of an earlier run.
 
     **Arguments:**
 
@@ -139,15 +184,25 @@ def write_summary(
     - `measures`: the figures of merit of the shape model.
     - `directory`: the directory of the results.
     - `provenance`: versions, settings and the machine.
+    - `files`: the files in `directory` that were written.
 
     **Raises:** `InputError` if the file cannot be written.
     """
     names = collection.names
+    listed = sorted(file.relative_to(directory).as_posix() for file in files)
+    outdated = set(_listed_files(directory / "collection.json")) - set(listed)
     contents = {
         "template": names[collection.template],
         "shapes": [
-            {"name": name, "vertices": len(mesh.vertices), "mirrored": bool(mirrored)}
-            for name, mesh, mirrored in zip(names, collection.meshes, collection.mirrored, strict=True)
+            {
+                "name": name,
+                "vertices": len(registered.mesh_y.vertices),
+                "mirrored": bool(mirrored),
+                "distance_of_registered_mesh": float(registered.distances.mean()),
+            }
+            for name, registered, mirrored in zip(
+                names, collection.registered, collection.mirrored, strict=True
+            )
         ],
         "outliers": [names[shape] for shape in collection.outliers],
         "left_out": collection.left_out,
@@ -158,7 +213,7 @@ def write_summary(
                 "decision": edge.decision,
                 "expected_error": _finite(edge.expected_error),
                 "distortion": _finite(edge.distortion),
-                "cycle_error": _finite(edge.cycle_error),
+                "estimated_error": _finite(edge.estimated_error),
                 "distance_from_consistent_map": _finite(edge.residual),
             }
             for edge in collection.edges
@@ -170,9 +225,25 @@ def write_summary(
         "shape_model": measures,
         "seconds": collection.seconds,
         "provenance": provenance,
+        "files": listed,
     }
     with atomic_write(directory / "collection.json") as temporary:
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", "utf-8")
+    for file in outdated:
+        (directory / file).unlink(missing_ok=True)
+
+
+def _listed_files(summary: Path) -> list[str]:
+    """Return the files that an earlier summary lists, as far as they lie within its directory."""
+    with suppress(OSError, ValueError):
+        found = json.loads(summary.read_text("utf-8"))
+        listed = found.get("files", []) if isinstance(found, dict) else []
+        return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]
+    return []
+
+
+# Only results are removed, and nothing outside the directory of the results.
+_LISTED = re.compile(r"(?:(?:maps|registered|landmarks|attributes)/[^/\0]+|mean\.\w+)")
 
 
 def _finite(value: float) -> float | None:

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.shapes import PreparedShape
+from jaxsmw.errors import InputError
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
 _COMPARED_EIGENVALUES = 50
@@ -77,8 +78,23 @@ def choose_edges(
     - `seed`: the seed of the random edges.
 
     **Returns:** The edges (i, j) with i < j, in ascending order.
+
+    **Raises:** `InputError` if the distances are not a square matrix of finite numbers, the number of edges
+    is not positive, the share is not from 0 to 1, or a given edge names no shape.
     """
+    distances = np.asarray(distances, np.float64)
     number = len(distances)
+    if distances.shape != (number, number) or not np.isfinite(distances).all():
+        raise InputError(
+            f"the distances have shape {distances.shape}: give a square matrix of finite numbers."
+        )
+    if not (edges_per_shape > 0 and 0 <= random_share <= 1):
+        raise InputError(
+            f"edges_per_shape is {edges_per_shape} and random_share is {random_share}: give a positive "
+            "number, and a share from 0 to 1."
+        )
+    if any(not 0 <= shape < number for edge in given for shape in edge):
+        raise InputError(f"a given edge names a shape that does not exist: there are {number} shapes.")
     chosen = {(min(edge), max(edge)) for edge in given}
     known = {shape for edge in chosen for shape in edge}
     wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]

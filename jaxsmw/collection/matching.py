@@ -35,7 +35,7 @@ from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components, count_of
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
@@ -61,7 +61,9 @@ class MatchedEdge:
     - `source`, `target`: the numbers of the two shapes.
     - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
     - `distortion`: the distortion of the map; infinite if the match failed.
-    - `cycle_error`: the error of the map that the cycles of the graph show; see `edge_errors`.
+    - `estimated_error`: an estimate of the error of the map, from which its weight comes: the error that the
+      cycles of the graph show (`edge_errors`), or at least half of the expected error, plus a term that grows
+      with the distortion (`CollectionSettings.distortion_weight`).
     - `residual`: the mean distance between the map and the map through the template.
     - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
       contradicted the other maps), or `"contradicted"` (still contradicts the other maps, and hardly counts).
@@ -71,14 +73,20 @@ class MatchedEdge:
     target: int
     expected_error: float
     distortion: float
-    cycle_error: float
+    estimated_error: float
     residual: float
     decision: str
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the map contradicts the other maps or has a large estimated error."""
+        return self.decision == "contradicted" or self.estimated_error >= _DOUBTFUL_FROM
 
     def sentence(self, names: Sequence[str]) -> str:
         """Return a sentence about the edge, given the names of all shapes."""
         errors = (
-            f"expected error {1e3 * self.expected_error:.0f}, cycle error {1e3 * self.cycle_error:.0f}, "
+            f"expected error {1e3 * self.expected_error:.0f}, estimated error "
+            f"{1e3 * self.estimated_error:.0f}, "
             f"distance from the consistent map {1e3 * self.residual:.0f} thousandths"
         )
         return f"{names[self.source]} to {names[self.target]}: {self.decision} ({errors})"
@@ -136,29 +144,54 @@ class Collection:
         """Return sentences about the template, the decisions, the hands, the outliers and missing meshes."""
         decisions = Counter(edge.decision for edge in self.edges)
         found = [
-            f"{len(self.meshes)} shapes, {len(self.edges)} matched pairs; the template is "
-            f"{self.names[self.template]}.",
-            f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
-            f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
-            f"{decisions['contradicted']}.",
+            f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
+            f"template is {self.names[self.template]}."
         ]
+        if self.cycle_errors is None or len(self.cycle_errors[0]):
+            found.append(
+                f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
+                f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
+                f"{decisions['contradicted']}."
+            )
+        else:
+            found.append("The graph has no cycles, so no map could be compared with other maps.")
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
             found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
-        found += [
-            f"{self.names[shape]} differs much from all other shapes, so its maps are uncertain. Look at its "
-            "colours, and leave it out if it is another kind of body."
-            for shape in self.outliers
-        ]
+        if self.outliers:
+            found.append(self._warning())
         found += [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return tuple(found)
 
+    def _warning(self) -> str:
+        names = ", ".join(self.names[shape] for shape in self.outliers)
+        if len(self.outliers) > _MANY_OUTLIERS * len(self.meshes):
+            return (
+                f"No good map was found for {len(self.outliers)} of {len(self.meshes)} shapes: {names}. Look "
+                "at their colours. The preset accurate matches different bodies best, and all meshes must be "
+                "of one kind of body."
+            )
+        return (
+            f"These shapes differ much from all others, so their maps are uncertain: {names}. Look at their "
+            "colours, and leave out other kinds of bodies."
+        )
+
+    def _check_number(self, *shapes: int) -> None:
+        for shape in shapes:
+            if not 0 <= shape < len(self.meshes):
+                raise InputError(
+                    f"there is no shape {shape}: give a number from 0 to {len(self.meshes) - 1}, in the "
+                    "order of `Collection.names`."
+                )
+
     def from_template(self, shape: int) -> Int64[np.ndarray, " n"]:
         """Return the map from the template (n,) to a shape, as 0-based vertices of the shape."""
+        self._check_number(shape)
         return self.registered[shape].surface_points.nearest_corners(self.meshes[shape])
 
     def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
         """Return the map from a shape (m,) to the template, as 0-based vertices of the template."""
+        self._check_number(shape)
         return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
 
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
@@ -166,7 +199,10 @@ class Collection:
 
         The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
         the rounding to vertices.
+
+        **Raises:** `InputError` if there is no shape with a number.
         """
+        self._check_number(source, target)
         images = self.registered[target].carry(self.registered[source].points_of_target)
         mesh = self.meshes[target]
         return nearest_surface_points(images, mesh)[0].nearest_corners(mesh)
@@ -184,9 +220,18 @@ class Collection:
         return register_mesh(self.meshes[source], self.meshes[target], points)
 
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
-        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_models`.
+        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
-        If a shape is of the other hand than the template, its mirror image enters the model.
+        Lengths are in the unit of the meshes, or without unit if `scale` is True. Each vertex has the area
+        around it on the template as its weight. If a shape is of the other hand than the template, its mirror
+        image enters the model.
+
+        **Arguments:**
+
+        - `scale`: whether to remove differences in size. If the meshes have different units, use True.
+        - `number_of_modes`: the largest number of modes; None for all modes.
+
+        **Returns:** A `ShapeModel` with n vertices.
         """
         other_hand = self.mirrored != self.mirrored[self.template]
         signs = np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
@@ -209,7 +254,7 @@ def match_collection(
     stiffness: float = DEFAULT_STIFFNESS,
     settings: CollectionSettings = CollectionSettings(),  # noqa: B008 (immutable)
     seed: int = 0,
-    directory: Path | None = None,
+    directory: Path | str | None = None,
     executor: Executor | None = None,
     devices: Sequence[jax.Device] | None = None,
     progress: Progress | None = None,
@@ -228,8 +273,8 @@ def match_collection(
     - `preset`: see `match`.
     - `template`: the number of the template. The default is the shape with the smallest sum of errors along
       the best paths to all other shapes (the medoid).
-    - `mirror`: whether shapes of opposite hands, such as left and right teeth, are recognised and matched by
-      their mirror images; see `match`.
+    - `mirror`: True to recognise shapes of opposite hands, such as left and right teeth, and to match their
+      mirror images. False to match all meshes as they are.
     - `stiffness`: see `register_mesh`.
     - `settings`: the `CollectionSettings`.
     - `seed`: the seed of the random edges of the graph.
@@ -243,9 +288,23 @@ def match_collection(
 
     **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`.
 
-    **Raises:** `InputError` if fewer than two meshes can be matched, or if the template is left out.
+    **Raises:** `InputError` if an argument is not valid, if fewer than two meshes can be matched, or if the
+    template is left out.
     `ArithmeticError` if all matches of a mesh fail numerically.
     """
+    if names is not None and (len(names) != len(meshes) or len(set(names)) != len(names)):
+        raise InputError(
+            f"there are {len(set(names))} different names for {len(meshes)} meshes: give each mesh a name of "
+            "its own."
+        )
+    if not isinstance(mirror, bool | np.bool):
+        raise InputError(f"mirror is {mirror!r}: give True or False.")
+    if template is not None and not (isinstance(template, int | np.integer) and 0 <= template < len(meshes)):
+        raise InputError(
+            f"the template is {template!r}: give the number of a mesh, from 0 to {len(meshes) - 1}."
+        )
+    if directory is not None and not Path(directory).is_dir():
+        raise InputError(f"{directory}: is not a directory: create it first.")
     given = [_named_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
     return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, devices, progress).run(
         template, mirror, stiffness
@@ -294,13 +353,13 @@ class _Matcher:
         preset: Preset,
         settings: CollectionSettings,
         seed: int,
-        directory: Path | None,
+        directory: Path | str | None,
         executor: Executor | None,
         devices: Sequence[jax.Device] | None,
         progress: Progress | None,
     ):
         self.given, self.preset, self.settings, self.seed = list(meshes), preset, settings, seed
-        self.store = None if directory is None else Store(directory)
+        self.store = None if directory is None else Store(Path(directory))
         self.executor, self.devices = executor, devices
         self.progress = progress or (lambda *_: None)
         self.left_out: dict[str, str] = {}
@@ -311,8 +370,8 @@ class _Matcher:
             kept = self._prepare()
         if len(kept) < 2:
             raise InputError(
-                f"a collection needs at least two meshes, but {len(kept)} can be matched: "
-                + "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
+                f"a collection needs at least two meshes, but only {len(kept)} of {len(self.given)} can be "
+                "matched. " + " ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
             )
         if template is not None:
             if template not in kept:
@@ -374,7 +433,7 @@ class _Matcher:
             axes=self.axes,
             cycle_errors=(first_cycles, self.cycles),
             outliers=find_outliers(
-                {(edge.source, edge.target): edge.cycle_error for edge in described},
+                {(edge.source, edge.target): edge.estimated_error for edge in described},
                 self.settings.outlier_from,
             ),
             left_out=self.left_out,
@@ -679,6 +738,10 @@ def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], Surf
     return forward | {(j, i): found.backward for (i, j), found in maps.items()}
 
 
+# A map with at least this estimated error is doubtful, and a shape whose maps are all doubtful is an outlier.
+_DOUBTFUL_FROM = CollectionSettings().outlier_from
+# With a larger share of outliers, the maps are at fault, and not the shapes.
+_MANY_OUTLIERS = 1 / 3
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _HANDS_PER_SHAPE = 1.5
 # The number of pairs whose hands are compared first. If none of them is asymmetric, as bodies are not, hands

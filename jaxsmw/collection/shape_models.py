@@ -181,10 +181,14 @@ class ShapeModel:
 
         - `scores`: scores of the first j modes (j,), at most k. The scores of further modes are 0.
 
-        **Raises:** `InputError` if there are more scores than modes.
+        **Raises:** `InputError` if there are more scores than modes, or a score is not finite.
         """
-        if len(scores) > len(self.modes):
-            raise InputError(f"there are {len(scores)} scores, but the model has {len(self.modes)} modes.")
+        scores = np.asarray(scores, np.float64)
+        if scores.ndim != 1 or len(scores) > len(self.modes) or not np.isfinite(scores).all():
+            raise InputError(
+                f"the scores have shape {scores.shape}: give at most {len(self.modes)} finite numbers, one "
+                "for each mode."
+            )
         return self.mean + np.tensordot(scores, self.modes[: len(scores)], axes=1)
 
     def project(self, shape: Real[np.ndarray, "_ 3"]) -> Float64[np.ndarray, " k"]:

@@ -122,7 +122,7 @@ def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "
         f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh, or "
-        "avoid SHOT (init='wks' and preset='paper', on the command line --init wks --preset paper)."
+        "avoid SHOT (init='wks' and preset='paper'; for jaxsmw match --init wks --preset paper)."
     )
 
 

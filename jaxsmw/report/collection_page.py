@@ -327,7 +327,7 @@ def _notes(notes: Sequence[str], left_out: Mapping[str, str]) -> str:
     parts = []
     if notes:
         items = "".join(f"<li>{html.escape(_plain(note))}</li>" for note in notes)
-        parts.append(f'<section><h2>Decisions</h2><ul class="notes">{items}</ul></section>')
+        parts.append(f'<section><h2>Result</h2><ul class="notes">{items}</ul></section>')
     if left_out:
         items = "".join(
             f"<li><b>{html.escape(_plain(name))}</b> {html.escape(_plain(reason))}</li>"
