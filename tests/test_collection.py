@@ -294,7 +294,8 @@ def test_shapes_of_the_other_hand_are_recognised(tmp_path):
         offsets = lumps[j].vertices[result.pointwise_map(i, j)] - lumps[j].vertices
         assert np.linalg.norm(offsets, axis=1).mean() < 0.02 * np.sqrt(lumps[j].area)
     # Faces of mirror images are written such that their normals point to the same side as on the meshes.
-    files = write_registered(result, MeshData(lumps[result.template], lump.faces), tmp_path, ".ply")
+    template = lumps[result.template]
+    files = write_registered(result, MeshData(template, template.faces), tmp_path, ".ply")
     for file, mesh in zip(files, lumps, strict=True):
         assert 0.9 < signed_volume(read_mesh(file)) / signed_volume(mesh) < 1.1
     # In the shape model, all lumps are of the template's hand, so they differ only by noise.
