@@ -29,7 +29,6 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
-from jaxsmw.collection import Collection, CollectionSettings
 from jaxsmw.geometry.creature import creature
 from jaxsmw.report.colors import position_colors
 from jaxsmw.report.figures import draw_correspondence, draw_mesh
@@ -252,30 +251,24 @@ def draw_another_kind() -> None:
     draw_side_by_side("failure_another_kind", panels)
 
 
-def draw_few_edges(data: Path) -> None:
-    """Draw three animals of SMAL, matched as a collection with two and with four edges per shape.
-
-    One animal is the template, and the two others have the largest errors with two edges per shape.
-    """
-    files = sorted((data / "smal_r" / "off").glob("*.off"))
-    meshes = [jaxsmw.read_mesh(file) for file in files]
-    truth = [np.loadtxt(data / "smal_r" / "corres" / f"{file.stem}.vts", int) - 1 for file in files]
-    four, two = (
-        jaxsmw.match_collection(meshes, template=0, settings=CollectionSettings(edges_per_shape=edges))
-        for edges in (4, 2)
-    )
-
-    def error(collection: Collection, shape: int) -> float:
-        images = collection.registered[shape].vertices[truth[0]] - meshes[shape].vertices[truth[shape]]
-        return float(np.linalg.norm(images, axis=1).mean() / meshes[shape].area ** 0.5)
-
+def draw_without_repair() -> None:
+    """Draw two different quadrupeds of a collection that was matched by `paper`, and by `accurate`."""
+    meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
+    found = {
+        preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror=False)
+        for preset in ("paper", "accurate")
+    }
+    errors = np.zeros(len(meshes))
+    for edge in found["paper"].edges:
+        if edge.source == 0:
+            errors[edge.target] = edge.estimated_error
+    shape = int(errors.argmax())
     colors = position_colors(meshes[0])
     panels = {"template": (meshes[0], colors)}
-    for shape in sorted(range(len(meshes)), key=lambda shape: -error(two, shape))[:2]:
-        print(f"{files[shape].stem}: {error(two, shape):.3f}, with four edges {error(four, shape):.3f}")
-        for name, collection in (("two", two), ("four", four)):
-            panels[f"{shape} {name}"] = meshes[shape], colors[collection.to_template(shape)]
-    draw_side_by_side("failure_few_edges", panels)
+    for preset, collection in found.items():
+        print(preset, *collection.sentences(), sep="\n")
+        panels[preset] = meshes[shape], colors[collection.to_template(shape)]
+    draw_side_by_side("failure_collection", panels)
 
 
 def spots(
@@ -321,7 +314,7 @@ def main() -> None:
         "--only",
         nargs="+",
         metavar="NAME",
-        help="draw only these: `tutorial`, `transfers`, `another_kind`, `few_edges`, or names of cases",
+        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, or names of cases",
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
@@ -331,8 +324,8 @@ def main() -> None:
         draw_transfers()
     if not options.only or "another_kind" in options.only:
         draw_another_kind()
-    if options.data and (not options.only or "few_edges" in options.only):
-        draw_few_edges(options.data)
+    if not options.only or "collection" in options.only:
+        draw_without_repair()
     cases = [*procedural_cases(), *(real_cases(options.data) if options.data else ())]
     print("| case | error | expected | error, cured | expected, cured |\n| --- | --- | --- | --- | --- |")
     for case in cases:

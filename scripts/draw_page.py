@@ -1,5 +1,6 @@
-"""Opens an interactive page in headless Chromium, and takes a screenshot of the wavelets around one vertex.
+"""Opens an interactive page in headless Chromium, and takes a screenshot.
 
+The picture of a pair shows the wavelets around one vertex. The picture of a collection shows the whole page.
 Run `python scripts/draw_page.py PAGE.html PICTURE.png`. The script needs the extra `test`, Chromium and
 chromedriver.
 """
@@ -18,7 +19,7 @@ WIDTH, HEIGHT = 1280, 850
 
 
 def main() -> None:
-    """Opens the page, chooses a wavelet and a vertex, and writes a screenshot."""
+    """Opens the page, and writes a screenshot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", metavar="PAGE.html", type=Path)
     parser.add_argument("picture", metavar="PICTURE.png", type=Path)
@@ -28,6 +29,7 @@ def main() -> None:
     parser.add_argument(
         "--scale", type=int, default=4, help="scale of the wavelet, 0 for the widest (default: %(default)s)"
     )
+    parser.add_argument("--height", type=int, default=HEIGHT, help="in pixels (default: %(default)s)")
     options = parser.parse_args()
     from PIL import Image
     from selenium import webdriver
@@ -43,11 +45,12 @@ def main() -> None:
             settings.add_argument(argument)
         browser = webdriver.Chrome(options=settings, service=Service(shutil.which("chromedriver")))
         try:
-            size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+            size = {"width": WIDTH, "height": options.height, "deviceScaleFactor": 1, "mobile": False}
             browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
             browser.get(options.page.resolve().as_uri())
             browser.execute_async_script(
                 "const [vertex, scale, done] = arguments, slider = document.querySelector('#filter');"
+                "if (!slider) return setTimeout(done, 5000);"  # a collection, whose small pictures take time
                 "document.querySelector('input[value=wavelets]').click();"
                 "slider.value = scale; slider.dispatchEvent(new Event('input')); jaxsmw.pick(vertex);"
                 "requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 100)))",
