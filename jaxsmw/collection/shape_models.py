@@ -24,7 +24,7 @@ _TOLERANCE = 1e-10
 _MOST_ROUNDS = 1000
 # Modes are left out if their standard deviation is below this multiple of the size of the mean. Mesh files in
 # single precision have larger rounding errors.
-_SMALLEST_DEVIATION = 1e-8
+_SMALLEST_DEVIATION = 1e-6
 # Scores count as equal if they differ by less than this share, so that rounding does not choose the signs
 # of modes.
 _EQUAL_SCORES = 1e-6
@@ -337,7 +337,7 @@ def shape_model(
     - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
     - `scale`, `weights`, `reference`: see `align`.
     - `number_of_modes`: the largest number of modes; None (the default) for all modes. A model of N shapes
-      has at most N - 1 modes. Modes whose standard deviation is below 1e-8 of the size of the mean are
+      has at most N - 1 modes. Modes whose standard deviation is below 1e-6 of the size of the mean are
       left out as rounding errors. One shape and identical shapes therefore have no modes.
 
     **Returns:** A `ShapeModel`.
