@@ -110,7 +110,9 @@ class Hands:
 
     def _asymmetry(self, shape: _Shape) -> float:
         shot = self._shot(shape, self.settings.asymmetry_radii)
-        found = _nearest(np.hstack(shot), np.hstack([mirrored_descriptors(one) for one in shot]))
+        # All descriptors have the same length, so the nearest descriptor has the largest inner product.
+        mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
+        found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
         random = np.random.default_rng(0).permutation(len(found))
         return _distance_error(shape, shape, found) / _distance_error(shape, shape, random)
 
@@ -233,8 +235,8 @@ class _Hand(NamedTuple):
 
 def _nearest(x: Float[np.ndarray, "s r"], y: Float[np.ndarray, "t r"]) -> Int64[np.ndarray, " s"]:
     """Return the nearest SHOT descriptor of Y for each SHOT descriptor of X."""
-    # All descriptors have the same length, so the nearest descriptor has the largest inner product.
-    return np.argmax(x @ y.T, axis=1)
+    # A matrix product takes a fraction of the time of `cdist`.
+    return np.argmax(x @ y.T - 0.5 * (y**2).sum(axis=1), axis=1)
 
 
 def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> float:
