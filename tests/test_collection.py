@@ -438,6 +438,10 @@ def test_files_of_earlier_meshes_and_options_are_removed(result_directory, direc
     output = tmp_path / "result"
     shutil.copytree(result_directory, output)
     (output / "registered" / "mine.txt").write_text("not a result")
+    (tmp_path / "kept").write_text("outside of the results")
+    summary = json.loads((output / "collection.json").read_text("utf-8"))
+    summary["files"] += ["../kept", "registered/..", "maps/../../kept", 3]
+    (output / "collection.json").write_text(json.dumps(summary), "utf-8")
     far = tmp_path / "far.csv"
     write_landmark_file(far, Landmarks(("a",), 10 * meshes[1].vertices[:1]))
     outcome = run(
@@ -445,6 +449,7 @@ def test_files_of_earlier_meshes_and_options_are_removed(result_directory, direc
         "--landmarks", far, "--landmarks-of", "shape1.off",
     )  # fmt: skip
     assert outcome.code == 0, outcome.errors
+    assert (tmp_path / "kept").exists()
     assert "3 shapes" in outcome.output and "from the surface" in outcome.errors
     names = ["shape0", "shape1", "shape2"]
     assert sorted(os.listdir(output / "registered")) == ["mine.txt", *(f"{name}.obj" for name in names)]

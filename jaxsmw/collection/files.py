@@ -230,7 +230,8 @@ def write_summary(
     with atomic_write(directory / "collection.json") as temporary:
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", "utf-8")
     for file in outdated:
-        (directory / file).unlink(missing_ok=True)
+        with suppress(OSError):  # the list may be damaged
+            (directory / file).unlink()
 
 
 def _listed_files(summary: Path) -> list[str]:
@@ -243,7 +244,7 @@ def _listed_files(summary: Path) -> list[str]:
 
 
 # Only results are removed, and nothing outside the directory of the results.
-_LISTED = re.compile(r"(?:(?:maps|registered|landmarks|attributes)/[^/\0]+|mean\.\w+)")
+_LISTED = re.compile(r"(?:(?:maps|registered|landmarks|attributes)/(?!\.\.)[^/\0]+|mean\.\w+)")
 
 
 def _finite(value: float) -> float | None:

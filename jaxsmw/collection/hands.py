@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool
@@ -45,14 +45,3 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
         if 2 * mirrored.sum() > number or (2 * mirrored.sum() == number and mirrored[0])
         else mirrored
     )
-
-
-def contradicted(mirrored: Bool[np.ndarray, " N"], decisions: Mapping[Edge, Decision]) -> Sequence[Edge]:
-    """Return the edges whose evidence contradicts the chosen hands."""
-    return [
-        (i, j)
-        for (i, j), decision in decisions.items()
-        if decision.evidence is not None
-        and decision.asymmetric
-        and (decision.evidence > 0) != (mirrored[i] != mirrored[j])
-    ]
