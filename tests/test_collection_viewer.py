@@ -78,7 +78,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def page(browser: Any, page_file: Path) -> Iterator[CollectionPage]:
     browser.get_log("browser")
-    yield CollectionPage(browser, page_file, width=1300, height=900)
+    yield CollectionPage(browser, page_file, width=1000, height=800)
     assert browser.get_log("browser") == []
 
 
@@ -366,7 +366,7 @@ def test_page_is_useful_without_webgl(browser: Any, page_file: Path) -> None:
     """
     added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
     try:
-        page = CollectionPage(browser, page_file, width=1300, height=900)
+        page = CollectionPage(browser, page_file, width=1000, height=800)
     finally:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
     assert "does not support WebGL" in page.find("#no-webgl").text
@@ -385,7 +385,7 @@ def test_hostile_texts_are_shown_as_plain_text(browser: Any, tmp_path: Path) -> 
     arguments = collection()
     arguments["names"] = [HOSTILE, *NAMES[1:]]
     arguments["edges"] = [PageEdge(0, 1, 1.0, True, HOSTILE)]
-    arguments |= {"title": HOSTILE, "notes": [HOSTILE], "left_out": {HOSTILE: HOSTILE}}
+    arguments |= {"title": HOSTILE, "notes": [HOSTILE], "warning": HOSTILE, "left_out": {HOSTILE: HOSTILE}}
     write_collection_page(tmp_path / "page.html", **arguments)
     browser.get_log("browser")
     page = CollectionPage(browser, tmp_path / "page.html", width=1300, height=900)

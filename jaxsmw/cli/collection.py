@@ -428,7 +428,8 @@ def _write(
         source = _number(collection, options.attributes_of, "the mesh with the attributes")
         files += write_attributes(collection, source, kept, directory, options.suffix)
     shared = _provenance(options)
-    settings = shared["settings"] | {"edges": options.edges, "scale": options.scale}
+    changeable = ("edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of")
+    settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
     provenance = {**shared, "settings": settings, "machine": machine()}
     write_summary(collection, measures, directory, provenance, files)
     template = collection.meshes[collection.template]
@@ -452,6 +453,7 @@ def _write(
         title=f"Collection {Path(options.directory).resolve().name}",
         notes=collection.sentences(),
         left_out=collection.left_out,
+        warning=collection.warning,
     )
 
 

@@ -158,12 +158,16 @@ class Collection:
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
             found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
-        if self.outliers:
-            found.append(self._warning())
+        if self.warning:
+            found.append(self.warning)
         found += [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return tuple(found)
 
-    def _warning(self) -> str:
+    @property
+    def warning(self) -> str:
+        """A sentence about the outliers; an empty text if there are none."""
+        if not self.outliers:
+            return ""
         names = ", ".join(self.names[shape] for shape in self.outliers)
         if len(self.outliers) > _MANY_OUTLIERS * len(self.meshes):
             return (

@@ -68,6 +68,7 @@ def write_collection_page(
     title: str,
     notes: Sequence[str] = (),
     left_out: Mapping[str, str] = MappingProxyType({}),
+    warning: str = "",
     up: Axis | None = None,
 ) -> None:
     """Writes a web page that shows all shapes of a collection, their matches and their shape model.
@@ -89,6 +90,7 @@ def write_collection_page(
     - `title`: the heading of the page.
     - `notes`: sentences about decisions, such as the choice of the template.
     - `left_out`: a dictionary from names of shapes that are not on the page to reasons.
+    - `warning`: a sentence below the heading, or an empty text.
     - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis from several shapes.
 
@@ -144,6 +146,7 @@ def write_collection_page(
     fragments = {
         "title": html.escape(title),
         "lead": html.escape(_lead(names, template, len(first.vertices), len(chosen))),
+        "warning": f'<p class="fault">{html.escape(_plain(warning))}</p>' if warning else "",
         "statistics": _statistics(names, edges, left_out, model),
         "notes": _notes(notes, left_out),
         "edges": _edge_table(names, edges),
@@ -327,7 +330,7 @@ def _notes(notes: Sequence[str], left_out: Mapping[str, str]) -> str:
     parts = []
     if notes:
         items = "".join(f"<li>{html.escape(_plain(note))}</li>" for note in notes)
-        parts.append(f'<section><h2>Result</h2><ul class="notes">{items}</ul></section>')
+        parts.append(f'<section><h2>Decisions</h2><ul class="notes">{items}</ul></section>')
     if left_out:
         items = "".join(
             f"<li><b>{html.escape(_plain(name))}</b> {html.escape(_plain(reason))}</li>"
