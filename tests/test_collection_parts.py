@@ -23,6 +23,7 @@ from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, fin
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.repair.chirality import Decision
 from jaxsmw.stage import Stage
 
@@ -303,12 +304,12 @@ def test_pairs_are_matched_as_by_match(three, one_by_one):
 
 
 @pytest.mark.parametrize(
-    ("preset", "batch_size"), [("paper", 3), pytest.param("accurate", 3, marks=pytest.mark.slow)]
+    "preset", ["paper", pytest.param(Preset(PRESETS["accurate"].stages[1:2]), marks=pytest.mark.slow)]
 )
-def test_batches_give_the_same_maps(three, one_by_one, preset, batch_size):
+def test_batches_give_the_same_maps(three, one_by_one, preset):
     if preset != "paper":
         one_by_one = dict(match_pairs(three, PAIRS, preset=preset))
-    for number, found in match_pairs(three, PAIRS, preset=preset, batch_size=batch_size):
+    for number, found in match_pairs(three, PAIRS, preset=preset, batch_size=3):
         expected = one_by_one[number]
         assert (found.pointwise_map == expected.pointwise_map).mean() > 0.999
         assert found.distortion == pytest.approx(expected.distortion, rel=1e-3)
