@@ -223,6 +223,7 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Check the options and the output directory before the long computation."""
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.mesh_data import check_mesh_suffix
+    from jaxsmw.runtime.files import size_of_file
 
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
     if not options.suffix.startswith("."):
@@ -234,8 +235,7 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
         if file := getattr(options, option):
             setattr(options, option, _inside(options, option, file, files))
     if options.landmarks:
-        if not os.path.exists(options.landmarks):
-            raise InputError(f"{options.landmarks}: does not exist: check the path.")
+        size_of_file(options.landmarks)
         check_readable_suffix(options.landmarks)
         check_landmark_suffix(f"landmarks{_landmark_suffix(options.landmarks)}")
         options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, files)

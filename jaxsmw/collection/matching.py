@@ -67,6 +67,8 @@ class MatchedEdge:
     - `residual`: the mean distance between the map and the map through the template.
     - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
       contradicted the other maps), or `"contradicted"` (still contradicts the other maps, and hardly counts).
+    - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
+      `CollectionSettings.outlier_from`.
     """
 
     source: int
@@ -76,11 +78,7 @@ class MatchedEdge:
     estimated_error: float
     residual: float
     decision: str
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the map contradicts the other maps or has a large estimated error."""
-        return self.decision == "contradicted" or self.estimated_error >= _DOUBTFUL_FROM
+    doubtful: bool
 
     def sentence(self, names: Sequence[str]) -> str:
         """Return a sentence about the edge, given the names of all shapes."""
@@ -727,13 +725,13 @@ class _Matcher:
         self, edge: Edge, network: Network, points: Sequence[SurfacePoints], replaced: set[Edge]
     ) -> MatchedEdge:
         if edge not in self.maps:
-            return MatchedEdge(*edge, np.inf, np.inf, np.inf, np.inf, "contradicted")
+            return MatchedEdge(*edge, np.inf, np.inf, np.inf, np.inf, "contradicted", True)
         found, residual = self.maps[edge], self._residual(network, points, *edge)
         wrong = residual >= self.settings.contradicted_from
         decision = "contradicted" if wrong else "replaced" if edge in replaced else "kept"
-        return MatchedEdge(
-            *edge, found.expected_error, found.distortion, network.error(*edge), residual, decision
-        )
+        error = network.error(*edge)
+        doubtful = wrong or error >= self.settings.outlier_from
+        return MatchedEdge(*edge, found.expected_error, found.distortion, error, residual, decision, doubtful)
 
 
 def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], SurfacePoints]:
@@ -742,8 +740,6 @@ def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], Surf
     return forward | {(j, i): found.backward for (i, j), found in maps.items()}
 
 
-# A map with at least this estimated error is doubtful, and a shape whose maps are all doubtful is an outlier.
-_DOUBTFUL_FROM = CollectionSettings().outlier_from
 # With a larger share of outliers, the maps are at fault, and not the shapes.
 _MANY_OUTLIERS = 1 / 3
 # The number of pairs whose hands are compared, divided by the number of shapes.

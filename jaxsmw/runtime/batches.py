@@ -101,9 +101,10 @@ def refine_pairs(
       True, both shapes must have the same unit of length.
     - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
     - `history`: whether to record a `History` of each pair.
-    - `batch_size`: the number of pairs that each device refines at the same time. The default on CPUs is 1,
-      because larger batches save no time there and need more memory. The default on other devices is as many
-      pairs as fit into `memory`, up to 64.
+    - `batch_size`: the number of pairs that each device receives at the same time. Accelerators refine these
+      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1,
+      because larger batches save no time there. The default on other devices is as many pairs as fit into
+      `memory`, up to 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
