@@ -3,32 +3,47 @@ import pytest
 from synthetic import body_with_arms, sphere_mesh
 
 from jaxsmw import creature_pair
+from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.repair.extremities import extremities, plausible_pairings
+from jaxsmw.repair.proxies import Proxy
+
+
+def reduced(mesh):
+    samples = farthest_point_samples(mesh, min(1000, len(mesh.vertices)))
+    return Proxy(mesh, compute_spectrum(mesh, 4), SurfaceSamples.along_surface(mesh, samples), mesh.area**0.5)
+
+
+def ends_of(mesh):
+    """The extremities of a mesh, and their vertices."""
+    proxy = reduced(mesh)
+    found = extremities(proxy)
+    return found, proxy.samples.vertices[found.samples]
 
 
 @pytest.fixture(scope="module")
 def creature():
     """Two poses of a body, and the extremities of both."""
     pair = creature_pair(vertices=2000)
-    return pair, extremities(pair.source), extremities(pair.target)
+    return pair, ends_of(pair.source), ends_of(pair.target)
 
 
 def test_the_tips_of_arms_are_extremities():
     mesh = body_with_arms()
-    found = extremities(mesh)
-    tips = mesh.vertices[found.vertices[:2], 0]
+    _, vertices = ends_of(mesh)
+    tips = mesh.vertices[vertices[:2], 0]
     assert sorted(np.sign(tips)) == [-1, 1] and np.abs(tips).min() > 0.9 * np.abs(mesh.vertices[:, 0]).max()
 
 
 @pytest.mark.slow
 def test_distances_run_along_the_surface(creature):
-    """Distances along edges are slightly too long. The unit of distances is the mean of `remoteness`."""
-    pair, ends, _ = creature
-    assert 3 <= len(ends.vertices) <= 6
-    exact = geodesic_distances(pair.source, ends.vertices)[:, ends.vertices]
-    between = ~np.eye(len(ends.vertices), dtype=bool)
+    """Distances between samples are slightly too long. The unit of distances is the mean of `remoteness`."""
+    pair, (ends, vertices), _ = creature
+    assert 3 <= len(vertices) <= 6
+    exact = geodesic_distances(pair.source, vertices)[:, vertices]
+    between = ~np.eye(len(vertices), dtype=bool)
     ratio = ends.distances[between] / exact[between]
     assert ratio.max() / ratio.min() < 1.1
     assert ends.remoteness.mean() == pytest.approx(1)
@@ -36,9 +51,9 @@ def test_distances_run_along_the_surface(creature):
 
 
 def test_the_true_pairing_is_among_the_most_plausible(creature):
-    pair, x, y = creature
-    points = SurfacePoints(pair.truth.faces[x.vertices], pair.truth.weights[x.vertices])
-    reach = geodesic_distances(pair.target, points)[:, y.vertices]
+    pair, (x, vertices_x), (y, vertices_y) = creature
+    points = SurfacePoints(pair.truth.faces[vertices_x], pair.truth.weights[vertices_x])
+    reach = geodesic_distances(pair.target, points)[:, vertices_y]
     true = np.sort(reach, axis=1)[:, 0] < 0.1 * pair.target.area**0.5
     assert true.sum() >= 3  # vertices that are extremities of both bodies
     best = dict(zip(np.flatnonzero(true), reach.argmin(axis=1)[true], strict=True))
@@ -47,22 +62,22 @@ def test_the_true_pairing_is_among_the_most_plausible(creature):
 
 
 def test_the_unit_and_the_vertex_numbers_have_no_effect(creature):
-    pair, ends, _ = creature
+    pair, (_, vertices), _ = creature
     mesh = pair.source
     order = np.random.default_rng(0).permutation(len(mesh.vertices))
-    other = extremities(make_mesh(50 * mesh.vertices[order] + 3, np.argsort(order)[mesh.faces]))
-    assert len(other.vertices) == len(ends.vertices)
-    apart = geodesic_distances(mesh, ends.vertices)[:, order[other.vertices]] / mesh.area**0.5
+    _, others = ends_of(make_mesh(50 * mesh.vertices[order] + 3, np.argsort(order)[mesh.faces]))
+    assert len(others) == len(vertices)
+    apart = geodesic_distances(mesh, vertices)[:, order[others]] / mesh.area**0.5
     assert apart.min(axis=0).max() < 0.02 and apart.min(axis=1).max() < 0.02
 
 
 def test_pairings_are_one_to_one_and_symmetric_in_both_bodies(creature):
-    _, x, y = creature
+    _, (x, _), (y, _) = creature
     forward, backward = plausible_pairings(x, y, 5), plausible_pairings(y, x, 5)
     assert len(forward) == 5
     for pairing in forward:
-        assert len(set(pairing[:, 0])) == len(set(pairing[:, 1])) == min(len(x.vertices), len(y.vertices))
-        assert (pairing >= 0).all() and (pairing < [len(x.vertices), len(y.vertices)]).all()
+        assert len(set(pairing[:, 0])) == len(set(pairing[:, 1])) == min(len(x.samples), len(y.samples))
+        assert (pairing >= 0).all() and (pairing < [len(x.samples), len(y.samples)]).all()
     for one, other in zip(forward, backward, strict=True):
         assert set(map(tuple, one)) == set(map(tuple, other[:, ::-1]))
 
@@ -73,13 +88,13 @@ def test_every_connected_component_has_extremities():
     apart = make_mesh(
         np.concatenate([mesh.vertices, 0.5 * mesh.vertices + 9]), np.concatenate([mesh.faces, mesh.faces + n])
     )
-    ends = extremities(apart)
-    assert (ends.vertices < n).any() and (ends.vertices >= n).any() and np.isinf(ends.distances).any()
+    ends, vertices = ends_of(apart)
+    assert (vertices < n).any() and (vertices >= n).any() and np.isfinite(ends.distances).all()
     (pairing, *_) = plausible_pairings(ends, ends, 1)
     np.testing.assert_array_equal(pairing[:, 0], pairing[:, 1])
 
 
 def test_a_sphere_has_extremities():
     mesh = make_mesh(*sphere_mesh(1))
-    ends = extremities(mesh)
-    assert 1 <= len(ends.vertices) <= 6 and np.isfinite(ends.remoteness).all()
+    ends, vertices = ends_of(mesh)
+    assert 1 <= len(vertices) <= 6 and np.isfinite(ends.remoteness).all()

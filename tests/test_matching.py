@@ -1,7 +1,6 @@
 import inspect
 import logging
 from dataclasses import replace
-from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -33,9 +32,7 @@ from jaxsmw.initial_maps import initial_map
 from jaxsmw.matching import Correspondence, match
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.presets import choose_preset
-from jaxsmw.repair.alternatives import alternative_initial_maps
 from jaxsmw.repair.rounds import refine_in_stages
-from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime import threads as threads_module
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.stage import Stage
@@ -406,32 +403,6 @@ def test_the_initial_map_by_shot_takes_nearest_neighbours(pair):
     spectra = [compute_spectrum(mesh, 10) for mesh in (mesh_x, mesh_y)]
     distances = cdist(shot_descriptors(mesh_x), shot_descriptors(mesh_y))
     np.testing.assert_array_equal(initial_map(Pair(mesh_x, mesh_y), *spectra), distances.argmin(axis=1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("thinned", [False, True])
-def test_alternative_initial_maps_differ_and_are_better_than_the_usual_one(pair, thinned, monkeypatch):
-    mesh_x, mesh_y, truth = pair
-    spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
-    if thinned:
-        monkeypatch.setattr(descriptors, "_COMPARED", 1200)
-        monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
-    starts = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *spectra))
-    assert len(starts) == 3
-    # For spectra with descriptors, pairings of extremities give further initial maps, on this body only one.
-    described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
-    (by_extremities,) = list(alternative_initial_maps(Pair(mesh_x, mesh_y), *described))[3:]
-    without = RepairSettings(alternatives=())
-    (alone,) = alternative_initial_maps(Pair(mesh_x, mesh_y), *described, without)
-    np.testing.assert_array_equal(alone, by_extremities)
-    assert mean_error(mesh_y, by_extremities, truth) < 0.1
-    usual = initial_map(Pair(mesh_x, mesh_y), *spectra)
-    for start in starts:
-        assert start.dtype == np.int64 and start.shape == truth.shape
-        # A filtered functional map gives a smoother map than nearest neighbours.
-        assert mean_error(mesh_y, start, truth) < 0.75 * mean_error(mesh_y, usual, truth)
-    if thinned:  # on the full mesh, all maps are nearly exact
-        assert all(np.any(a != b) for a, b in combinations(starts, 2))
 
 
 def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):

@@ -93,25 +93,20 @@ def test_an_alternative_initial_map_helps_where_a_single_round_does_not(body, sw
     assert wrong > 0.5 and alone.suspicious and alone.distortion > 1.3
 
 
-def test_a_map_that_looks_right_precedes_a_map_with_a_better_score(body, mirrored, identity, monkeypatch):
+def test_the_map_of_the_best_score_is_chosen(body, mirrored, identity, monkeypatch):
     monkeypatch.setattr(Judge, "score", lambda self, outcome: -outcome.distortion)
-    wrong, found = outcome(body, mirrored, alternatives=[identity])
-    assert wrong < 0.02 and not found.suspicious
+    wrong, found = outcome(body, mirrored, replace(REPAIR, rounds=0), alternatives=[identity])
+    assert wrong > 0.5 and found.suspicious
 
 
-@pytest.mark.slow
-def test_the_map_on_which_three_initial_maps_agree_is_taken_if_none_looks_right(body, mirrored, identity):
-    alternatives = [mirrored, identity, mirrored]
-    wrong, found = outcome(body, mirrored, alternatives=alternatives)
-    # The identity looks right, so the agreement of initial maps is not considered.
+def test_a_large_fault_makes_a_map_suspicious(body, swapped, identity):
+    """Swapped arms are a fault even if distortions of any size are accepted."""
+    lenient = replace(REPAIR, suspicious=100.0, doubtful=100.0)
+    stages = (Stage(FeatureRegression((40,))),)
+    wrong, found = outcome(body, swapped, replace(lenient, suspicious_area=1.0), stages)
+    assert wrong > 0.1 and not found.suspicious
+    wrong, found = outcome(body, swapped, lenient, stages)
     assert wrong < 0.02 and not found.suspicious
-    strict = replace(REPAIR, suspicious=0.5, doubtful=0.5)
-    wrong, found = outcome(body, mirrored, strict, alternatives=alternatives)
-    assert wrong > 0.5 and found.suspicious
-    wrong, found = outcome(body, mirrored, strict, alternatives=alternatives[:2])
-    assert wrong < 0.02 and found.suspicious  # the agreement of two initial maps is not enough
-    wrong, found = outcome(body, mirrored, replace(strict, agreeing=2), alternatives=alternatives[:2])
-    assert wrong > 0.5 and found.suspicious
 
 
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):

@@ -16,6 +16,7 @@ from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.batches import refine_batch
 from jaxsmw.repair.outcome import Outcome
+from jaxsmw.runtime.compilation import release_programs
 
 # The number of pairs per device that are refined before their maps are judged and repaired.
 _PAIRS_PER_DEVICE = 64
@@ -95,12 +96,14 @@ def refined_starts(
     fitted = ((one, fitted_preset(preset, *one[0].pair.meshes)) for one in starts)
     if len(devices) == 1 and devices[0].platform == "cpu" and batch_size is None:
         for one, own in fitted:
+            release_programs()
             yield one, own, []
         return
     # All pairs of a batch run the same stages.
     for own, group in itertools.groupby(fitted, key=lambda pair: pair[1]):
         while waiting := [one for one, _ in itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))]:
             flat = [start for one in waiting for start in one]
+            release_programs()
             described = flat[0].spectrum_x.descriptors is not None
             stages = (own if described else own.without_descriptors()).stages
             outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))

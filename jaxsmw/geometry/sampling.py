@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Int64
+from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
@@ -59,6 +60,24 @@ class SurfaceSamples(NamedTuple):
 
     vertices: Int64[np.ndarray, " s"]
     nearest: Int64[np.ndarray, " n"]
+
+    @classmethod
+    def along_surface(cls, mesh: Mesh, vertices: Int64[np.ndarray, " s"]) -> SurfaceSamples:
+        """Return given samples (s,) of a mesh in ascending order, with the nearest sample along the surface.
+
+        Distances are measured along edges. Limbs that touch each other do not share samples. In a connected
+        component without samples, the nearest sample is the nearest in space.
+        """
+        vertices = np.sort(vertices)
+        lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+        graph = sp.csr_array((lengths, tuple(mesh.edges.T)), (len(mesh.vertices),) * 2)
+        _, _, source = csgraph.dijkstra(
+            graph, directed=False, indices=vertices, min_only=True, return_predecessors=True
+        )
+        nearest = np.searchsorted(vertices, source)
+        if (apart := source < 0).any():
+            _, nearest[apart] = KDTree(mesh.vertices[vertices]).query(mesh.vertices[apart])
+        return cls(vertices, nearest)
 
 
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:

@@ -1,185 +1,235 @@
-"""Alternative initial maps, for pairs on which the usual initial map exchanges limbs."""
+"""Alternative maps, for pairs whose usual initial map leads to exchanged limbs or to an upside-down body."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache, partial
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.core.functional_map import encode, multiscale_kernel
-from jaxsmw.core.pointwise_map import chosen_patches, decode
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import SampledPair, paired_shot, sample_pair
-from jaxsmw.geometry.mesh import extend_to_unreferenced
-from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
-from jaxsmw.geometry.shot import SHOT_RADIUS
-from jaxsmw.initial_maps.landmarks import distance_features
-from jaxsmw.initial_maps.nearest import nearest_among_compared, nearest_map, to_all_vertices
-from jaxsmw.pair import Pair
+from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
+from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.preparation import PreparedPair
 from jaxsmw.repair.extremities import extremities, plausible_pairings
-from jaxsmw.repair.outcome import Outcome, score
-from jaxsmw.repair.scores import distinct, distortion, same_map
+from jaxsmw.repair.outcome import Judge, Outcome
+from jaxsmw.repair.proxies import Proxy, deformation
+from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
+from jaxsmw.runtime.batches import refine_pairs
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-_Shot = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
+# A map of samples: for each sample of X, the 0-based index of a sample of Y.
+SampleMap = Int64[np.ndarray, " s"]
+# The proper rotations by half a turn about the principal axes, as factors of the three coordinates.
+_HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
-def alternative_initial_maps(
-    pair: Pair,
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-    settings: RepairSettings = RepairSettings(),  # noqa: B008 (immutable)
-) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Yield alternative initial maps, which are computed one by one.
+class Alternatives:
+    """Alternative maps of a pair, computed and compared on proxies.
 
-    Each of the first alternative initial maps is computed from two functional maps. A nearest-neighbour
-    search in SHOT from X to Y gives one functional map, and a search from Y to X gives another functional
-    map. The weighted mean of both functional maps is filtered as in the MWP paper and converted to a
-    pointwise map. `RepairSettings.alternatives` lists the radii of SHOT and the weights.
+    Each shape is reduced to about a thousand samples. On the samples, a feature regression with few
+    eigenvectors refines many initial maps in the time that one refinement takes at all vertices. An initial
+    map is a nearest-neighbour search in one of the following features.
 
-    For two full shapes with descriptors (`describe`), further maps come from pairings of the extremities of X
-    with the extremities of Y. The pairings are selected by the distances between extremities. For each
-    pairing, a nearest-neighbour search in SHOT and in distances to the extremities gives a map. A feature
-    regression with few eigenvectors refines this map. Of the refined maps, the best-scoring maps that differ
-    from each other are yielded.
+    - SHOT with several radii.
+    - SHOT and the distances to extremities, for each of the most plausible pairings of extremities.
+    - SHOT and the positions along the principal axes of inertia, for each of the four rotations that take
+      principal axes to principal axes.
+
+    For a partial pair, only the first kind is used, because a part has other extremities and other axes.
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units, from `paired_spectra`.
+    - `prepared`: the pair with its spectra.
     - `settings`: the settings of the repair.
-
-    **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
-
-    **Raises:** `InputError` if a mesh is too coarse for SHOT, or a spectrum belongs to another mesh.
-    """
-    sampled = sample_pair(pair, spectrum_x, spectrum_y)
-
-    @cache
-    def shot(multiple: int) -> _Shot:
-        return paired_shot(sampled, multiple * SHOT_RADIUS)
-
-    for multiples, weight in settings.alternatives:
-        features_x, features_y = (np.hstack(side) for side in zip(*map(shot, multiples), strict=True))
-        k = settings.alternative_eigenvectors
-        truncated = spectrum_x.truncate(k), spectrum_y.truncate(k)
-        yield extend_to_unreferenced(
-            pair.mesh_x, _in_both_directions(sampled, features_x, features_y, weight, *truncated)
-        )
-    if not pair.partial and spectrum_x.descriptors is not None:
-        yield from _by_extremities(sampled, shot(1), spectrum_x, settings)
-
-
-def _in_both_directions(
-    sampled: SampledPair,
-    features_x: Float[np.ndarray, "a d"],
-    features_y: Float[np.ndarray, "b d"],
-    weight: float,
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-) -> Int64[np.ndarray, " m"]:
-    """Compute the pointwise map from the weighted mean of two functional maps.
-
-    A nearest-neighbour search in feature space from X to Y gives the functional map of weight `1 - weight`. A
-    search from Y to X gives the functional map of weight `weight`.
-    """
-    reversed_ = SampledPair(sampled.pair.reversed(), sampled.y, sampled.x)
-    forward = nearest_map(sampled, features_x, features_y)
-    backward = nearest_map(reversed_, features_y, features_x)
-    on_device = jax.device_put((forward, backward, spectrum_x.eigenvalues.dtype.type(weight)))
-    found = compiled(_decode_mean)(on_device, spectrum_x, spectrum_y)
-    return np.asarray(found).astype(np.int64)
-
-
-def _decode_mean(
-    maps_and_weight: tuple[Int[Array, " m"], Int[Array, " n"], Float[Array, ""]],
-    spectrum_x: Spectrum,
-    spectrum_y: Spectrum,
-) -> Int[Array, " m"]:
-    forward, backward, reverse_weight = maps_and_weight
-    responses = WaveletPreservation().problem(spectrum_x, spectrum_y).responses
-    of_forward = encode(forward, spectrum_x, spectrum_y)
-    of_backward = encode(backward, spectrum_y, spectrum_x).T
-    mean = (1 - reverse_weight) * of_forward + reverse_weight * of_backward
-    patches = chosen_patches("auto", spectrum_x, spectrum_y)
-    return decode(mean * multiscale_kernel(*responses), spectrum_x, spectrum_y, patches=patches)
-
-
-def _by_extremities(
-    sampled: SampledPair, shot: _Shot, spectrum_x: Spectrum, settings: RepairSettings
-) -> Iterator[Int64[np.ndarray, " m"]]:
-    """Yield maps from pairings of extremities.
-
-    `spectrum_x` is the spectrum at all vertices of X, which is needed for the scores.
-    """
-    pair = sampled.pair
-    refinement = _CoarseRefinement(sampled, settings)
-    ends = side_by_side(lambda side: extremities(side.mesh, settings.extremities), *sampled.sides)
-    distances = [
-        distance_features(side, of_side.vertices, unit)
-        for side, of_side, unit in zip(sampled.sides, ends, pair.units_of_length, strict=True)
-    ]
-    outcomes = []
-    for pairing in plausible_pairings(*ends, settings.extremity_pairings):
-        features_x, features_y = (
-            np.hstack([described, to_ends[:, chosen]])
-            for described, to_ends, chosen in zip(shot, distances, pairing.T, strict=True)
-        )
-        outcome = refinement(features_x, features_y)
-        if outcome.successful:
-            found = np.asarray(outcome.pointwise_map)[: len(sampled.x.spectrum.mask)].astype(np.int64)
-            everywhere = to_all_vertices(sampled, found)
-            measured = distortion(pair, everywhere, spectrum_x, settings.scores)
-            outcome = outcome._replace(distortion=measured)
-            outcomes.append((score(outcome, settings.uncertainty_weight), everywhere))
-    outcomes.sort(key=lambda outcome: outcome[0])
-    same = partial(same_map, pair, settings=settings.scores)
-    for everywhere in islice(distinct((found for _, found in outcomes), same), settings.extremity_maps):
-        yield extend_to_unreferenced(pair.mesh_x, everywhere)
-
-
-class _CoarseRefinement:
-    """A function that computes maps by nearest-neighbour search and refines them by a feature regression.
-
-    A coarse feature regression suffices to determine the match of each limb. The nearest-neighbour search is
-    made only for evenly spread vertices of X, and every other vertex receives the match of the nearest such
-    vertex.
     """
 
-    def __init__(self, sampled: SampledPair, settings: RepairSettings) -> None:
-        fewest = sampled.pair.fewest_vertices()
-        self.stage = Stage(
-            FeatureRegression(levels=settings.extremity_levels),
-            number_of_descriptors=settings.extremity_descriptors,
-            number_of_samples=settings.extremity_samples,
-        ).fitted(fewest)
-        count = self.stage.number_of_samples or fewest
-        queries = poisson_disk_samples(sampled.x.mesh, count)
-        self.sampled = sampled
-        self.rows = sampled.x.rows(queries.vertices)
-        samples = sampled.x.samples
-        self.nearest_query = queries.nearest if samples is None else queries.nearest[samples.vertices]
-        self.spectrum_x, self.spectrum_y = (
-            spectrum.pad(padded_size(len(spectrum.mask)))
-            for spectrum in self.stage.view(sampled.x.spectrum, sampled.y.spectrum)
+    def __init__(self, prepared: PreparedPair, settings: RepairSettings) -> None:
+        assert prepared.sampled is not None
+        self.prepared, self.pair, self.settings = prepared, prepared.pair, settings
+        self.sampled = prepared.sampled
+        sides = zip(
+            self.pair.meshes,
+            (prepared.spectrum_x, prepared.spectrum_y),
+            self.pair.units_of_length,
+            strict=True,
         )
-        self.samples = tuple(
-            jax.device_put(side.rows(farthest_point_samples(side.mesh, count))) for side in sampled.sides
+        self.x, self.y = side_by_side(self._proxy, *sides)
+        chosen = settings.alternatives
+        self._stage = Stage(
+            FeatureRegression(chosen.levels),
+            number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
+        ).fitted(min(len(self.x.areas), len(self.y.areas)))
+        self._spectra = self._stage.view(
+            self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
+        )
+        coarse = prepared.spectrum_x.truncate(chosen.eigenvectors)
+        self.judge = Judge(self.pair, coarse, settings, self.deformation)
+
+    def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
+        mesh, spectrum, unit = side
+        count = min(self.settings.alternatives.samples, int(mesh.referenced_vertices.sum()))
+        samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, count))
+        return Proxy(mesh, spectrum, samples, unit)
+
+    def deformation(self, pointwise_map: Int64[np.ndarray, " m"]) -> float:
+        """Return the deformation of a map X -> Y (m,), measured on the proxies."""
+        radius = self.settings.alternatives.patch_radius
+        return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
+
+    def best(self, *known: Int64[np.ndarray, " m"]) -> Iterator[Int64[np.ndarray, " m"]]:
+        """Yield maps that differ from each other, those of the best score first.
+
+        Of the refined maps, the best are repaired: a refinement without the vertices of a fault gives a
+        further map.
+
+        **Arguments:**
+
+        - `known`: maps X -> Y (m,), which are refined as further initial maps.
+
+        **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
+        """
+        outcomes = self._refined([*self._initial_maps(), *map(self._reduced, known)])
+        outcomes = self._sorted(outcomes + self._without_faults(self._first(outcomes)))
+        for outcome in distinct(outcomes, self.judge.same):
+            if self.judge.score(outcome) > self.judge.score(outcomes[0]) + self.settings.alternatives.margin:
+                break
+            yield np.asarray(outcome.pointwise_map).astype(np.int64)
+
+    def _first(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        """Return the first outcomes that differ from each other."""
+        return list(islice(distinct(outcomes, self.judge.same), self.settings.alternatives.repaired))
+
+    def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        """Refine each outcome without each of its faults."""
+        sound = [(outcome, ~fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
+        maps = [self._reduced(np.asarray(outcome.pointwise_map)) for outcome, _ in sound]
+        return self._refined(maps, [mask[self.x.samples.vertices] for _, mask in sound])
+
+    def _initial_maps(self) -> Iterator[SampleMap]:
+        """Yield the initial maps of samples."""
+        settings = self.settings.alternatives
+        usual = self._usual_shot()
+        for radii in settings.radii:
+            of_x, of_y = zip(*(usual if r == 1 else self._shot(r) for r in radii), strict=True)
+            yield np.argmin(_squares(np.hstack(of_x), np.hstack(of_y)), axis=1)
+        if self.pair.partial:
+            return
+        shot = _squares(*usual)
+        yield from self._by_extremities(shot)
+        frame_x, frame_y = _principal_frame(self.x), _principal_frame(self.y)
+        for signs in _HALF_TURNS:
+            positions = settings.position_weight * _squares(frame_x * signs, frame_y)
+            yield np.argmin(shot + positions, axis=1)
+
+    def _by_extremities(self, shot: Float[np.ndarray, "s t"]) -> Iterator[SampleMap]:
+        """Yield the initial maps from pairings of extremities, those of the most plausible pairings first.
+
+        **Arguments:**
+
+        - `shot`: the squared differences of SHOT between samples of X (s,) and of Y (t,).
+        """
+        settings = self.settings.alternatives
+        ends = extremities(self.x, settings.extremities), extremities(self.y, settings.extremities)
+        # The limbs of different animals have different lengths. Relative distances are more similar.
+        to_ends = [
+            proxy.distances[:, of_side.samples] / (proxy.areas @ proxy.distances[:, of_side.samples])
+            for of_side, proxy in zip(ends, (self.x, self.y), strict=True)
+        ]
+
+        def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
+            of_x, of_y = (distances[rows, side] for distances, side in zip(to_ends, pairing.T, strict=True))
+            return weight * shot[rows, rows] + settings.distance_weight * _squares(of_x, of_y)
+
+        def residual(pairing: Int64[np.ndarray, "l 2"]) -> float:
+            rows = slice(None, None, 3)  # a third of the samples is enough for a comparison
+            cost = costs(pairing, 0.3, rows)
+            return float(
+                np.average(cost.min(axis=1), weights=self.x.areas[rows])
+                + np.average(cost.min(axis=0), weights=self.y.areas[rows])
+            )
+
+        pairings = plausible_pairings(*ends, settings.compared_pairings)
+        for pairing in sorted(pairings, key=residual)[: settings.pairings]:
+            yield np.argmin(costs(pairing, 1.0, slice(None)), axis=1)
+
+    def _usual_shot(self) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
+        return tuple(
+            shot[side.rows(proxy.samples.vertices)]
+            for shot, side, proxy in zip(self.sampled.shot, self.sampled.sides, (self.x, self.y), strict=True)
         )
 
-    def __call__(self, features_x: Float[np.ndarray, "m d"], features_y: Float[np.ndarray, "n d"]) -> Outcome:
-        """Run the feature regression and return its outcome, whose distortion is None."""
-        nearest = nearest_among_compared(features_x[self.rows], features_y, self.sampled.y)
-        padded = pad_rows(nearest[self.nearest_query], len(self.spectrum_x.mask))
-        first = jax.device_put(padded.astype(np.int32))
-        return Outcome([self.stage.run(self.spectrum_x, self.spectrum_y, first, self.samples)], first)
+    def _shot(self, multiple: int) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
+        """Compute SHOT at the samples with a multiple of the usual radius."""
+
+        def of_one(argument: tuple[Proxy, float]) -> Float[np.ndarray, "s d"]:
+            proxy, unit = argument
+            radius = multiple * SHOT_RADIUS * unit / proxy.mesh.area**0.5
+            return shot_descriptors(proxy.mesh, radius=radius, samples=proxy.samples)
+
+        return side_by_side(of_one, *zip((self.x, self.y), self.pair.units_of_length, strict=True))
+
+    def _refined(
+        self, initial: Sequence[SampleMap], sound: Sequence[Bool[np.ndarray, " s"]] | None = None
+    ) -> list[Outcome]:
+        """Refine maps of samples.
+
+        **Arguments:**
+
+        - `initial`: the maps.
+        - `sound`: for each map, a mask of samples of X (s,). The first iteration uses only these samples. The
+          default is all samples.
+
+        **Returns:** The successful outcomes with maps of vertices, those of the best score first.
+        """
+        if not initial:
+            return []
+        first_x, y = self._spectra
+        if sound is None:
+            spectra, pairs = [first_x, y], [(0, 1)] * len(initial)
+        else:
+            spectra = [y] + [replace(first_x, vertex_areas=jnp.where(mask, first_x.vertex_areas, 0)) for mask in sound]
+            pairs = [(number, 0) for number in range(1, len(spectra))]
+        outcomes = []
+        for _, found in refine_pairs(
+            spectra, pairs, initial, partial=self.pair.partial, **self._stage.settings
+        ):
+            if found.result == RESULTS.successful:
+                everywhere = jax.device_put(self._extended(np.asarray(found.pointwise_map).astype(np.int64)))
+                found = eqx.tree_at(lambda tree: tree.pointwise_map, found, everywhere)
+                outcomes.append(self.judge.judged(Outcome([found], everywhere)))
+        return self._sorted(outcomes)
+
+    def _sorted(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        return sorted(outcomes, key=self.judge.score)
+
+    def _reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
+        return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
+
+    def _extended(self, found: SampleMap) -> Int64[np.ndarray, " m"]:
+        everywhere = self.y.samples.vertices[found][self.x.samples.nearest]
+        return extend_to_unreferenced(self.pair.mesh_x, everywhere)
+
+
+def _squares(x: Float[np.ndarray, "s d"], y: Float[np.ndarray, "t d"]) -> Float[np.ndarray, "s t"]:
+    """Return the squared distance between each row of `x` and each row of `y`."""
+    # A matrix product takes a fraction of the time of `cdist`.
+    return np.sum(x**2, axis=1)[:, None] + np.sum(y**2, axis=1) - 2 * x @ y.T
+
+
+def _principal_frame(proxy: Proxy) -> Float[np.ndarray, "s 3"]:
+    """Return the positions along the principal axes of inertia, in units of the radius of gyration."""
+    centered = proxy.positions - proxy.areas @ proxy.positions
+    variances, axes = np.linalg.eigh((proxy.areas * centered.T) @ centered)
+    axes = axes[:, ::-1] * [1, 1, np.sign(np.linalg.det(axes[:, ::-1]))]
+    return centered @ axes / np.sqrt(variances.sum())

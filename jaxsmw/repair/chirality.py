@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.sparse import coo_array, csgraph
-from scipy.spatial.distance import cdist
 
 from jaxsmw.choices import Mirror
 from jaxsmw.core.refiner import Problem, reverse_map
@@ -20,16 +16,15 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import principal_components
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import SurfaceSamples, poisson_disk_samples
+from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
 from jaxsmw.pair import Pair
+from jaxsmw.repair.proxies import Proxy, distance_error
 from jaxsmw.repair.settings import ChiralitySettings
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
-
-_Distances = Float[np.ndarray, "s s"]
 
 
 class Hands:
@@ -68,7 +63,7 @@ class Hands:
         self.stage = Stage(
             FeatureRegression(levels=settings.levels), number_of_descriptors=settings.descriptors
         )
-        self.x, self.y = side_by_side(self._shape, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
+        self.x, self.y = side_by_side(self._proxy, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
     def decide(self, mirror: Mirror = "auto") -> Decision:
         """Decide whether X or its mirror image is matched.
@@ -108,13 +103,13 @@ class Hands:
         """
         return float(np.mean(side_by_side(self._asymmetry, self.x, self.y)))
 
-    def _asymmetry(self, shape: _Shape) -> float:
+    def _asymmetry(self, shape: Proxy) -> float:
         shot = self._shot(shape, self.settings.asymmetry_radii)
         # All descriptors have the same length, so the nearest descriptor has the largest inner product.
         mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
         found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
         random = np.random.default_rng(0).permutation(len(found))
-        return _distance_error(shape, shape, found) / _distance_error(shape, shape, random)
+        return distance_error(shape, shape, found) / distance_error(shape, shape, random)
 
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.
@@ -160,13 +155,14 @@ class Hands:
         x: _Hand, y: _Hand, forward: Int64[np.ndarray, " s"], backward: Int64[np.ndarray, " t"]
     ) -> float:
         """Return the sum of the distance errors of a map and of its reverse map."""
-        return _distance_error(x.shape, y.shape, forward) + _distance_error(y.shape, x.shape, backward)
+        return distance_error(x.shape, y.shape, forward) + distance_error(y.shape, x.shape, backward)
 
-    def _shape(self, argument: tuple[Mesh, Spectrum]) -> _Shape:
+    def _proxy(self, argument: tuple[Mesh, Spectrum]) -> Proxy:
         mesh, spectrum = argument
-        return _Shape(mesh, poisson_disk_samples(mesh, self.settings.samples), spectrum)
+        samples = poisson_disk_samples(mesh, self.settings.samples)
+        return Proxy(mesh, spectrum, samples, mesh.area**0.5)
 
-    def _shot(self, shape: _Shape, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:
+    def _shot(self, shape: Proxy, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:
         return [
             shot_descriptors(shape.mesh, radius=multiple * SHOT_RADIUS, samples=shape.samples)
             for multiple in radii
@@ -178,7 +174,7 @@ class Hands:
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
         first = _nearest(x.shot, y.shot)
-        spectra = [hand.shape.described(hand.components) for hand in (x, y)]
+        spectra = [hand.shape.sampled_spectrum(hand.components) for hand in (x, y)]
         size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
         views = [spectrum.pad(size) for spectrum in self.stage.view(*spectra)]
         start = jax.device_put(pad_rows(first, size).astype(np.int32))
@@ -188,47 +184,10 @@ class Hands:
         return forward[: len(x.shot)], backward[: len(y.shot)]
 
 
-class _Shape:
-    """A shape with its evenly spread samples. Lengths are in units of the square root of the area."""
-
-    def __init__(self, mesh: Mesh, samples: SurfaceSamples, spectrum: Spectrum) -> None:
-        self.mesh, self.samples, self.spectrum = mesh, samples, spectrum
-        areas = np.bincount(samples.nearest, mesh.vertex_areas, len(samples.vertices))
-        self.areas = areas / mesh.area
-
-    def described(self, descriptors: Float[np.ndarray, "s d"]) -> Spectrum:
-        """Return the spectrum at the samples, with their areas and with the given descriptors."""
-        sampled = self.spectrum.sample(jnp.asarray(self.samples.vertices))
-        dtype = sampled.eigenvectors.dtype
-        return Spectrum(
-            sampled.eigenvalues,
-            sampled.eigenvectors,
-            jnp.asarray(self.areas, dtype),
-            sampled.mask,
-            jnp.asarray(descriptors, dtype),
-        )
-
-    @functools.cached_property
-    def distances(self) -> _Distances:
-        """The lengths of the shortest paths between the samples.
-
-        A path consists of straight steps between samples whose regions are adjacent. Between two connected
-        components, the distance is the distance in space.
-        """
-        nearest, vertices = self.samples.nearest, self.samples.vertices
-        pairs = np.unique(np.sort(nearest[self.mesh.edges], axis=1), axis=0)
-        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-        places = self.mesh.vertices[vertices] / self.mesh.area**0.5
-        lengths = np.linalg.norm(np.diff(places[pairs], axis=1)[:, 0], axis=1)
-        graph = coo_array((lengths, tuple(pairs.T)), (len(vertices),) * 2).tocsr()
-        along = csgraph.dijkstra(graph, directed=False)
-        return np.where(np.isfinite(along), along, cdist(places, places))
-
-
 class _Hand(NamedTuple):
     """A shape or its mirror image, with SHOT at its samples and the principal components of SHOT."""
 
-    shape: _Shape
+    shape: Proxy
     shot: Float[np.ndarray, "s r"]
     components: Float[np.ndarray, "s d"]
 
@@ -237,11 +196,6 @@ def _nearest(x: Float[np.ndarray, "s r"], y: Float[np.ndarray, "t r"]) -> Int64[
     """Return the nearest SHOT descriptor of Y for each SHOT descriptor of X."""
     # A matrix product takes a fraction of the time of `cdist`.
     return np.argmax(x @ y.T - 0.5 * (y**2).sum(axis=1), axis=1)
-
-
-def _distance_error(x: _Shape, y: _Shape, found: Int64[np.ndarray, " s"]) -> float:
-    """Return the mean absolute difference between distances on X and distances of the matches on Y."""
-    return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
 
 
 def _log_ratio(own: float, mirrored: float) -> float:

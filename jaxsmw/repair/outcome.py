@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,12 +26,14 @@ class Outcome(NamedTuple):
     - `initial_map`: the initial map of the first stage (m,), 0-based vertices of Y. The initial map and the
       maps of the refinements may be padded.
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
+    - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
     """
 
     refinements: list[Refinement]
     initial_map: Int[Array, " m"]
     distortion: float | None = None
+    deformation: float = 0.0
     suspicious: bool = False
 
     @property
@@ -45,7 +47,7 @@ class Outcome(NamedTuple):
         return self.refinements[-1].pointwise_map if self.refinements else self.initial_map
 
 
-def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncertainty_weight) -> float:
+def score(outcome: Outcome, settings: RepairSettings = RepairSettings()) -> float:  # noqa: B008 (immutable)
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
     The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty comes from the
@@ -63,7 +65,12 @@ def score(outcome: Outcome, uncertainty_weight: float = RepairSettings().uncerta
         return np.inf
     uncertainties = [found.state.uncertainty for found in outcome.refinements]
     known = [uncertainty for uncertainty in uncertainties if uncertainty is not None]
-    return float(np.log(outcome.distortion or 1) + uncertainty_weight * (known[-1] if known else 0))
+    uncertainty = float(known[-1]) if known else 0.0
+    return (
+        float(np.log(outcome.distortion or 1))
+        + settings.uncertainty_weight * uncertainty
+        + settings.deformation_weight * outcome.deformation
+    )
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,7 @@ class Judge:
     pair: Pair
     spectrum_x: Spectrum
     settings: RepairSettings
+    measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
 
     def judged(self, outcome: Outcome) -> Outcome:
         """Return the outcome with computed values of `distortion` and `suspicious`.
@@ -89,12 +97,20 @@ class Judge:
         """
         if not outcome.successful:
             return outcome._replace(distortion=np.inf, suspicious=True)
-        found = distortion(self.pair, self._matches(outcome), self.spectrum_x, self.settings.scores)
-        return outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
+        matches = self._matches(outcome)
+        if self.measure_deformation is not None:
+            outcome = outcome._replace(deformation=self.measure_deformation(matches))
+        found = distortion(self.pair, matches, self.spectrum_x, self.settings.scores)
+        outcome = outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
+        areas = self.pair.mesh_x.vertex_areas / self.pair.mesh_x.area
+        if not outcome.suspicious and self.settings.suspicious_area < 1:
+            largest = max((areas[fault].sum() for fault in self.faults(outcome)), default=0)
+            outcome = outcome._replace(suspicious=bool(largest >= self.settings.suspicious_area))
+        return outcome
 
     def score(self, outcome: Outcome) -> float:
         """Return the `score` of an outcome with the uncertainty weight of the settings; lower is better."""
-        return score(outcome, self.settings.uncertainty_weight)
+        return score(outcome, self.settings)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
         """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
@@ -125,14 +141,6 @@ class Judge:
     def same(self, first: Outcome, second: Outcome) -> bool:
         """Return whether the maps of two outcomes agree on nearly all of X; see `same_map`."""
         return same_map(self.pair, self._matches(first), self._matches(second), self.settings.scores)
-
-    def largest_group(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
-        """Return the largest group of outcomes whose maps all agree with the map of one outcome in the group.
-
-        **Raises:** `ValueError` if there are no outcomes.
-        """
-        outcomes = list(outcomes)
-        return max(([o for o in outcomes if self.same(member, o)] for member in outcomes), key=len)
 
     def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
         return np.asarray(outcome.pointwise_map)[: len(self.pair.mesh_x.vertices)].astype(np.int64)

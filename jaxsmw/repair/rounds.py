@@ -13,9 +13,8 @@ from jaxtyping import Array, Int, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.preparation import PreparedPair
-from jaxsmw.repair.alternatives import alternative_initial_maps
+from jaxsmw.repair.alternatives import Alternatives
 from jaxsmw.repair.outcome import Judge, Outcome
-from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import WITHOUT_REPAIR, RepairSettings
 from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
@@ -78,8 +77,6 @@ def refine_in_stages(
         return judge.judged(refined or runner.run(0, Outcome([], first)))
     repairer = _Repairer(runner, judge, repair)
     best = judge.judged(refined) if refined else repairer.finished(repairer.begun(first))
-    if best.successful and best.suspicious:
-        best = repairer.repaired(best)
     if not (best.successful and best.suspicious):
         return best
     logger.info(
@@ -88,16 +85,12 @@ def refine_in_stages(
         repair.suspicious,
     )
     if alternatives is None:
-        alternatives = _usual_alternatives(prepared, repair)
+        alternatives = ()
+        if isinstance(prepared.init, str) and prepared.init == "shot":
+            proxies = Alternatives(prepared, repair)
+            repairer = replace(repairer, judge=replace(judge, measure_deformation=proxies.deformation))
+            alternatives = proxies.best(prepared.unpadded_map(best.pointwise_map))
     return repairer.best_of_alternatives(best, map(prepared.padded_map, alternatives))
-
-
-def _usual_alternatives(
-    prepared: PreparedPair, settings: RepairSettings
-) -> Iterable[Int64[np.ndarray, " m"]]:
-    if not isinstance(prepared.init, str) or prepared.init != "shot":
-        return ()
-    return alternative_initial_maps(prepared.pair, prepared.spectrum_x, prepared.spectrum_y, settings)
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -171,40 +164,16 @@ class _Repairer:
         return best._replace(suspicious=not self.judge.looks_right(best))
 
     def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Repair outcomes from alternative initial maps, and return the best of these outcomes and `best`."""
-        rough = self._rough_outcomes(alternatives)
-        # The search does not stop at the first map that looks right, because a later map may be better.
-        finished, tried = [best], [best, *rough]
-        for outcome in islice(distinct(rough, self.judge.same), self.settings.finalists):
-            finished.append(self.repaired(self.finished(outcome)))
-        best = min(finished, key=lambda outcome: (outcome.suspicious, self.judge.score(outcome)))
-        if best.suspicious:
-            # With topological noise, correct maps also look discontinuous. Most wrong maps differ from each
-            # other, so a map to which several initial maps lead is probably correct.
-            group = self.judge.largest_group(tried)
-            if len(group) >= self.settings.agreeing:
-                known = [outcome for outcome in finished if self.judge.same(outcome, group[0])]
-                best = min(known, key=self.judge.score) if known else self.repaired(self.finished(group[0]))
-        if rough:
-            left = "; limbs may still be swapped" if best.suspicious else ""
-            logger.info(
-                "the best of %d initial maps has distortion %.2f%s", len(tried), best.distortion, left
-            )
-        return best
-
-    def _rough_outcomes(self, alternatives: Iterable[Int[Array, " m"]]) -> list[Outcome]:
-        """Refine alternative initial maps up to the repeated stage, and repair them in up to `rough_rounds`
-        rounds.
-
-        **Returns:** The successful outcomes, ordered by score, best first.
-        """
-        rough: list[Outcome] = []
-        for number, first in enumerate(alternatives, 2):
-            logger.info("initial map %d ...", number)
-            rough.append(
-                self._without_faults(self.judge.judged(self.begun(first)), self.settings.rough_rounds)
-            )
-        return sorted((outcome for outcome in rough if outcome.successful), key=self.judge.score)
+        """Finish alternative maps, and return the best of these outcomes and `best`, repaired if needed."""
+        finished = [self.judge.judged(best)]
+        for number, start in enumerate(islice(alternatives, self.settings.finalists), 2):
+            logger.info("map %d ...", number)
+            outcome = self.runner.run(self.settings.stage, Outcome([], start))
+            finished.append(self.judge.judged(outcome))
+        best = min(finished, key=self.judge.score)
+        if not self.judge.looks_right(best):
+            best = self.repaired(best)
+        return best._replace(suspicious=not self.judge.looks_right(best))
 
     def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
         """Run rounds of repair and return the best outcome.

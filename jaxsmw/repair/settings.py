@@ -70,15 +70,54 @@ class ExtremitySettings:
 
     **Attributes:**
 
-    - `samples`: the number of evenly spread samples. The distances from a vertex to the samples are averaged.
     - `distance`: the smallest allowed distance between two extremities.
     - `most`: the largest number of extremities. The number of pairings grows very fast with the number of
       extremities.
     """
 
-    samples: int = 200
     distance: float = 0.35
     most: int = 6
+
+
+@dataclass(frozen=True)
+class AlternativeSettings:
+    """The settings of `jaxsmw.repair.alternatives`. Lengths are in units of the square root of the area.
+
+    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `samples`: the number of samples of each shape.
+    - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
+      which are positive integers in units of 0.06.
+    - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
+    - `compared_pairings`: the number of pairings of extremities that are compared by the similarity of their
+      features. The pairings are those that best preserve the distances between extremities.
+    - `pairings` (Table R27): the number of initial maps from pairings of extremities.
+    - `distance_weight`, `position_weight`: the weights of squared differences of relative distances and of
+      relative positions, compared with squared differences of SHOT.
+    - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
+      the initial maps.
+    - `repaired`: the number of refined maps that are refined again without their faults.
+    - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
+    - `patch_radius` (Table R28): the radius of the patches of the deformation.
+    - `margin` (Table R28): the largest difference of scores between the best map and a returned map. If a
+      wrong map has the best score, the scores of the right map and of the wrong map differ less.
+    """
+
+    samples: int = 1000
+    radii: tuple[tuple[int, ...], ...] = ((1,), (1, 2, 4), (2, 4))
+    extremities: ExtremitySettings = ExtremitySettings()
+    compared_pairings: int = 64
+    pairings: int = 6
+    distance_weight: float = 2.25
+    position_weight: float = 10.0
+    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20, 26, 35)
+    descriptors: int = 30
+    repaired: int = 3
+    eigenvectors: int = 50
+    patch_radius: float = 0.2
+    margin: float = 0.7
 
 
 @dataclass(frozen=True)
@@ -99,6 +138,8 @@ class RepairSettings:
       fewer eigenvectors than the stage.
     - `suspicious` (Table R3): a number above 1. A map with a distortion of at least this value is suspicious
       and is repaired. Correct maps between poses of one body have a distortion below this value.
+    - `suspicious_area` (Table R28): a number from 0 to 1. A map with a fault of at least this share of X's
+      area is suspicious as well.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value, which should be at least `suspicious`. Between non-isometric shapes, some correct maps have
       distortions up to this value.
@@ -108,34 +149,20 @@ class RepairSettings:
       a body is mapped upside down, the rest of the map does not suffice to find the correct map.
     - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
       stage and all later stages.
-    - `rough_rounds`: the largest number of rounds for each alternative initial map, at least 0. The rounds
-      for alternative initial maps run the repeated stage but no later stages.
-    - `finalists`: the largest number of alternative initial maps that are refined by all stages, at least 0.
-    - `agreeing` (entry R7): if no map looks right, but at least this number of initial maps lead to the same
-      map, that map is chosen. Two wrong maps sometimes agree, but three wrong maps seldom do.
+    - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
     - `uncertainty_weight` (Table R13): the weight of the feature regression's uncertainty in the score,
       relative to the logarithm of the distortion; at least 0. Upside-down maps have a higher uncertainty than
       correct maps, and mirrored maps have a higher distortion. Weights from 6 to 12 lead to nearly the same
       choices of maps.
+    - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
+      maps and mirrored maps have larger deformations than right maps.
     - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
       worse by less than this value (at least 0). The scores of two correct maps mostly differ by less than
       this value. The scores of a correct map and an upside-down map differ by more than this value.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
       from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is returned if its mean expected
       error is below this multiple of the other map's mean expected error.
-    - `alternatives` (Table R13): a tuple with one entry for each alternative initial map from functional
-      maps. Each entry is a pair: a tuple of SHOT radii, and a weight w from 0 to 1. The radii are positive
-      integers, in units of 0.06 times the square root of the area. A nearest-neighbour search in SHOT from X
-      to Y gives a functional map C_1. A search from Y to X gives a functional map C_2. The initial map is
-      computed from the weighted mean `(1 - w) C_1 + w C_2`.
-    - `alternative_eigenvectors`: the number of eigenvectors of the functional maps in `alternatives`.
-    - `extremity_levels`: the levels (numbers of eigenvectors) of the feature regression that refines maps
-      from pairings of extremities (entry R14).
-    - `extremity_descriptors`, `extremity_samples`: the number of descriptors and the number of samples of the
-      feature regression with `extremity_levels` (entry R14).
-    - `extremity_pairings`: the largest number of pairings of extremities that are tried.
-    - `extremity_maps`: the largest number of alternative initial maps that come from pairings of extremities.
-    - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
+    - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
     The constructor checks nothing. `Preset` raises `InputError` if the stage at position `stage` does not
@@ -145,28 +172,21 @@ class RepairSettings:
     stage: int = 1
     fallback_levels: tuple[int, ...] = (10, 10, 14, 14, 20, 20, 26, 35)
     suspicious: float = 1.12
+    suspicious_area: float = 0.02
     doubtful: float = 1.15
     negligible_area: float = 0.002
     excessive_area: float = 0.5
     rounds: int = 4
-    rough_rounds: int = 2
     finalists: int = 2
-    agreeing: int = 3
-    uncertainty_weight: float = 10.0
+    uncertainty_weight: float = 20.0
+    deformation_weight: float = 5.0
     score_tolerance: float = 0.25
     aligned_preference: float = 0.98
-    alternatives: tuple[tuple[tuple[int, ...], float], ...] = (((1, 2, 4), 0.5), ((1,), 1.0), ((1,), 0.5))
-    alternative_eigenvectors: int = 100
-    extremity_levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
-    extremity_descriptors: int = 30
-    extremity_samples: int = 500
-    extremity_pairings: int = 16
-    extremity_maps: int = 2
-    extremities: ExtremitySettings = ExtremitySettings()
+    alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
 
-WITHOUT_REPAIR = RepairSettings(suspicious=1.25)
+WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0)
 """The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
 
 

@@ -115,11 +115,11 @@ def compile_ahead(
 def release_programs() -> None:
     """Releases all compiled programs if the process uses a large share of its allowed memory maps.
 
-    Commands call this function between pairs. Library functions must not call it, because `jax.clear_caches`
-    also clears the programs of the caller. On Linux, the programs for a few dozen pairs of different sizes
-    would use up all memory maps of the process. LLVM would then end the process. JAX compiles released
-    programs again when they are needed, or loads them from the disk. On other systems the function does
-    nothing.
+    Commands, and functions that match many pairs, call this function between pairs. Functions that match one
+    pair must not call it, because `jax.clear_caches` also clears the programs of the caller. On Linux, the
+    programs for a few dozen pairs of different sizes would use up all memory maps of the process. LLVM would
+    then end the process. JAX compiles released programs again when they are needed, or loads them from the
+    disk. On other systems the function does nothing.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

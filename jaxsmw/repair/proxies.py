@@ -1,0 +1,118 @@
+"""Proxies: shapes reduced to evenly spread samples, on which coarse maps are computed and compared."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.sparse import coo_array, csgraph
+from scipy.spatial.distance import cdist
+
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.sampling import SurfaceSamples
+
+
+class Proxy:
+    """A shape reduced to s evenly spread samples.
+
+    **Arguments:**
+
+    - `mesh`: the shape (n vertices).
+    - `spectrum`: the spectrum of the shape (n vertices), without padding.
+    - `samples`: evenly spread samples of the mesh, as `SurfaceSamples`.
+    - `unit`: the unit of length of `positions` and `distances`, in the coordinates of the mesh; see
+      `Pair.units_of_length`.
+
+    **Attributes:**
+
+    - `mesh`, `spectrum`, `samples`: the arguments.
+    - `areas`: the share of the area that belongs to each sample (s,), with sum 1.
+    - `positions`: the positions of the samples (s, 3).
+    """
+
+    def __init__(self, mesh: Mesh, spectrum: Spectrum, samples: SurfaceSamples, unit: float) -> None:
+        self.mesh, self.spectrum, self.samples = mesh, spectrum, samples
+        areas = np.bincount(samples.nearest, mesh.vertex_areas, len(samples.vertices))
+        self.areas = areas / mesh.area
+        self.positions = mesh.vertices[samples.vertices] / unit
+
+    def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None = None) -> Spectrum:
+        """Return the spectrum at the samples, with their areas.
+
+        **Arguments:**
+
+        - `descriptors`: the descriptors of the samples (s, d). The default is those of `spectrum`.
+        """
+        at_samples = self.spectrum.sample(jnp.asarray(self.samples.vertices))
+        dtype = at_samples.eigenvectors.dtype
+        areas = self.areas * float(np.sum(self.spectrum.vertex_areas))
+        if descriptors is not None:
+            at_samples = at_samples.with_descriptors(jnp.asarray(descriptors, dtype))
+        return Spectrum(
+            at_samples.eigenvalues,
+            at_samples.eigenvectors,
+            jnp.asarray(areas, dtype),
+            at_samples.mask,
+            at_samples.descriptors,
+        )
+
+    @functools.cached_property
+    def distances(self) -> Float[np.ndarray, "s s"]:
+        """The lengths of the shortest paths between the samples.
+
+        A path consists of straight steps between samples whose regions are adjacent. Between two connected
+        components, the distance is the distance in space.
+        """
+        pairs = np.unique(np.sort(self.samples.nearest[self.mesh.edges], axis=1), axis=0)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        lengths = np.linalg.norm(np.diff(self.positions[pairs], axis=1)[:, 0], axis=1)
+        graph = coo_array((lengths, tuple(pairs.T)), (len(self.areas),) * 2).tocsr()
+        along = csgraph.dijkstra(graph, directed=False)
+        return np.where(np.isfinite(along), along, cdist(self.positions, self.positions))
+
+
+def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
+    """Return the mean absolute difference between distances on X and distances of the matches on Y.
+
+    **Arguments:**
+
+    - `x`, `y`: the proxies of X (s samples) and Y (t samples).
+    - `found`: a map of samples (s,), as 0-based indices of samples of Y.
+    """
+    return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
+
+
+def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: float) -> float:
+    """Measure how far a map is from moving every patch of X rigidly.
+
+    The patch of a sample consists of all samples within a geodesic distance. The rotation and the translation
+    that best carry the patch to its matches leave a residual. The deformation is the mean residual of all
+    patches, divided by the size of each patch. A map that bends a body at its joints deforms most patches
+    little. Upside-down maps and mirrored maps deform most patches, because rotations contain no reflection.
+    Energies of this kind are called as rigid as possible (Sorkine, Alexa 2007).
+
+    **Arguments:**
+
+    - `x`, `y`: the proxies of X (s samples) and Y (t samples).
+    - `found`: a map of samples (s,), as 0-based indices of samples of Y.
+    - `radius`: the radius of the patches, in the unit of the distances.
+
+    **Returns:** The mean squared residual, relative to the mean squared distances of the patch and of its
+    matches from their centroids: 0 for a rigid motion, and at most 1.
+    """
+    weights = (x.distances < radius) * x.areas
+    weights /= weights.sum(axis=1, keepdims=True)
+    source, target = x.positions, y.positions[found]
+    products = np.einsum("sa,sb->sab", source, target).reshape(-1, 9)
+    squares = np.sum(source**2 + target**2, axis=1, keepdims=True)
+    columns = weights @ np.hstack([source, target, products, squares])
+    mean_x, mean_y = columns[:, :3], columns[:, 3:6]
+    covariance = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_x, mean_y)
+    size = columns[:, 15] - np.sum(mean_x**2 + mean_y**2, axis=1)
+    left, values, right = np.linalg.svd(covariance)
+    values[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
+    residual = size - 2 * values.sum(axis=1)
+    return float(x.areas @ np.clip(residual / np.maximum(size, np.finfo(float).tiny), 0, 1))

@@ -1,0 +1,137 @@
+"""Alternative maps are computed and compared on proxies."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxsmw import creature_pair
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.pair import Pair
+from jaxsmw.preparation import prepare
+from jaxsmw.presets import PRESETS
+from jaxsmw.repair.alternatives import Alternatives
+from jaxsmw.repair.proxies import Proxy, deformation, distance_error
+
+REPAIR = PRESETS["accurate"].repair
+# Fewer samples and levels, which compile faster.
+REPAIR = replace(REPAIR, alternatives=replace(REPAIR.alternatives, samples=500, levels=(8, 11, 15, 20)))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two poses of a body with different triangulations."""
+    found = creature_pair(vertices=1500)
+    return found.source, found.target, found.truth.nearest_corners(found.target)
+
+
+def reduced(mesh, number=300):
+    samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, number))
+    return Proxy(mesh, compute_spectrum(mesh, 4), samples, mesh.area**0.5)
+
+
+def moved(mesh, rotation, shift=2.0):
+    return Mesh(mesh.vertices @ rotation.as_matrix().T + shift, mesh.faces, mesh.name)
+
+
+def prepared(mesh_x, mesh_y, **options):
+    return prepare(
+        Pair.make(mesh_x, mesh_y, **options),
+        number_of_eigenvectors=60,
+        number_of_descriptors=30,
+        number_of_samples=500,
+    )
+
+
+def mean_error(mesh, found, truth):
+    return float(np.linalg.norm(mesh.vertices[found] - mesh.vertices[truth], axis=1).mean() / mesh.area**0.5)
+
+
+def test_samples_belong_to_the_nearest_along_the_surface():
+    """Two parallel sheets that nearly touch share no samples."""
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    corners = np.arange(64).reshape(8, 8)
+    a, b, c, d = (
+        part.ravel() for part in (corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:])
+    )
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    sheets = [np.column_stack([grid, np.full(64, height)]) for height in (0.0, 0.01)]
+    mesh = Mesh(np.concatenate(sheets), np.concatenate([faces, faces + 64]))
+    samples = SurfaceSamples.along_surface(mesh, np.array([0, 64 + 63]))
+    assert (samples.nearest == np.repeat([0, 1], 64)).all()
+    alone = SurfaceSamples.along_surface(mesh, np.array([3, 0]))  # no sample on the second sheet
+    assert alone.vertices.tolist() == [0, 3]
+    assert (alone.nearest[:64] == alone.nearest[64:]).mean() > 0.9
+
+
+def test_rigid_motions_have_no_deformation_and_reflections_have(pair):
+    mesh, _, _ = pair
+    rotation = Rotation.random(random_state=0)
+    x, y = reduced(mesh), reduced(moved(mesh, rotation))
+    np.testing.assert_array_equal(x.samples.vertices, y.samples.vertices)
+    identity = np.arange(len(x.areas))
+    assert deformation(x, y, identity, 0.3) < 1e-12 and distance_error(x, y, identity) < 1e-12
+    mirrored = Proxy(mesh.mirrored(), x.spectrum, x.samples, mesh.area**0.5)
+    assert distance_error(x, mirrored, identity) < 1e-12
+    assert deformation(x, mirrored, identity, 0.3) > 0.01
+
+
+def test_deformation_is_the_residual_of_procrustes_alignment(pair):
+    mesh_x, mesh_y, truth = pair
+    x, y = reduced(mesh_x, 80), reduced(mesh_y, 90)
+    found = y.samples.nearest[truth[x.samples.vertices]]
+    expected = 0.0
+    for sample, area in enumerate(x.areas):
+        patch = x.distances[sample] < 0.4
+        weights = x.areas[patch] / x.areas[patch].sum()
+        source, target = (p - weights @ p for p in (x.positions[patch], y.positions[found[patch]]))
+        rotation, _ = Rotation.align_vectors(target, source, weights=weights)
+        residual = weights @ np.sum((rotation.apply(source) - target) ** 2, axis=1)
+        expected += area * residual / (weights @ np.sum(source**2 + target**2, axis=1))
+    assert deformation(x, y, found, 0.4) == pytest.approx(expected, rel=1e-6)
+
+
+def test_wrong_maps_deform_more_than_the_true_map(pair):
+    mesh_x, mesh_y, truth = pair
+    x, y = reduced(mesh_x), reduced(mesh_y)
+    found = y.samples.nearest[truth[x.samples.vertices]]
+    random = (
+        np.random.default_rng(0).permutation(len(y.areas))[: len(found)]
+        if len(found) <= len(y.areas)
+        else None
+    )
+    measure = partial(deformation, x, y, radius=0.3)
+    assert measure(found) < 0.5 * measure(random)
+
+
+def test_the_best_alternative_is_right_and_does_not_depend_on_the_position_in_space(pair):
+    mesh_x, mesh_y, truth = pair
+    first, *others = Alternatives(prepared(mesh_x, mesh_y), REPAIR).best()
+    assert first.dtype == np.int64 and first.shape == truth.shape
+    assert mean_error(mesh_y, first, truth) < 0.08
+    assert len(others) <= 3
+    turned = moved(mesh_x, Rotation.random(random_state=1)), moved(mesh_y, Rotation.random(random_state=2))
+    (again, *_) = Alternatives(prepared(*turned), REPAIR).best()
+    assert np.mean(again == first) > 0.99
+
+
+def test_alternatives_of_partial_pairs_come_from_descriptors_alone(pair):
+    mesh_x, mesh_y, _ = pair
+    whole = Alternatives(prepared(mesh_x, mesh_y), REPAIR)
+    part = Alternatives(prepared(mesh_x, mesh_y, partial=True), REPAIR)
+    radii, pairings = REPAIR.alternatives.radii, REPAIR.alternatives.pairings
+    assert len(list(part._initial_maps())) == len(radii)
+    assert len(list(whole._initial_maps())) == len(radii) + pairings + 4
+    assert next(part.best()).shape == (len(mesh_x.vertices),)
+
+
+def test_known_maps_are_refined_as_well(pair):
+    """On a body without descriptors and limbs, only a given map is right."""
+    mesh_x, mesh_y, truth = pair
+    alone = Alternatives(prepared(mesh_x, mesh_y), REPAIR)
+    alone._initial_maps = lambda: iter(())
+    assert mean_error(mesh_y, next(alone.best(truth)), truth) < 0.05
