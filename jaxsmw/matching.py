@@ -392,7 +392,7 @@ def match(
           the smaller expected error is returned.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
-          With `"shot"`, repair also tries alternative initial maps.
+          With `"shot"`, repair also tries alternative maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
           with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
           `"shot"` and has smaller errors. However, the refined map often has larger errors than with `"shot"`
@@ -529,7 +529,7 @@ def match_prepared(
     - `seconds`: a dictionary to which the times of the steps are added. With None, the steps are neither
       measured nor reported as progress.
     - `compiling`: compilations in the background, which refinement waits for.
-    - `alternatives`: whether repair tries alternative initial maps.
+    - `alternatives`: whether repair tries alternative maps.
     - `refined`: for each start, the outcome of all stages if the stages already ran; see
       `jaxsmw.repair.batches`.
 

@@ -100,7 +100,7 @@ def match_edges(
 ) -> Iterator[EdgeMap | ArithmeticError]:
     """Match the edges of a graph, in batches on accelerators; see `match_pairs`.
 
-    A map that looks wrong is repaired, but no alternative initial maps are tried, because the maps of other
+    A map that looks wrong is repaired, but no alternative maps are tried, because the maps of other
     edges provide a better initial map later.
 
     **Arguments:**

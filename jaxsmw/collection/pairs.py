@@ -43,7 +43,7 @@ def match_pairs(
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts.
     - `pairs`: the number of the source X and of the target Y of each pair.
     - `preset`: the name of a preset, or a `Preset`; see `match`.
-    - `alternatives`: whether repair tries alternative initial maps.
+    - `alternatives`: whether repair tries alternative maps.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 

@@ -198,7 +198,9 @@ class Alternatives:
         if sound is None:
             spectra, pairs = [first_x, y], [(0, 1)] * len(initial)
         else:
-            spectra = [y] + [replace(first_x, vertex_areas=jnp.where(mask, first_x.vertex_areas, 0)) for mask in sound]
+            spectra = [y] + [
+                replace(first_x, vertex_areas=jnp.where(mask, first_x.vertex_areas, 0)) for mask in sound
+            ]
             pairs = [(number, 0) for number in range(1, len(spectra))]
         outcomes = []
         for _, found in refine_pairs(

@@ -9,7 +9,7 @@ from itertools import islice
 
 import jax
 import numpy as np
-from jaxtyping import Array, Int, Int64
+from jaxtyping import Array, Float, Int, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.preparation import PreparedPair
@@ -38,27 +38,24 @@ def refine_in_stages(
     (`jaxsmw.repair.scores`). If the outcome looks wrong, repair takes the following three steps. The stage at
     position `repair.stage` is called the repeated stage.
 
-    1. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
+    1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. From each
+       of the best maps, at most `finalists`, the repeated stage and all later stages run. Of these outcomes
+       and the first outcome, the outcome with the best score is kept. If it looks right, repair ends.
+    2. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
        with a fault in the previous map have weight zero. If a map has both orientation reversal and
        discontinuous parts, successive rounds leave out these two faults alternately.
-    2. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
+    3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
-    3. Alternatives: if the outcome still looks wrong, alternative initial maps are refined up to and
-       including the repeated stage. The repeated stage then runs again in up to `rough_rounds` rounds. Up to
-       `finalists` different outcomes with the best scores go through all later stages and through repair.
-       Among the outcomes that look right, the outcome with the best score is returned. If no outcome looks
-       right, but at least `agreeing` initial maps lead to the same map, this map is returned. If fewer
-       initial maps agree, the outcome with the best score is returned.
 
     **Arguments:**
 
     - `prepared`: the pair with its spectra and its initial map.
     - `stages`: the stages, in the order in which they run.
     - `repair`: the settings of the repair. With None, the outcome is judged but not repaired.
-    - `alternatives`: alternative initial maps (m,), as an iterable that is consumed only if needed. By
-      default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
+    - `alternatives`: alternative maps (m,), the best first, as an iterable that is consumed only if needed.
+      By default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
       initial maps, there are no alternatives by default.
     - `refined`: the outcome of all stages from the initial map, for example from `refine_batch`. By default,
       the stages run first.
@@ -66,18 +63,15 @@ def refine_in_stages(
 
     **Returns:** An `Outcome` with padded maps. Refinement stops at the first stage that fails.
 
-    **Raises:** `InputError` if alternative initial maps cannot be computed.
+    **Raises:** `InputError` if alternative maps cannot be computed.
     """
     views = [prepared.view(stage) for stage in stages]
     runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
     first = prepared.padded_map(prepared.initial_map)
     finest = max((of_x for of_x, _ in views), key=lambda of_x: of_x.eigenvalues.shape[0])
     judge = Judge(prepared.pair, finest, repair or WITHOUT_REPAIR)
-    if repair is None:
-        return judge.judged(refined or runner.run(0, Outcome([], first)))
-    repairer = _Repairer(runner, judge, repair)
-    best = judge.judged(refined) if refined else repairer.finished(repairer.begun(first))
-    if not (best.successful and best.suspicious):
+    best = judge.judged(refined or runner.run(0, Outcome([], first)))
+    if repair is None or not (best.successful and best.suspicious):
         return best
     logger.info(
         "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
@@ -88,9 +82,10 @@ def refine_in_stages(
         alternatives = ()
         if isinstance(prepared.init, str) and prepared.init == "shot":
             proxies = Alternatives(prepared, repair)
-            repairer = replace(repairer, judge=replace(judge, measure_deformation=proxies.deformation))
+            judge = replace(judge, measure_deformation=proxies.deformation)
             alternatives = proxies.best(prepared.unpadded_map(best.pointwise_map))
-    return repairer.best_of_alternatives(best, map(prepared.padded_map, alternatives))
+    repairer = _Repairer(runner, judge, repair)
+    return repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives))
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -129,30 +124,34 @@ class _Runner:
 
 @dataclass(frozen=True)
 class _Repairer:
-    """A repairer of outcomes. The repairer repeats the stage at position `settings.stage` and all later
-    stages.
-    """
+    """A repairer of outcomes, which repeats the stage at position `settings.stage` and all later stages."""
 
     runner: _Runner
     judge: Judge
     settings: RepairSettings
 
-    def begun(self, first: Int[Array, " m"]) -> Outcome:
-        """Run all stages up to and including the repeated stage, without judging the outcome."""
-        return self.runner.run(0, Outcome([], first), self.settings.stage + 1)
+    def repaired(self, first: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
+        """Repair a judged outcome by alternative maps and, if the best outcome looks wrong, by rounds."""
+        outcomes = [first]
+        for number, start in enumerate(islice(alternatives, self.settings.finalists), 1):
+            logger.info("alternative map %d ...", number)
+            outcomes.append(self._from_repeated(Outcome([], start)))
+        best = min(outcomes, key=self.judge.score)
+        if not self.judge.looks_right(best):
+            best = self._by_rounds(best)
+        best = best._replace(suspicious=not self.judge.looks_right(best))
+        left = "; limbs may still be swapped" if best.suspicious else ""
+        logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
+        return best
 
-    def finished(self, outcome: Outcome) -> Outcome:
-        """Run all stages after the repeated stage and return the judged outcome."""
-        return self.judge.judged(self.runner.run(self.settings.stage + 1, outcome))
-
-    def repaired(self, outcome: Outcome) -> Outcome:
-        """Repair a finished outcome by rounds and by the fallback."""
-        outcome = self._without_faults(outcome, self.settings.rounds, finish=True)
-        (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
+    def _by_rounds(self, outcome: Outcome) -> Outcome:
+        """Repair an outcome by rounds and by the fallback."""
+        outcome = self._without_faults(outcome)
+        _, stage = self.runner.steps[self.settings.stage]
         fallback = stage.with_levels(
             tuple(min(level, stage.number_of_eigenvectors) for level in self.settings.fallback_levels)
         )
-        last = self.finished(self._repeated(outcome, spectrum_x, fallback))
+        last = self._from_repeated(outcome, fallback)
         # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
         # fallback is preferred if it looks right and its score is not much worse. Upside-down maps are not
         # preferred, because their scores are worse by more than `score_tolerance`.
@@ -160,46 +159,43 @@ class _Repairer:
         preferred = (
             self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
         )
-        best = last if preferred else min(outcome, last, key=score)
-        return best._replace(suspicious=not self.judge.looks_right(best))
+        return last if preferred else min(outcome, last, key=score)
 
-    def best_of_alternatives(self, best: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Finish alternative maps, and return the best of these outcomes and `best`, repaired if needed."""
-        finished = [self.judge.judged(best)]
-        for number, start in enumerate(islice(alternatives, self.settings.finalists), 2):
-            logger.info("map %d ...", number)
-            outcome = self.runner.run(self.settings.stage, Outcome([], start))
-            finished.append(self.judge.judged(outcome))
-        best = min(finished, key=self.judge.score)
-        if not self.judge.looks_right(best):
-            best = self.repaired(best)
-        return best._replace(suspicious=not self.judge.looks_right(best))
-
-    def _without_faults(self, outcome: Outcome, rounds: int, *, finish: bool = False) -> Outcome:
+    def _without_faults(self, outcome: Outcome) -> Outcome:
         """Run rounds of repair and return the best outcome.
 
-        Each round chooses one kind of fault of the previous map. Vertices with this fault have weight
-        zero. If `finish` is True, each round also runs all stages after the repeated stage.
+        Each round chooses one kind of fault of the previous map. Vertices with this fault have weight zero in
+        the repeated stage.
         """
-        (spectrum_x, _), stage = self.runner.steps[self.settings.stage]
+        (spectrum_x, _), _ = self.runner.steps[self.settings.stage]
         areas = np.asarray(spectrum_x.vertex_areas)
         best = last = outcome
-        for done in range(rounds):
+        for done in range(self.settings.rounds):
             if not (last.successful and best.suspicious and (faults := self.judge.faults(last))):
                 break
             fault = faults[done % len(faults)]
             sound = np.where(pad_rows(fault, len(areas)), 0, areas)
-            last = self._repeated(last, replace(spectrum_x, vertex_areas=jax.device_put(sound)), stage)
-            last = self.finished(last) if finish else self.judge.judged(last)
+            last = self._from_repeated(last, weights=jax.device_put(sound))
             best = min(best, last, key=self.judge.score)
         return best
 
-    def _repeated(self, outcome: Outcome, spectrum_x: Spectrum, stage: Stage) -> Outcome:
-        """Run `stage` instead of the repeated stage, starting from the final map of an outcome.
+    def _from_repeated(
+        self, outcome: Outcome, stage: Stage | None = None, weights: Float[Array, " m"] | None = None
+    ) -> Outcome:
+        """Run the repeated stage and all later stages from the map of an outcome, and judge the result.
 
-        In the returned outcome, `distortion` and `suspicious` are still those of the given outcome.
+        **Arguments:**
+
+        - `outcome`: the outcome. The refinements of its stages before the repeated stage are kept.
+        - `stage`: a stage that runs instead of the repeated stage.
+        - `weights`: the weights of the vertices of X in the repeated stage (m,), instead of their areas.
         """
-        (_, spectrum_y), _ = self.runner.steps[self.settings.stage]
-        found = self.runner.run_one((spectrum_x, spectrum_y), stage, Outcome([], outcome.pointwise_map))
-        before = outcome.refinements[: self.settings.stage]
-        return outcome._replace(refinements=[*before, *found.refinements])
+        position = self.settings.stage
+        (spectrum_x, spectrum_y), usual = self.runner.steps[position]
+        if weights is not None:
+            spectrum_x = replace(spectrum_x, vertex_areas=weights)
+        before = Outcome([], outcome.pointwise_map)
+        repeated = self.runner.run_one((spectrum_x, spectrum_y), stage or usual, before)
+        finished = self.runner.run(position + 1, repeated)
+        kept = outcome.refinements[:position] if len(outcome.refinements) == len(self.runner.steps) else []
+        return self.judge.judged(Outcome([*kept, *finished.refinements], outcome.initial_map))

@@ -117,7 +117,7 @@ class AlternativeSettings:
     repaired: int = 3
     eigenvectors: int = 50
     patch_radius: float = 0.2
-    margin: float = 0.7
+    margin: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -150,10 +150,9 @@ class RepairSettings:
     - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
       stage and all later stages.
     - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
-    - `uncertainty_weight` (Table R13): the weight of the feature regression's uncertainty in the score,
+    - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score,
       relative to the logarithm of the distortion; at least 0. Upside-down maps have a higher uncertainty than
-      correct maps, and mirrored maps have a higher distortion. Weights from 6 to 12 lead to nearly the same
-      choices of maps.
+      correct maps, and mirrored maps have a higher distortion.
     - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
       maps and mirrored maps have larger deformations than right maps.
     - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
@@ -178,7 +177,7 @@ class RepairSettings:
     excessive_area: float = 0.5
     rounds: int = 4
     finalists: int = 2
-    uncertainty_weight: float = 20.0
+    uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
     score_tolerance: float = 0.25
     aligned_preference: float = 0.98
