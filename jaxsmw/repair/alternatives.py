@@ -104,7 +104,7 @@ class Alternatives:
         for outcome in distinct(outcomes, self.judge.same):
             if self.judge.score(outcome) > self.judge.score(outcomes[0]) + self.settings.alternatives.margin:
                 break
-            yield np.asarray(outcome.pointwise_map).astype(np.int64)
+            yield self.prepared.unpadded_map(outcome.pointwise_map)
 
     def _first(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Return the first outcomes that differ from each other."""
@@ -113,7 +113,7 @@ class Alternatives:
     def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Refine each outcome without each of its faults."""
         sound = [(outcome, ~fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
-        maps = [self._reduced(np.asarray(outcome.pointwise_map)) for outcome, _ in sound]
+        maps = [self._reduced(self.prepared.unpadded_map(one.pointwise_map)) for one, _ in sound]
         return self._refined(maps, [mask[self.x.samples.vertices] for _, mask in sound])
 
     def _initial_maps(self) -> Iterator[SampleMap]:

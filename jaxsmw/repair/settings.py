@@ -176,7 +176,7 @@ class RepairSettings:
     negligible_area: float = 0.002
     excessive_area: float = 0.5
     rounds: int = 4
-    finalists: int = 2
+    finalists: int = 3
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
     score_tolerance: float = 0.25
