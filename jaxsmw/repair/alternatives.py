@@ -24,7 +24,7 @@ from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.proxies import Proxy, deformation
 from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.runtime.batches import refine_pairs
+from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
@@ -70,9 +70,10 @@ class Alternatives:
             FeatureRegression(chosen.levels),
             number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
         ).fitted(min(len(self.x.areas), len(self.y.areas)))
-        self._spectra = self._stage.view(
+        spectra = self._stage.view(
             self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
         )
+        self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
         coarse = prepared.spectrum_x.truncate(chosen.eigenvectors)
         self.judge = Judge(self.pair, coarse, settings, self.deformation)
 
@@ -187,27 +188,24 @@ class Alternatives:
         **Arguments:**
 
         - `initial`: the maps.
-        - `sound`: for each map, a mask of samples of X (s,). The first iteration uses only these samples. The
-          default is all samples.
+        - `sound`: for each map, a mask of samples of X (s,). The other samples have weight zero. The default
+          is all samples.
 
         **Returns:** The successful outcomes with maps of vertices, those of the best score first.
         """
-        if not initial:
-            return []
-        first_x, y = self._spectra
-        if sound is None:
-            spectra, pairs = [first_x, y], [(0, 1)] * len(initial)
-        else:
-            spectra = [y] + [
-                replace(first_x, vertex_areas=jnp.where(mask, first_x.vertex_areas, 0)) for mask in sound
-            ]
-            pairs = [(number, 0) for number in range(1, len(spectra))]
+        x, y = self._spectra
+        size, count = len(x.mask), len(self.x.areas)
         outcomes = []
-        for _, found in refine_pairs(
-            spectra, pairs, initial, partial=self.pair.partial, **self._stage.settings
-        ):
+        for number, start in enumerate(initial):
+            weighted = x
+            if sound is not None:
+                areas = jnp.where(pad_rows(sound[number], size), x.vertex_areas, 0)
+                weighted = replace(x, vertex_areas=areas)
+            padded = jax.device_put(pad_rows(start, size).astype(np.int32))
+            found = self._stage.run(weighted, y, padded, partial=self.pair.partial)
             if found.result == RESULTS.successful:
-                everywhere = jax.device_put(self._extended(np.asarray(found.pointwise_map).astype(np.int64)))
+                of_samples = np.asarray(found.pointwise_map)[:count].astype(np.int64)
+                everywhere = jax.device_put(self._extended(of_samples))
                 found = eqx.tree_at(lambda tree: tree.pointwise_map, found, everywhere)
                 outcomes.append(self.judge.judged(Outcome([found], everywhere)))
         return self._sorted(outcomes)
