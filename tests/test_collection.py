@@ -107,6 +107,19 @@ def test_registered_meshes_have_the_template_s_triangulation(found):
     np.testing.assert_allclose(own, template.vertices, atol=1e-3 * np.sqrt(template.area))
 
 
+def test_bad_numbers_of_shapes_are_refused(found):
+    for numbers in ((0, -1), (-3, 0), (0, 99)):
+        for method in (found.registered_mesh, found.pointwise_map):
+            with pytest.raises(InputError, match="shape"):
+                method(*numbers)
+
+
+def test_equal_names_are_numbered(meshes):
+    alike = [replace(mesh, name="mesh") for mesh in meshes[:3]]
+    collection = match_collection(alike, preset="paper", settings=SETTINGS, mirror=False)
+    assert list(collection.names) == ["mesh 0", "mesh 1", "mesh 2"]
+
+
 def test_the_template_can_be_chosen(meshes, work):
     chosen = match_collection(
         meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work, template=3
@@ -485,6 +498,50 @@ def test_the_results_do_not_go_into_the_directory_of_the_meshes(directory, run):
     before = sorted(os.listdir(directory))
     assert_refused(run("collection", directory, "--output", directory), naming="another directory")
     assert sorted(os.listdir(directory)) == before
+
+
+@pytest.mark.parametrize("folder", ["registered", "maps"])
+def test_results_are_not_overwritten_as_inputs(result_directory, run, tmp_path, folder):
+    output = tmp_path / "result"
+    shutil.copytree(result_directory, output)
+    for file in (output / "registered").glob("*.ply"):
+        file.rename(output / folder / f"m{file.name}")
+    before = {file: file.read_bytes() for file in (output / folder).iterdir()}
+    outcome = run("collection", output / folder, "--output", output, *OPTIONS)
+    assert_refused(outcome, naming="lies among the results")
+    assert {file: file.read_bytes() for file in (output / folder).iterdir()} == before
+
+
+def test_given_landmarks_are_not_overwritten(directory, meshes, run, tmp_path):
+    landmarks = tmp_path / "out" / "landmarks" / "shape1.csv"
+    landmarks.parent.mkdir(parents=True)
+    write_landmark_file(landmarks, Landmarks(("a",), meshes[0].vertices[:1]))
+    options = ("--landmarks", landmarks, "--landmarks-of", "shape0.ply")
+    outcome = run("collection", directory, "--output", tmp_path / "out", *OPTIONS, *options)
+    assert_refused(outcome, naming="lies among the results")
+
+
+def test_names_that_are_too_long_are_refused_before_the_computation(meshes, run, tmp_path):
+    for number, stem in enumerate(("x" * 230, "short")):
+        write_mesh(tmp_path / f"{stem}.ply", meshes[number])
+    outcome = run("collection", tmp_path, "--output", tmp_path / "out", *OPTIONS)
+    assert_refused(outcome, naming="too long")
+
+
+def test_a_damaged_summary_and_names_of_any_bytes_do_not_stop_the_results(meshes, run, tmp_path):
+    inputs, output = tmp_path / "in", tmp_path / "out"
+    inputs.mkdir()
+    output.mkdir()
+    for number, name in enumerate(
+        (b"bad\xff.ply", "sch\xf6n.ply".encode(), b"a_ply.ply", b"a.ply", b"a.off")
+    ):
+        write_mesh(inputs / os.fsdecode(name), meshes[number])
+    (output / "collection.json").write_text("[" * 100_000)
+    outcome = run("collection", inputs, "--output", output, *OPTIONS)
+    assert outcome.code == 0, outcome.errors
+    names = json.loads((output / "collection.json").read_text("utf-8"))["shapes"]
+    assert len({shape["name"] for shape in names}) == 5 == len(list((output / "registered").iterdir()))
+    assert len((output / "scores.csv").read_text("utf-8", "surrogateescape").splitlines()) == 6
 
 
 def test_names_with_equal_stems_are_kept_apart(meshes, run, tmp_path):

@@ -1,5 +1,6 @@
 """The parts of collections: graph, cycles, hands, synchronisation and batches."""
 
+from dataclasses import replace
 from itertools import combinations, permutations
 
 import jax
@@ -23,6 +24,7 @@ from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, fin
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.repair.chirality import Decision
 from jaxsmw.stage import Stage
@@ -176,8 +178,6 @@ def body():
 
 def noisy_network(body, edges, wrong, noise, number, seed=0):
     """A network of copies of one body, whose maps are noisy displacements on the surface."""
-    from jaxsmw.geometry.surface_distance import nearest_surface_points
-
     rng = np.random.default_rng(seed)
     maps = {}
     for i, j in edges:
@@ -216,6 +216,22 @@ def test_exact_maps_stay_exact(body):
     network = noisy_network(body, edges, set(), 0.0, 4)
     for points in synchronize(network, 2):
         np.testing.assert_allclose(points.positions(body), body.vertices, atol=1e-6)
+
+
+def test_meshes_far_from_the_origin_are_averaged_as_precisely(body):
+    """In single precision, coordinates near 5e6 have steps of 0.5."""
+    edges = [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)]
+    far = replace(body, vertices=body.vertices + 5e6)
+    near_network = noisy_network(body, edges, set(), 0.01, 4)
+    maps = {key: nearest_surface_points(images, body)[0] for key, images in near_network._images.items()}
+    shifted = Network([body, far, body, far], maps, near_network.errors)
+    unit = np.sqrt(body.area)
+    for shape, (near, moved) in enumerate(
+        zip(synchronize(near_network, 0), synchronize(shifted, 0), strict=True)
+    ):
+        offset = 5e6 if shape in (1, 3) else 0.0
+        distances = moved.positions(shifted.meshes[shape]) - offset - near.positions(body)
+        assert np.abs(distances).max() < 1e-3 * unit
 
 
 def test_unconnected_shapes_are_refused(body):
@@ -322,6 +338,18 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
     monkeypatch.setattr(Stage, "run", refuse)
     found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
     assert len(dict(found)) == len(PAIRS)
+
+
+def test_pairs_may_come_from_an_iterator(three, one_by_one):
+    found = dict(match_pairs(three, (pair for pair in PAIRS[:1]), preset="paper"))
+    np.testing.assert_array_equal(found[0].pointwise_map, one_by_one[0].pointwise_map)
+
+
+def test_programs_are_released_between_pairs(three, monkeypatch):
+    """Each combination of sizes needs its own programs, which would use up the memory maps of the process."""
+    released = []
+    monkeypatch.setattr("jaxsmw.collection.pairs.release_programs", lambda: released.append(1))
+    assert len(dict(match_pairs(three, PAIRS[:2], preset="paper"))) == len(released) == 2
 
 
 def test_bad_pairs_are_refused(three):

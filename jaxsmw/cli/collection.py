@@ -151,8 +151,11 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("reading"):
         landmarks = _read_landmarks(options)
         data, unreadable = _read(files, weld=options.weld)
-    if options.template and Path(options.template).name not in data:
-        raise InputError(f"{options.template}: the template cannot be used: choose another template.")
+    for option in ("template", "landmarks_of", "attributes_of"):
+        if (file := getattr(options, option)) and Path(file).name not in data:
+            raise InputError(
+                f"--{option.replace('_', '-')}: {file} was left out (see above): choose another mesh."
+            )
     directory = make_directory(options.output)
     work = make_directory(directory / "work")
     announce_consequence(
@@ -175,7 +178,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
-    """Return the mesh files of a collection: a dictionary from file names to paths, in natural order.
+    """Return the mesh files of a collection: a dictionary from file names to paths, in alphabetical order.
 
     **Raises:** `InputError` if the directory cannot be read, contains fewer than two mesh files, or does not
     contain an excluded file.
@@ -243,10 +246,34 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
         [*map(str, files.values()), options.landmarks],
         directories=[(options.output, ("collection.json", "index.html", "modes.npz", "scores.csv"))],
     )
+    _refuse_results_as_inputs(options, files)
     if _same(options.output, Path(options.directory)):
         raise InputError(
             f"{options.output}: is the directory of the meshes: choose another directory for the results."
         )
+
+
+# The directories of the results, from which outdated files are removed.
+_RESULTS = ("maps", "registered", "landmarks", "attributes", "work")
+# The longest file name that usual file systems allow, in bytes.
+_LONGEST_NAME = 255
+
+
+def _refuse_results_as_inputs(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
+    """Refuse inputs that the results would replace, and names that are too long for the files of results."""
+    output = Path(os.path.realpath(options.output))
+    for file in filter(None, [*map(str, files.values()), options.landmarks]):
+        path = Path(os.path.realpath(file))
+        if path.is_relative_to(output):
+            inside = path.relative_to(output)
+            if inside.parts[0] in _RESULTS or inside.stem == "mean":
+                raise InputError(
+                    f"{file}: lies among the results in {options.output}, which would replace it: choose "
+                    "another directory for the results."
+                )
+    for name in files:
+        if len(os.fsencode(f".{'x' * 16}{name}_from_template.txt")) > _LONGEST_NAME:
+            raise InputError(f"{name}: the file name is too long for the names of the results: shorten it.")
 
 
 def _same(file: str, other: Path) -> bool:
@@ -329,7 +356,10 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 def _names(data: Mapping[str, MeshData]) -> list[str]:
     """Return the file names without suffix, unless two of these names are equal."""
     stems = [Path(name).stem for name in data]
-    return stems if len(set(stems)) == len(stems) else [name.replace(".", "_") for name in data]
+    for names in (stems, [name.replace(".", "_") for name in data]):
+        if len(set(names)) == len(names):
+            return names
+    return list(data)
 
 
 def _match(
@@ -414,24 +444,28 @@ def _write(
 
     by_name = dict(zip(_names(data), data.values(), strict=True))
     kept = [by_name[name] for name in collection.names]
+    names = dict(zip(data, _names(data), strict=True))
+    sources = {
+        option: _number(collection, names[Path(file).name], file)
+        for option in ("landmarks_of", "attributes_of")
+        if (file := getattr(options, option))
+    }
     files = write_maps(collection, directory)
     files += write_registered(collection, kept[collection.template], directory, options.suffix)
     files += write_model(collection, model, directory, options.suffix)
     if landmarks is not None:
-        source = _number(collection, options.landmarks_of, "the mesh with the landmarks")
         suffix = _landmark_suffix(options.landmarks)
-        written, notes = write_landmarks(collection, source, landmarks, directory, suffix)
+        written, notes = write_landmarks(collection, sources["landmarks_of"], landmarks, directory, suffix)
         files += written
         for note in notes:
             say(f"note: {note}")
     if options.attributes_of:
-        source = _number(collection, options.attributes_of, "the mesh with the attributes")
-        files += write_attributes(collection, source, kept, directory, options.suffix)
+        files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
     shared = _provenance(options)
     changeable = ("edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of")
     settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
     provenance = {**shared, "settings": settings, "machine": machine()}
-    write_summary(collection, measures, directory, provenance, files)
+    write_summary(collection, measures, directory, provenance, [*files, directory / "index.html"])
     template = collection.meshes[collection.template]
     write_collection_page(
         directory / "index.html",
@@ -457,11 +491,11 @@ def _write(
     )
 
 
-def _number(collection: Collection, file: str, what: str) -> int:
-    for name in (Path(file).stem, Path(file).name.replace(".", "_")):
-        if name in collection.names:
-            return collection.names.index(name)
-    raise InputError(f"{file}: {what} was left out of the collection: choose another mesh.")
+def _number(collection: Collection, name: str, file: str) -> int:
+    """Return the number of the mesh with the given name, which was read from `file`."""
+    if name not in collection.names:
+        raise InputError(f"{file}: was left out of the collection: choose another mesh.")
+    return collection.names.index(name)
 
 
 def _show(collection: Collection, measures: Mapping[str, Any], *, scale: bool) -> None:

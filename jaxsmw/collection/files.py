@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +24,8 @@ from jaxsmw.io.mesh_data import MeshData, write_mesh_data
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
+
+logger = logging.getLogger("jaxsmw")
 
 
 def write_maps(collection: Collection, directory: Path) -> list[Path]:
@@ -68,8 +71,15 @@ def write_registered(collection: Collection, template: MeshData, directory: Path
         if collection.mirrored[shape] != collection.mirrored[collection.template]:
             data = _turned(data)
         written.append(folder / f"{collection.names[shape]}{suffix}")
-        write_mesh_data(written[-1], data)
+        _write_mesh(written[-1], data, told=bool(shape))
     return written
+
+
+def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
+    """Write a mesh, and report what its format cannot contain, unless the user was told before."""
+    warnings = write_mesh_data(path, data)
+    for warning in () if told else warnings:
+        logger.warning("%s", warning)
 
 
 def _turned(data: MeshData) -> MeshData:
@@ -97,13 +107,13 @@ def write_attributes(
     **Raises:** `InputError` if a file cannot be written.
     """
     folder = make_directory(directory / "attributes")
-    written = []
+    written: list[Path] = []
     for target, name in enumerate(collection.names):
         if target != source:
             registered = collection.registered_mesh(source, target)
             carried = transfer_attributes(data[source], registered, data[target])
+            _write_mesh(folder / f"{name}{suffix}", carried, told=bool(written))
             written.append(folder / f"{name}{suffix}")
-            write_mesh_data(written[-1], carried)
     return written
 
 
@@ -158,7 +168,10 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
             faces=template.faces,
             weights=model.weights,
         )
-    with atomic_write(directory / "scores.csv") as temporary, temporary.open("w", newline="") as file:
+    with (
+        atomic_write(directory / "scores.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+    ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["mesh", *(f"mode_{number + 1}" for number in range(len(model.modes)))])
         for name, scores in zip(collection.names, model.scores, strict=True):
@@ -236,7 +249,7 @@ def write_summary(
 
 def _listed_files(summary: Path) -> list[str]:
     """Return the files that an earlier summary lists, as far as they lie within its directory."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, RecursionError):
         found = json.loads(summary.read_text("utf-8"))
         listed = found.get("files", []) if isinstance(found, dict) else []
         return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]

@@ -214,7 +214,10 @@ class Collection:
 
         With the registered mesh, `jaxsmw.transfer` transfers landmarks and attributes from `source` to
         `target`.
+
+        **Raises:** `InputError` if there is no shape with a number.
         """
+        self._check_number(source, target)
         if source == self.template:
             return self.registered[target]
         images = self.registered[target].carry(self.registered[source].points_of_target)
@@ -271,7 +274,8 @@ def match_collection(
 
     - `meshes`: at least two meshes of the same kind of body, in any poses, units and triangulations. Each is
       a `Mesh`, or a mesh that `make_mesh` accepts.
-    - `names`: the names of the meshes. The default are the names of the meshes.
+    - `names`: the names of the meshes. The default are the names of the meshes, which are numbered if two
+      names are equal.
     - `preset`: see `match`.
     - `template`: the number of the template. The default is the shape with the smallest sum of errors along
       the best paths to all other shapes (the medoid).
@@ -308,6 +312,8 @@ def match_collection(
     if directory is not None and not Path(directory).is_dir():
         raise InputError(f"{directory}: is not a directory: create it first.")
     given = [_named_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]
+    if len({mesh.name for mesh in given}) < len(given):
+        given = [replace(mesh, name=f"{mesh.name} {number}") for number, mesh in enumerate(given)]
     return _Matcher(given, choose_preset(preset), settings, seed, directory, executor, devices, progress).run(
         template, mirror, stiffness
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import jax
 
@@ -24,7 +24,7 @@ _PAIRS_PER_DEVICE = 64
 
 def match_pairs(
     meshes: Sequence[Mesh | MeshLike],
-    pairs: Sequence[tuple[int, int]],
+    pairs: Iterable[tuple[int, int]],
     *,
     preset: PresetName | Preset = DEFAULT_PRESET,
     alternatives: bool = True,
@@ -53,8 +53,9 @@ def match_pairs(
     `ArithmeticError` if the refinement of a pair fails numerically.
     """
     given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
+    pairs = list(pairs)
     for number, pair in enumerate(pairs):
-        if len(pair) != 2 or not all(0 <= shape < len(given) for shape in pair):
+        if len(pair) != 2 or any(shape not in range(len(given)) for shape in pair):
             raise InputError(
                 f"pair {number} is {tuple(pair)}, but there are {len(given)} meshes: give the numbers of two "
                 "meshes, counted from 0."

@@ -173,9 +173,11 @@ class Network:
             if shape == template:
                 return points[shape]
             unit, neighbors = self.units[shape], self._neighbors[shape]
+            # Single precision cannot resolve a mesh that lies far from the origin.
+            center = self.meshes[shape].vertices.mean(axis=0)
             weights = np.array([1 / max(self.error(i, shape), 1e-3) ** 2 for i in neighbors])
-            candidates = np.stack([self.carried(points[i], i, shape) for i in neighbors]) / unit
-            start = points[shape].positions(self.meshes[shape]) / unit
+            candidates = np.stack([self.carried(points[i], i, shape) - center for i in neighbors]) / unit
+            start = (points[shape].positions(self.meshes[shape]) - center) / unit
             n, size = len(start), padded_size(len(start))
             # Maps and vertices are padded, so that all shapes share one compiled program.
             padding = ((0, self._most - len(neighbors)), (0, size - n), (0, 0))
@@ -185,7 +187,7 @@ class Network:
                 jnp.asarray(pad_rows(start, size), jnp.float32),
                 jnp.asarray(self.settings.robust_scale, jnp.float32),
             )
-            return self._project(np.asarray(found, np.float64)[:n] * unit, shape)
+            return self._project(np.asarray(found, np.float64)[:n] * unit + center, shape)
 
         return [moved(shape) for shape in range(len(self.meshes))]
 

@@ -3,13 +3,15 @@
 import { rove } from "./rove.js";
 
 const NAMED = 30; // the most shapes whose names are written next to the nodes
+const NAMED_SCORES = 12; // the most shapes whose names are written next to their scores
 const PICTURED = 40; // the most shapes that the graph shows as pictures
 const LONGEST_NAME = 14;
 const SEPARATIONS = 200; // rounds that move overlapping nodes apart
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
 const byId = (id) => document.getElementById(id);
-const short = (name) => (name.length > LONGEST_NAME ? `${name.slice(0, LONGEST_NAME - 1)}…` : name);
+// Names often differ at their ends alone, so long names lose their middle.
+const short = (name) => (name.length > LONGEST_NAME ? `${name.slice(0, 5)}…${name.slice(6 - LONGEST_NAME)}` : name);
 const percent = (share) => `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`;
 
 function svg(tag, attributes = {}, ...children) {
@@ -59,7 +61,7 @@ export function startPlots({ data, open, compare }) {
   }
 
   /** Adds one node per shape at these places. `radius` is the size of the nodes, in pixels. */
-  function addNodes(picture, places, radius, { withPictures, describe }) {
+  function addNodes(picture, places, radius, { withPictures, withNames, describe }) {
     const nodes = names.map((name, index) => {
       const [x, y] = places[index];
       const node = svg("g", { class: "node", role: "button", "data-shape": index, "aria-label": name, transform: `translate(${x} ${y})` });
@@ -67,9 +69,7 @@ export function startPlots({ data, open, compare }) {
         node.append(svg("circle", { class: "disc", r: radius }));
         if (pictures[index]) addPicture(node, index, radius);
       } else node.append(svg("circle", { class: "dot", r: radius }));
-      if (withPictures && names.length <= NAMED) {
-        node.append(svg("text", { y: radius + 13 }, short(name)));
-      }
+      if (withNames) node.append(svg("text", { y: radius + 13 }, short(name)));
       node.classList.toggle("template", index === data.template);
       explain(node, () => [name, describe(index), pictures[index]]);
       return node;
@@ -140,7 +140,7 @@ export function startPlots({ data, open, compare }) {
     });
     lines.sort((a, b) => a.doubtful - b.doubtful); // doubtful lines are drawn over the other lines
     picture.append(...lines.flatMap(({ elements }) => elements));
-    const nodes = addNodes(picture, places, radius, { withPictures, describe: kind });
+    const nodes = addNodes(picture, places, radius, { withPictures, withNames: withPictures && names.length <= NAMED, describe: kind });
     return { picture, nodes, pictureRadius: withPictures ? radius : 0 };
   }
 
@@ -171,7 +171,7 @@ export function startPlots({ data, open, compare }) {
       const words = `${signed(of(index)[0])} σ across, ${signed(of(index)[1])} σ up`;
       return index === data.template ? `the template; ${words}` : words;
     };
-    const nodes = addNodes(picture, places, names.length > 40 ? 5 : 7, { withPictures: false, describe });
+    const nodes = addNodes(picture, places, names.length > 40 ? 5 : 7, { withPictures: false, withNames: names.length <= NAMED_SCORES, describe });
     const cross = svg("path", { class: "cursor", d: "M-8 0H8M0 -8V8" });
     picture.append(cross);
     const place = () => {
