@@ -136,9 +136,11 @@ class _Repairer:
         for number, start in enumerate(islice(alternatives, self.settings.finalists), 1):
             logger.info("alternative map %d ...", number)
             outcomes.append(self._from_repeated(Outcome([], start)))
-        best = min(outcomes, key=self.judge.score)
+        best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
-            best = self._by_rounds(best)
+            # A right map with a fault can have a worse score than a wrong map without faults.
+            faulty = [outcome for outcome in others[:1] if self.judge.faults(outcome)]
+            best = min(map(self._by_rounds, [best, *faulty]), key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
