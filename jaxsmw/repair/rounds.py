@@ -43,7 +43,9 @@ def refine_in_stages(
        and the first outcome, the outcome with the best score is kept. If it looks right, repair ends.
     2. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
        with a fault in the previous map have weight zero. If a map has both orientation reversal and
-       discontinuous parts, successive rounds leave out these two faults alternately.
+       discontinuous parts, successive rounds leave out these two faults alternately. If the outcome of the
+       second-best score has faults, it is repaired in the same way. It is used if all its faults disappear
+       and its score is the best.
     3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
@@ -138,9 +140,11 @@ class _Repairer:
             outcomes.append(self._from_repeated(Outcome([], start)))
         best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
-            # A right map with a fault can have a worse score than a wrong map without faults.
-            faulty = [outcome for outcome in others[:1] if self.judge.faults(outcome)]
-            best = min(map(self._by_rounds, [best, *faulty]), key=self.judge.score)
+            # A right map with a fault can have a worse score than a wrong map without faults. The fallback
+            # lowers the scores of wrong maps as well, so only the removal of all faults counts.
+            faulty = (outcome for outcome in others[:1] if self.judge.faults(outcome))
+            mended = [other for other in map(self._by_rounds, faulty) if not self.judge.faults(other)]
+            best = min([self._by_rounds(best), *mended], key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
