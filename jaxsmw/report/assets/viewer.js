@@ -1,4 +1,4 @@
-/* Built from the viewer's sources with SHA-256 948c555fb89baec7780a5f3e5758ee844c3b2773364e81def92adfa757491227.
+/* Built from the viewer's sources with SHA-256 98cf4ab42448c297565022c5b64c1b6daaf1531b53ccb5c4589be1565367427c.
 Contains three.js:
 
 The MIT License
