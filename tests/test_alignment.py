@@ -75,6 +75,7 @@ def _count_calls(monkeypatch, name):
     return calls
 
 
+@pytest.mark.slow
 def test_asymmetric_shapes_are_matched_from_both_initial_maps(monkeypatch):
     """The lump differs from its mirror image, so `match` keeps the better of two maps."""
     noise = 0.004 * np.random.default_rng(1).normal(size=LUMP.vertices.shape)
@@ -109,6 +110,7 @@ def test_a_bent_shape_is_matched_from_descriptors():
     assert found.init == "shot" and apart.mean() < 0.02 * target.area**0.5
 
 
+@pytest.mark.slow
 def test_a_mirrored_asymmetric_shape_is_aligned_as_its_mirror_image():
     settings = replace(PRESETS["accurate"], repair=RepairSettings(aligned_preference=0.0))
     found = match(LUMP, _turned(LUMP.mirrored()), preset=settings)

@@ -54,6 +54,7 @@ def test_descriptors_of_a_mirror_image_are_those_of_the_surface_in_another_order
     assert np.abs(of_itself - of_image).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opposite", [False, True])
 def test_auto_finds_the_hand_of_a_lump(lump, opposite):
     target = turned(lump.mirrored() if opposite else lump)
@@ -79,6 +80,7 @@ def test_the_given_hand_is_used(lump):
     np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
 
 
+@pytest.mark.slow
 def test_a_mirrored_result_is_in_terms_of_the_source():
     lump = bumpy_mesh(3)
     target = turned(lump.mirrored())
@@ -131,6 +133,7 @@ def test_decisions():
     assert decide(-clear, nearly_symmetric) == (False, -clear, False, False)
 
 
+@pytest.mark.slow
 def test_a_shape_that_is_its_own_mirror_image_has_no_asymmetry(lump):
     creature = creature_pair(vertices=1500)
     for mesh_x, mesh_y, low, high in (

@@ -474,6 +474,7 @@ def test_surface_points_are_written_and_measured(run, pair, tmp_path):
 QUALITY = re.compile(r"quality:     (.*)\n")
 
 
+@pytest.mark.slow
 def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
     computed, expected_error = [], jaxsmw.Correspondence.expected_error
 

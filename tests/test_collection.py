@@ -528,6 +528,7 @@ def test_names_that_are_too_long_are_refused_before_the_computation(meshes, run,
     assert_refused(outcome, naming="too long")
 
 
+@pytest.mark.slow
 def test_a_damaged_summary_and_names_of_any_bytes_do_not_stop_the_results(meshes, run, tmp_path):
     inputs, output = tmp_path / "in", tmp_path / "out"
     inputs.mkdir()

@@ -128,6 +128,7 @@ def test_one_shape_is_shown_without_modes(tmp_path: Path) -> None:
     assert "Matched pairs</dt>" not in page
 
 
+@pytest.mark.slow
 def test_a_hundred_shapes_fit_in_8_megabytes(tmp_path: Path) -> None:
     mesh = creature("biped", vertices=5000)
     shapes = mesh.vertices + 0.002 * np.random.default_rng(0).normal(size=(100, 5000, 3))

@@ -66,6 +66,7 @@ def test_correspondence_transfers_colors() -> None:
     assert np.array_equal(window[inside], target[..., :3][inside])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_correspondence_shows_errors_on_the_source() -> None:
     n = len(TALL.vertices)
