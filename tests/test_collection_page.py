@@ -69,6 +69,18 @@ def test_page_holds_the_aligned_shapes_and_the_model(tmp_path: Path) -> None:
     assert any(error is None for _, _, error, _, _ in edges)
 
 
+@pytest.mark.parametrize("up", ["y", None])
+@pytest.mark.filterwarnings("error")
+def test_a_shape_on_which_the_template_collapses_is_shown(tmp_path: Path, up: Any) -> None:
+    """A tiny or very different mesh can give such a shape. All vertices lie at the ends of one segment."""
+    arguments = collection()
+    ends = np.where(arguments["registered"][0][:, :1] > 0, 1.0, 0.0) * [1, 2, 3]
+    registered = [*arguments["registered"][:2], ends]
+    changes = {"names": ["rest", "stand", "segment"], "registered": registered, "edges": [], "up": up}
+    _, data, _ = written(tmp_path / "page.html", **changes, model=shape_model(registered))
+    assert len(data["shapes"]) == 3 and np.isfinite(data["azimuth"])
+
+
 def test_page_loads_nothing_and_escapes_texts(tmp_path: Path) -> None:
     names = [HOSTILE, *collection()["names"][1:]]
     edges = [PageEdge(0, 1, 3.0, True, HOSTILE)]

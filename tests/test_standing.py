@@ -126,8 +126,10 @@ def test_stand_orients_faces_consistently() -> None:
 
 @pytest.mark.usefixtures("unchecked")
 def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
-    with pytest.raises(InputError, match="nothing to draw"):
-        stand(replace(TALL, vertices=0 * TALL.vertices))
+    for flattened in ([0, 0, 0], [0, 1, 0]):
+        for function in (stand, guess_up):
+            with pytest.raises(InputError, match="nothing to draw"):
+                function(replace(TALL, vertices=TALL.vertices * flattened))
     with pytest.raises(InputError, match="choose x, y, z"):
         stand(TALL, "w")  # type: ignore[arg-type]
 

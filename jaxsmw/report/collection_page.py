@@ -108,7 +108,12 @@ def write_collection_page(
     # Without a model, the shapes are aligned in the same way, and their modes are not shown.
     shown_model = model or shape_model(registered, weights=first.vertex_areas, reference=template)
     template_mesh = replace(first, vertices=shown_model.aligned[template])
-    some = _some(len(registered), template)
+    some = [
+        i
+        for i in _some(len(registered), template)
+        # On a very bad shape, the template can collapse to a curve, which has no upright position.
+        if i == template or replace(first, vertices=shown_model.aligned[i]).area > 0
+    ]
     if up is None:
         # All shapes are aligned, so each shape gives a guess.
         guesses = [guess_up(replace(first, vertices=shown_model.aligned[i])) for i in some]

@@ -68,10 +68,7 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
 
     **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
     """
-    if not mesh.area > 0:
-        raise InputError(
-            f"{mesh.name}: there is nothing to draw because the faces have no area; give a surface."
-        )
+    _check_area(mesh)
     if up is None:
         up = guess_up(mesh)
     else:
@@ -84,6 +81,13 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
         vertices=vertices - (used.min(axis=0) + used.max(axis=0)) / 2,
         faces=faces.astype(np.int64),
     )
+
+
+def _check_area(mesh: Mesh) -> None:
+    if not mesh.area > 0:
+        raise InputError(
+            f"{mesh.name}: there is nothing to draw because the faces have no area; give a surface."
+        )
 
 
 def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
@@ -150,7 +154,10 @@ def guess_up(mesh: Mesh) -> Axis:
     - `mesh`: a surface of positive area.
 
     **Returns:** The axis: `"y"`, `"z"` or `"-y"`.
+
+    **Raises:** `InputError` if the mesh has no area.
     """
+    _check_area(mesh)
     unit = np.sqrt(mesh.area)
     center = mesh.vertex_areas @ mesh.vertices / mesh.area
     spread = np.sqrt(mesh.vertex_areas @ (mesh.vertices - center) ** 2)
@@ -171,7 +178,8 @@ def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"]
     two points if an edge of the mesh joins the two cells.
     """
     used = mesh.vertices[mesh.referenced_vertices]
-    keys = np.floor((used - used.min(axis=0)) / cell).astype(np.int64)
+    # A thin mesh may be more cells long than an integer can count, so the keys remain floats.
+    keys = np.floor((used - used.min(axis=0)) / cell)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     cells = cells.ravel()
     points = np.stack([np.bincount(cells, coordinate) / counts for coordinate in used.T], axis=1)
