@@ -270,6 +270,55 @@ def test_nodes_of_the_graph_do_not_overlap(page: CollectionPage) -> None:
     assert np.ptp(places[:, 0]) < box["width"] and np.ptp(places[:, 1]) < box["height"]
 
 
+@pytest.mark.parametrize("width", [1400, 390])
+def test_names_and_nodes_of_a_large_graph_do_not_overlap(browser: Any, tmp_path: Path, width: int) -> None:
+    """On a phone there is no room for names. The layout places many of the shapes near each other."""
+    generator = np.random.default_rng(0)
+    arguments = collection()
+    shapes = [arguments["registered"][i % 5] * generator.normal(1, 0.05, 3) for i in range(25)]
+    names = [f"a rather long name {i}" if i % 2 else f"{i}" for i in range(25)]
+    edges = [PageEdge(i, j, 5.0, i % 3 == 0, "") for i in range(25) for j in (i - 1, i - 7) if j >= 0]
+    model = shape_model(shapes)
+    changes = {"names": names, "registered": shapes, "edges": edges, "model": model, "warning": "Look."}
+    write_collection_page(tmp_path / "page.html", **(arguments | changes), up="y")
+    page = CollectionPage(browser, tmp_path / "page.html", width=width, height=900)
+    # A node with its name is one box.
+    script = """
+        return [...document.querySelectorAll("#graph .node")].map((node) =>
+            [...node.querySelectorAll(".disc, text")].map((e) => e.getBoundingClientRect())).map((boxes) =>
+            ["left", "top", "right", "bottom"].map((side, i) =>
+                Math[i < 2 ? "min" : "max"](...boxes.map((box) => box[side]))));
+    """
+    boxes = np.array(page.run(script))
+    assert len(boxes) == 25
+    for i, one in enumerate(boxes):
+        apart = (boxes[:, :2] >= one[2:] - 1).any(axis=1) | (boxes[:, 2:] <= one[:2] + 1).any(axis=1)
+        assert np.flatnonzero(~apart).tolist() == [i]
+    box = page.run(
+        "const b = document.querySelector('#graph').getBoundingClientRect(); return [b.left, b.right]"
+    )
+    assert boxes[:, 0].min() >= box[0] and boxes[:, 2].max() <= box[1]
+    assert len(page.browser.find_elements("css selector", "#graph text")) == (25 if width == 1400 else 0)
+    # The warning does not touch the sentence above it.
+    script = "const b = (s) => document.querySelector(s).getBoundingClientRect(); return b('header .fault').top - b('.lead').bottom"
+    assert page.run(script) > 8
+
+
+def test_badges_are_above_the_bodies(page: CollectionPage) -> None:
+    """In the small pictures, the rows beside the badges contain nothing but background."""
+    script = """
+        const thumb = document.querySelector(".thumb"), canvas = thumb.querySelector("canvas");
+        const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+        const first = [...data.keys()].find((at) => at % 4 === 3 && data[at] > 128);
+        const style = getComputedStyle(canvas), box = canvas.getBoundingClientRect();
+        const top = parseFloat(style.paddingTop);
+        const body = box.top + top + (Math.floor(first / 4 / width) / height) * (box.height - top);
+        return [...thumb.querySelectorAll("small, .badge")].map((e) => body - e.getBoundingClientRect().bottom);
+    """
+    distances = page.run(script)
+    assert len(distances) == 2 and min(distances) >= 0
+
+
 def test_sliders_deform_the_mean(page: CollectionPage) -> None:
     model = collection()["model"]
     data = embedded(page.path.read_text("utf-8"))
@@ -414,4 +463,8 @@ def test_small_collections_are_shown(browser: Any, tmp_path: Path, count: int) -
     assert page.find("#deform").is_displayed() == page.find("#scores").is_displayed() == (count == 2)
     assert len(browser.find_elements("css selector", ".mode")) == count - 1
     assert vertex_in_front(page, "b") >= 0
+    # A plot of one mode has no direction up, so all points are on one line.
+    assert not page.find("#upward").is_displayed()
+    script = "return [...document.querySelectorAll('#scores .dot')].map((e) => e.getBoundingClientRect().y)"
+    assert np.ptp(page.run(script) or [0]) == 0
     assert browser.get_log("browser") == []

@@ -2,11 +2,12 @@
 
 import { rove } from "./rove.js";
 
-const NAMED = 30; // the most shapes whose names are written next to the nodes
+const CROWDED = 0.5; // if nodes and names need more than this share of the graph, the names are left out
 const NAMED_SCORES = 12; // the most shapes whose names are written next to their scores
 const PICTURED = 40; // the most shapes that the graph shows as pictures
 const LONGEST_NAME = 14;
-const SEPARATIONS = 200; // rounds that move overlapping nodes apart
+const SEPARATIONS = 1000; // rounds that move overlapping nodes apart
+const NAME_HEIGHT = 16; // pixels, from a node to the lower end of its name
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
 const byId = (id) => document.getElementById(id);
@@ -21,8 +22,17 @@ function svg(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Returns the widths of short names next to the nodes, in pixels. */
+function measure(names) {
+  const pen = document.createElement("canvas").getContext("2d");
+  const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
+  pen.font = `${0.72 * rem}px system-ui, sans-serif`; // as in collection.html
+  return names.map((name) => pen.measureText(short(name)).width);
+}
+
 export function startPlots({ data, open, compare }) {
   const { names, edges, model } = data;
+  const lengths = measure(names);
   const pictures = names.map(() => null); // data URLs
   let marks = names.map(() => false);
   let cursor = null; // the scores of the sliders
@@ -60,8 +70,9 @@ export function startPlots({ data, open, compare }) {
     node.querySelector(".disc").after(image);
   }
 
-  /** Adds one node per shape at these places. `radius` is the size of the nodes, in pixels. */
-  function addNodes(picture, places, radius, { withPictures, withNames, describe }) {
+  /** Adds one node per shape at these places. `radius` is the size of the nodes, in pixels. The tooltip always shows
+   * the name of a node, and `named` says which nodes show it permanently. */
+  function addNodes(picture, places, radius, { withPictures, named, describe }) {
     const nodes = names.map((name, index) => {
       const [x, y] = places[index];
       const node = svg("g", { class: "node", role: "button", "data-shape": index, "aria-label": name, transform: `translate(${x} ${y})` });
@@ -69,7 +80,7 @@ export function startPlots({ data, open, compare }) {
         node.append(svg("circle", { class: "disc", r: radius }));
         if (pictures[index]) addPicture(node, index, radius);
       } else node.append(svg("circle", { class: "dot", r: radius }));
-      if (withNames) node.append(svg("text", { y: radius + 13 }, short(name)));
+      if (named[index]) node.append(svg("text", { y: radius + 13 }, short(name)));
       node.classList.toggle("template", index === data.template);
       explain(node, () => [name, describe(index), pictures[index]]);
       return node;
@@ -83,30 +94,30 @@ export function startPlots({ data, open, compare }) {
 
   // ---- The graph of matched pairs
 
-  /** Moves overlapping nodes apart, and keeps all nodes in the box. */
-  function separate(places, least, [left, top, right, bottom]) {
+  /** Moves overlapping nodes with their names apart, and keeps them in the picture. A node with its name is a box of
+   * the given width, from `above` to `below` pixels around its place. */
+  function separate(places, widths, [above, below], width, height) {
+    const gap = 6;
     for (let round = 0; round < SEPARATIONS; round++) {
       let moved = false;
       for (let i = 0; i < places.length; i++) {
         for (let j = 0; j < i; j++) {
-          let [x, y] = [places[i][0] - places[j][0], places[i][1] - places[j][1]];
-          const distance = Math.hypot(x, y);
-          if (distance >= least) continue;
+          const offset = [places[i][0] - places[j][0], places[i][1] - places[j][1]];
+          const overlap = [(widths[i] + widths[j]) / 2 + gap - Math.abs(offset[0]), above + below + gap - Math.abs(offset[1])];
+          if (Math.min(...overlap) <= 0.1) continue;
           moved = true;
           // Nodes at the same place part in different directions.
-          if (distance < 1e-6) [x, y] = [Math.cos(GOLDEN * i), Math.sin(GOLDEN * i)];
-          else [x, y] = [x / distance, y / distance];
-          const push = 0.5 * (least - distance);
-          places[i][0] += push * x;
-          places[i][1] += push * y;
-          places[j][0] -= push * x;
-          places[j][1] -= push * y;
+          if (Math.hypot(...offset) < 1e-6) offset.splice(0, 2, Math.cos(GOLDEN * i), Math.sin(GOLDEN * i));
+          const axis = Number(overlap[1] < overlap[0]);
+          const push = (Math.sign(offset[axis]) || 1) * 0.5 * overlap[axis];
+          places[i][axis] += push;
+          places[j][axis] -= push;
         }
       }
-      for (const place of places) {
-        place[0] = Math.max(left, Math.min(right, place[0]));
-        place[1] = Math.max(top, Math.min(bottom, place[1]));
-      }
+      places.forEach((place, i) => {
+        place[0] = Math.max(widths[i] / 2, Math.min(width - widths[i] / 2, place[0]));
+        place[1] = Math.max(above, Math.min(height - below, place[1]));
+      });
       if (!moved) break;
     }
   }
@@ -116,7 +127,10 @@ export function startPlots({ data, open, compare }) {
     const height = Math.round(Math.max(280, Math.min(0.78 * width, 560)));
     const withPictures = names.length <= PICTURED;
     const radius = (narrow ? 0.75 : 1) * (names.length <= 16 ? 30 : withPictures ? 22 : 7);
-    const margin = radius + (names.length <= NAMED ? 20 : 6);
+    const widest = lengths.map((length) => Math.max(length, 2 * radius));
+    const space = widest.reduce((sum, length) => sum + length * (2 * radius + NAME_HEIGHT), 0);
+    const withNames = withPictures && space <= CROWDED * width * height;
+    const margin = radius + (withNames ? NAME_HEIGHT : 0) + 4; // the outline of an open node is thick
     const [lowX, highX] = [0, 1].map((end) => Math[end ? "max" : "min"](...data.layout.map(([x]) => x)));
     const [lowY, highY] = [0, 1].map((end) => Math[end ? "max" : "min"](...data.layout.map(([, y]) => y)));
     const factor = Math.min((width - 2 * margin) / (highX - lowX || 1e-9), (height - 2 * margin) / (highY - lowY || 1e-9), 1e9);
@@ -124,8 +138,7 @@ export function startPlots({ data, open, compare }) {
       width / 2 + factor * (x - (lowX + highX) / 2),
       height / 2 - factor * (y - (lowY + highY) / 2),
     ]);
-    const gap = names.length <= NAMED ? 22 : 6; // room for names
-    separate(places, 2 * radius + gap, [margin, radius + 6, width - margin, height - margin]);
+    separate(places, withNames ? widest : names.map(() => 2 * radius), [radius + 4, margin], width, height);
 
     const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Graph of matched pairs" });
     const lines = edges.map((edge, index) => {
@@ -140,42 +153,58 @@ export function startPlots({ data, open, compare }) {
     });
     lines.sort((a, b) => a.doubtful - b.doubtful); // doubtful lines are drawn over the other lines
     picture.append(...lines.flatMap(({ elements }) => elements));
-    const nodes = addNodes(picture, places, radius, { withPictures, withNames: withPictures && names.length <= NAMED, describe: kind });
+    const nodes = addNodes(picture, places, radius, { withPictures, named: names.map(() => withNames), describe: kind });
     return { picture, nodes, pictureRadius: withPictures ? radius : 0 };
   }
 
   // ---- The scores
 
   function drawScores(width) {
-    const height = Math.round(Math.max(280, Math.min(0.78 * width, 560)));
+    // One mode alone has no direction up.
+    const flat = model.modes.length === 1;
+    const height = flat ? 120 : Math.round(Math.max(280, Math.min(0.78 * width, 560)));
     const [across, up] = [byId("across").value, byId("upward").value].map(Number);
-    const of = (index) => [model.scores[index][across], model.scores[index][up] ?? 0];
+    const of = (index) => [model.scores[index][across], flat ? 0 : model.scores[index][up]];
     const limit = 1.12 * Math.max(3, ...names.flatMap((_, index) => of(index).map(Math.abs)));
     const [left, bottom, edge] = [14, 22, 8];
     const toX = (score) => left + ((score + limit) / (2 * limit)) * (width - left - edge);
     const toY = (score) => edge + ((limit - score) / (2 * limit)) * (height - bottom - edge);
+    /** Returns which names have enough room: they are inside the picture, and cover no node and no other name. */
+    const roomFor = (places, radius) => {
+      const boxes = places.map(([x, y]) => [x - radius, x + radius, y - radius, y + radius]);
+      return places.map(([x, y], index) => {
+        const half = lengths[index] / 2;
+        const box = [x - half, x + half, y + radius, y + radius + NAME_HEIGHT];
+        const covers = (other) => box[0] < other[1] && other[0] < box[1] && box[2] < other[3] && other[2] < box[3];
+        if (box[0] < 0 || box[1] > width || boxes.some(covers)) return false;
+        boxes.push(box);
+        return true;
+      });
+    };
     const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Scores of the shapes" });
     for (let tick = -Math.floor(limit); tick <= limit; tick++) {
       const opacity = tick ? 0.5 : 1;
       picture.append(
         svg("line", { class: "axis", opacity, x1: toX(tick), x2: toX(tick), y1: edge, y2: height - bottom }),
-        svg("line", { class: "axis", opacity, x1: left, x2: width - edge, y1: toY(tick), y2: toY(tick) }),
       );
+      if (!flat || !tick) picture.append(svg("line", { class: "axis", opacity, x1: left, x2: width - edge, y1: toY(tick), y2: toY(tick) }));
       const label = `${tick}`.replace("-", "−");
       picture.append(svg("text", { class: "tick", x: toX(tick), y: height - 7 }, label));
-      if (tick) picture.append(svg("text", { class: "tick", x: 6, y: toY(tick) + 4 }, label));
+      if (tick && !flat) picture.append(svg("text", { class: "tick", x: 6, y: toY(tick) + 4 }, label));
     }
     const places = names.map((_, index) => of(index).map((score, axis) => (axis ? toY(score) : toX(score))));
     const signed = (score) => score.toFixed(1).replace("-", "−");
     const describe = (index) => {
-      const words = `${signed(of(index)[0])} σ across, ${signed(of(index)[1])} σ up`;
+      const words = `${signed(of(index)[0])} σ across${flat ? "" : `, ${signed(of(index)[1])} σ up`}`;
       return index === data.template ? `the template; ${words}` : words;
     };
-    const nodes = addNodes(picture, places, names.length > 40 ? 5 : 7, { withPictures: false, withNames: names.length <= NAMED_SCORES, describe });
+    const radius = names.length > 40 ? 5 : 7;
+    const named = names.length <= NAMED_SCORES ? roomFor(places, radius) : [];
+    const nodes = addNodes(picture, places, radius, { withPictures: false, named, describe });
     const cross = svg("path", { class: "cursor", d: "M-8 0H8M0 -8V8" });
     picture.append(cross);
     const place = () => {
-      if (cursor) cross.setAttribute("transform", `translate(${toX(cursor[across])} ${toY(cursor[up] ?? 0)})`);
+      if (cursor) cross.setAttribute("transform", `translate(${toX(cursor[across])} ${toY(flat ? 0 : cursor[up])})`);
       cross.setAttribute("visibility", cursor ? "visible" : "hidden");
     };
     place();
@@ -214,6 +243,7 @@ export function startPlots({ data, open, compare }) {
   let scores = null;
   if (model && model.modes.length) {
     byId("plot").hidden = false;
+    byId("upward").parentElement.hidden = model.modes.length === 1;
     for (const [id, chosen] of [["across", 0], ["upward", Math.min(1, model.modes.length - 1)]]) {
       byId(id).append(...model.shares.map((share, k) => new Option(`Mode ${k + 1} (${percent(share)})`, k, false, k === chosen)));
       byId(id).addEventListener("change", () => scores.draw());

@@ -1,4 +1,4 @@
-/* Built from the viewer's sources with SHA-256 98cf4ab42448c297565022c5b64c1b6daaf1531b53ccb5c4589be1565367427c.
+/* Built from the viewer's sources with SHA-256 2585f25ae7c3bb241b2f00a2223e4dc91b3880ad758ea3a43f9a81d41ec96394.
 Contains three.js:
 
 The MIT License
