@@ -1,5 +1,6 @@
 """The parts of collections: graph, cycles, hands, synchronisation and batches."""
 
+import warnings
 from dataclasses import replace
 from itertools import combinations, permutations
 
@@ -21,6 +22,7 @@ from jaxsmw.collection import (
     synchronize,
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
+from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
@@ -39,6 +41,17 @@ def is_connected(edges, number):
     rows, columns = np.array(edges).T
     graph = coo_array((np.ones(len(edges)), (rows, columns)), shape=(number, number))
     return connected_components(graph, directed=False)[0] == 1
+
+
+def test_a_coarse_mesh_is_named_once_with_advice_that_fits():
+    bodies = [replace(creature("biped", vertices=500, seed=seed), name=f"body {seed}") for seed in range(2)]
+    with warnings.catch_warnings(record=True) as issued:
+        warnings.simplefilter("always")
+        shapes, _ = prepare_shapes(bodies, PRESETS["fast"])
+        prepare_pair(*shapes)
+    texts = [str(warning.message) for warning in issued]
+    assert [text.split(":")[0] for text in texts] == ["body 0", "body 1"]
+    assert all(text.endswith("use a finer mesh.") for text in texts)
 
 
 # ----------------------------------------------------------------------------------------------------- graph

@@ -104,6 +104,8 @@ def test_too_coarse_meshes_are_refused():
     coarse = make_mesh(*sphere_mesh(1))
     with pytest.raises(InputError, match="--init wks"):
         shot_descriptors(coarse)
+    with pytest.raises(InputError, match=r"use a finer mesh\.$"):
+        shot_descriptors(coarse, required=True)
     assert np.isfinite(shot_descriptors(coarse, radius=0.5)).all()
     vertices, faces = sphere_mesh(4)
     far = np.concatenate([vertices, np.eye(3) + 50])

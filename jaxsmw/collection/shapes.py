@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -20,6 +21,11 @@ from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.pair import Pair, check_eigenvalues
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
+
+
+def _warned_already() -> warnings.catch_warnings[None]:
+    """Ignore warnings about coarse meshes in the block, because `prepare_shape` has issued them."""
+    return warnings.catch_warnings(action="ignore", category=UserWarning)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +99,8 @@ def prepare_shape(
         samples = jax.device_put(farthest_point_samples(mesh, preset.number_of_samples))
     check_eigenvalues(mesh, spectrum)
     compared = compared_samples(mesh)
-    shot_descriptors(mesh, samples=compared)  # kept in the cache, and refuses meshes that are too coarse
+    # The descriptors are kept in the cache. Meshes that are too coarse are refused.
+    shot_descriptors(mesh, samples=compared, required=True)
     return PreparedShape(mesh, spectrum, compared, samples)
 
 
@@ -102,7 +109,8 @@ def describe_shape(shape: PreparedShape, axes: DescriptorAxes) -> PreparedShape:
 
     **Raises:** `InputError` if SHOT is not defined on the mesh.
     """
-    return replace(shape, spectrum=axes.describe(shape.sampled, shape.spectrum))
+    with _warned_already():
+        return replace(shape, spectrum=axes.describe(shape.sampled, shape.spectrum))
 
 
 def prepare_pair(
@@ -117,7 +125,8 @@ def prepare_pair(
     """
     pair = Pair(x.mesh, y.mesh)
     sampled = SampledPair(pair, x.sampled, y.sampled)
-    start = nearest_map(sampled, *sampled.shot) if init is None else init
+    with _warned_already():
+        start = nearest_map(sampled, *sampled.shot) if init is None else init
     samples = None if x.samples is None or y.samples is None else (x.samples, y.samples)
     return PreparedPair(
         pair, x.spectrum, y.spectrum, "shot" if init is None else init, start, samples, sampled
@@ -126,7 +135,8 @@ def prepare_pair(
 
 def descriptor_axes(shapes: Sequence[PreparedShape], preset: Preset) -> DescriptorAxes:
     """Compute the principal axes of the descriptors of all shapes; see `DescriptorAxes`."""
-    return DescriptorAxes.of([shape.sampled for shape in shapes], preset.number_of_descriptors)
+    with _warned_already():
+        return DescriptorAxes.of([shape.sampled for shape in shapes], preset.number_of_descriptors)
 
 
 def prepare_shapes(

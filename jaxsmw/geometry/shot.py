@@ -25,7 +25,11 @@ _PAIRS_PER_BLOCK = 30_000
 
 
 def shot_descriptors(
-    mesh: Mesh, *, radius: float = SHOT_RADIUS, samples: SurfaceSamples | None = None
+    mesh: Mesh,
+    *,
+    radius: float = SHOT_RADIUS,
+    samples: SurfaceSamples | None = None,
+    required: bool = False,
 ) -> Float32[np.ndarray, "n 352"]:
     """Compute SHOT descriptors (signatures of histograms of orientations), one per vertex.
 
@@ -54,6 +58,7 @@ def shot_descriptors(
       samples are given, descriptors are computed only at the samples, and only samples are used as
       neighbours. The normal of a sample is the mean normal of the vertices nearest to the sample. Without
       samples, the time grows with the square of the number of vertices.
+    - `required`: whether the caller cannot avoid SHOT. Messages then advise only a finer mesh.
 
     **Returns:** Descriptors as float32, without unit: one row per vertex (n, 352), or one row per sample
     (s, 352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than
@@ -83,7 +88,7 @@ def shot_descriptors(
         neighbors = tree.query_ball_point(positions, radius, return_length=True, workers=-1) - 1
         lonely = np.mean(neighbors < _FEWEST_NEIGHBORS)
         if lonely > 0.5:
-            raise InputError(_too_coarse(mesh, lonely, radius))
+            raise InputError(_too_coarse(mesh, lonely, radius, required))
 
         # Single precision is accurate enough for descriptors.
         descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
@@ -101,7 +106,7 @@ def shot_descriptors(
     chosen = () if samples is None else samples
     result = cached("shot", (mesh.vertices, mesh.faces, radius, *chosen), compute)
     if (lonely := float(result["lonely"])) > 0.01:
-        warnings.warn(_too_coarse(mesh, lonely, radius), stacklevel=2)
+        warnings.warn(_too_coarse(mesh, lonely, radius, required), stacklevel=2)
     return result["descriptors"]
 
 
@@ -118,11 +123,12 @@ def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[n
     return np.ascontiguousarray(sectors[:, ::-1]).reshape(descriptors.shape)
 
 
-def _too_coarse(mesh: Mesh, lonely: float, radius: float) -> str:
+def _too_coarse(mesh: Mesh, lonely: float, radius: float, required: bool) -> str:
+    avoidance = ", or avoid SHOT (init='wks' and preset='paper'; for jaxsmw match --init wks --preset paper)"
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "
-        f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh, or "
-        "avoid SHOT (init='wks' and preset='paper'; for jaxsmw match --init wks --preset paper)."
+        f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh"
+        f"{'' if required else avoidance}."
     )
 
 
