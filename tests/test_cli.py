@@ -1,5 +1,6 @@
 """The commands of `jaxsmw` print help texts, results and notes, and write their output files."""
 
+import argparse
 import base64
 import inspect
 import json
@@ -8,10 +9,12 @@ import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -336,6 +339,17 @@ def test_a_page_compares_maps(run, pair, tmp_path):
     two = tmp_path / "zero.txt", tmp_path / "other" / "zero.txt"
     assert run("render", *meshes, *two, "--output", rendered).code == 0
     assert [shown["name"] for shown in shown_maps(rendered)] == [str(path) for path in two]
+
+
+@pytest.mark.filterwarnings("default")
+def test_equal_warnings_are_printed_once(run, monkeypatch):
+    def warn_twice(_):
+        warnings.warn("the same", stacklevel=1)
+        warnings.warn("the same", stacklevel=2)
+
+    options = argparse.Namespace(quiet=True, run=warn_twice)
+    monkeypatch.setattr("jaxsmw.cli.run.make_parser", lambda: Mock(parse_args=lambda _: options))
+    assert run().errors == "warning: the same\n"
 
 
 @pytest.mark.filterwarnings("default:the page has no wavelets")

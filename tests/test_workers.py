@@ -6,13 +6,14 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import jax
 import pytest
 
 from jaxsmw.runtime import compilation
-from jaxsmw.runtime.workers import Workers
+from jaxsmw.runtime.workers import Workers, run_tasks
 
 # NumPy and JAX are imported, and an array is made, before the worker runs any function of the library.
 PROGRAM = """
@@ -80,6 +81,23 @@ def test_an_exception_ends_the_workers_and_no_other_process():
     finally:
         other.terminate()
         other.join()
+
+
+def square(number: int) -> int:
+    """Issues two equal warnings, then one that contains the number."""
+    for text in ("the same", "the same", f"of {number}"):
+        warnings.warn(text, stacklevel=1)
+    return number**2
+
+
+def test_warnings_of_workers_are_issued_in_the_calling_process(capfd):
+    with Workers(1) as workers, warnings.catch_warnings(record=True) as issued:
+        warnings.simplefilter("always")
+        found = dict(run_tasks(square, {"two": 2, "three": 3}, workers))
+    assert found == {"two": 4, "three": 9}
+    texts = [str(warning.message) for warning in issued]
+    assert texts.count("the same") >= 1 and {"of 2", "of 3"} < set(texts)
+    assert "Warning" not in capfd.readouterr().err
 
 
 def fill() -> int:

@@ -45,8 +45,15 @@ def run_command(arguments: Sequence[str]) -> int:
 def _run(arguments: Sequence[str]) -> None:
     options = make_parser().parse_args(arguments)
     log_to_console(quiet=options.quiet)
+    shown: set[str] = set()
+
+    def show_once(message: Warning | str, *_: object, **__: object) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            say(f"warning: {message}")
+
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+        warnings.showwarning = show_once
         from jaxsmw.runtime.cache import cache_compiled_programs
 
         cache_compiled_programs()

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -116,8 +117,9 @@ _starting = threading.Lock()
 def _start_worker() -> None:
     """Makes a worker ignore Ctrl-C, and makes the worker exit when the calling process exits.
 
-    Only the calling process handles Ctrl-C.
+    Only the calling process handles Ctrl-C. Warnings are kept for the calling process; see `run_tasks`.
     """
+    warnings.showwarning = lambda message, *_, **__: _warnings.append(message)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -127,6 +129,18 @@ def _start_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+# The warnings of this worker that `run_tasks` has not received yet.
+_warnings: list[Warning] = []
+
+
+def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[Warning]]:
+    """Calls a function in a worker. Returns its result, and the warnings since the last such call."""
+    result = function(task)
+    issued = _warnings.copy()
+    _warnings.clear()
+    return result, issued
 
 
 def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
@@ -204,11 +218,18 @@ def run_tasks(
 
     **Yields:** A tuple for each task, with the name of the task and the result of `function`. If `function`
     raised an exception, the tuple contains the exception instead of a result. Tuples are yielded in the order
-    in which the tasks end.
+    in which the tasks end. Warnings that a task issues in a process of `Workers` are issued again in the
+    calling process.
     """
-    futures = {executor.submit(function, task): name for name, task in tasks.items()}
+    futures = {executor.submit(_with_warnings, function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
         # The dictionary must not keep the future, because the future holds the result in memory.
         name = futures.pop(future)
         error = future.exception()
-        yield name, future.result() if error is None else error
+        if error is not None:
+            yield name, error
+            continue
+        result, issued = future.result()
+        for warning in issued:
+            warnings.warn(warning, stacklevel=1)
+        yield name, result
