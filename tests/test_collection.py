@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
@@ -261,6 +262,15 @@ def test_bad_arguments_are_refused(meshes, arguments, message):
         match_collection(meshes, preset="paper", **arguments)
 
 
+def test_tasks_of_workers_are_kept_in_the_directory(meshes, work, found, monkeypatch):
+    monkeypatch.setattr(matching, "TemporaryDirectory", None)
+    with ThreadPoolExecutor(1) as executor:
+        again = match_collection(
+            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work, executor=executor
+        )
+    assert again.edges == found.edges
+
+
 def test_sentences_name_shapes_that_do_not_fit(found):
     names = found.names
     (sentence,) = (text for text in replace(found, outliers=(1,)).sentences() if names[1] in text)
@@ -470,6 +480,37 @@ def test_files_of_earlier_meshes_and_options_are_removed(result_directory, direc
     assert os.listdir(output / "attributes") == []
     assert not any("shape3" in file for file in os.listdir(output / "maps"))
     assert not (output / "mean.ply").exists() and (output / "mean.obj").exists()
+
+
+def test_a_failed_run_leaves_the_earlier_results_and_nothing_else(
+    result_directory, directory, run, tmp_path, monkeypatch
+):
+    def files():
+        found = {path.relative_to(output) for path in output.rglob("*") if path.is_file()}
+        return {path: (output / path).read_bytes() for path in found if path.parts[0] != "work"}
+
+    output = tmp_path / "result"
+    shutil.copytree(result_directory, output)
+    before = files()
+
+    def fail(*_, **__):
+        raise InputError("the disk is full: make room.")
+
+    command = ("collection", directory, "--output", output, *OPTIONS, "--suffix", "obj", "--quiet")
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxsmw.report.collection_page.write_collection_page", fail)
+        assert run(*command).code == 2
+    assert files() == before
+    # A process that was killed while it wrote files left these.
+    for place in ("registered", "work", "."):
+        (output / place / f".{'0' * 32}.npz").touch()
+    assert run(*command).code == 0
+    summary = json.loads((output / "collection.json").read_text("utf-8"))
+    assert {"workers", "scheduler", "suffix"} <= set(summary["provenance"]["settings"])
+    assert {path.as_posix() for path in files()} == {
+        *summary["files"], "collection.json", "provenance.json", ".lock"
+    }  # fmt: skip
+    assert not {"new", f".{'0' * 32}.npz"} & set(os.listdir(output / "work"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory, read_bytes
+from jaxsmw.runtime.files import (
+    atomic_write,
+    check_directory,
+    check_writable,
+    make_directory,
+    read_bytes,
+    remove_leftovers,
+)
 
 
 def test_a_file_is_written_completely_or_not_at_all(tmp_path):
@@ -84,6 +91,19 @@ def test_concurrent_writers_leave_one_complete_file(tmp_path):
         thread.join()
     assert path.stat().st_size == 100_000 and len(set(path.read_text())) == 1
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path):
+    for name in ("map.txt", "noext"):
+        with atomic_write(tmp_path / name) as temporary:
+            leftover = temporary.name
+        (tmp_path / leftover).touch()
+    kept = {"map.txt", "noext", ".hidden.txt", ".lock", f".{'0' * 32}.a.b"}
+    for name in kept:
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path)
+    assert set(os.listdir(tmp_path)) == kept
+    remove_leftovers(tmp_path / "missing")
 
 
 def test_check_writable_raises_what_atomic_write_would_raise_later(tmp_path):

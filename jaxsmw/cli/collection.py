@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -146,7 +147,8 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         files = _mesh_files(options)
         _check(options, files)
-        from jaxsmw.runtime.files import make_directory
+        from jaxsmw.collection.files import replace_results
+        from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
         landmarks = _read_landmarks(options)
@@ -162,8 +164,8 @@ def run(options: argparse.Namespace) -> None:
         f"finished pairs are kept in {options.output}, and the same command continues from there"
     )
     with claimed_directory(directory, _provenance(options)), _executor(options) as executor:
-        for unfinished in work.glob(".*.npz"):  # a killed run left these files
-            unfinished.unlink(missing_ok=True)
+        for place in (directory, *(directory / name for name in _RESULTS)):
+            remove_leftovers(place)
         collection = _match(options, data, work, executor)
         collection.left_out.update(unreadable)
         stopwatch.add(collection.seconds)
@@ -171,7 +173,11 @@ def run(options: argparse.Namespace) -> None:
             model = collection.shape_model(scale=options.scale, number_of_modes=options.modes)
             measures = _measures(model)
         with stopwatch.step("writing"):
-            _write(options, collection, data, landmarks, model, measures, directory)
+            # Results of an earlier run are replaced only when all new results are complete.
+            new = work / "new"
+            shutil.rmtree(new, ignore_errors=True)  # a killed run left this directory
+            _write(options, collection, data, landmarks, model, measures, make_directory(new))
+            replace_results(new, directory)
     _show(collection, measures, scale=options.scale)
     show(f"time: {stopwatch.summary()} (compilation included)")
     report_progress(f"the results are in {options.output}")
@@ -462,7 +468,8 @@ def _write(
     if options.attributes_of:
         files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
     shared = _provenance(options)
-    changeable = ("edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of")
+    changeable = ["edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of"]
+    changeable += ["workers", "scheduler"]  # which hardly change results, but change times
     settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
     provenance = {**shared, "settings": settings, "machine": machine()}
     write_summary(collection, measures, directory, provenance, [*files, directory / "index.html"])

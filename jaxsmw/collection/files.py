@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import logging
+import os
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -21,7 +23,7 @@ from jaxsmw.io.landmark_files import write_landmark_file
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.map_files import write_pointwise_map
 from jaxsmw.io.mesh_data import MeshData, write_mesh_data
-from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.files import atomic_write, check_writable, make_directory
 from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
 
@@ -188,9 +190,6 @@ def write_summary(
 ) -> None:
     """Write `collection.json`: the graph, the decisions, the errors, the times and the provenance.
 
-    Files that an earlier `collection.json` lists, but `files` does not contain, are removed. They belong to
-    meshes or options of an earlier run.
-
     **Arguments:**
 
     - `collection`: the collection.
@@ -203,7 +202,6 @@ def write_summary(
     """
     names = collection.names
     listed = sorted(file.relative_to(directory).as_posix() for file in files)
-    outdated = set(_listed_files(directory / "collection.json")) - set(listed)
     contents = {
         "template": names[collection.template],
         "shapes": [
@@ -242,9 +240,33 @@ def write_summary(
     }
     with atomic_write(directory / "collection.json") as temporary:
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", "utf-8")
-    for file in outdated:
+
+
+def replace_results(new: Path, directory: Path) -> None:
+    """Move complete results to a directory, and remove the results of an earlier run.
+
+    Files that the earlier `collection.json` lists, but the new one does not, are removed. They belong to
+    meshes or options of the earlier run. The new `collection.json` is moved first, so that it lists all
+    results even if the process is killed.
+
+    **Arguments:**
+
+    - `new`: the directory with the new results, which is removed.
+    - `directory`: the directory of the results.
+
+    **Raises:** `InputError` if a file cannot be written.
+    """
+    summary = new / "collection.json"
+    for file in set(_listed_files(directory / "collection.json")) - set(_listed_files(summary)):
         with suppress(OSError):  # the list may be damaged
             (directory / file).unlink()
+    for path in [summary, *sorted(new.rglob("*"))]:
+        if path.is_file():
+            target = directory / path.relative_to(new)
+            make_directory(target.parent)
+            check_writable(target)
+            shutil.move(path, os.path.realpath(target))
+    shutil.rmtree(new)
 
 
 def _listed_files(summary: Path) -> list[str]:

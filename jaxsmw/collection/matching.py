@@ -8,6 +8,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -600,8 +601,9 @@ class _Matcher:
             )
             yield from zip(inits, match_edges(tasks, self.preset, self.devices), strict=True)
             return
-        with TemporaryDirectory() as temporary:
-            store = self.store or Store(Path(temporary))
+        place = TemporaryDirectory() if self.store is None else nullcontext(self.store.directory)
+        with place as directory:
+            store = Store(Path(directory))
             keys = self._save_shapes(store, inits)
             edges = {f"{i} {j}": (i, j) for i, j in inits}
             stored = {

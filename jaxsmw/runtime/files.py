@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import uuid
 from collections.abc import Iterator
@@ -128,6 +129,18 @@ def remove_unfinished() -> None:
             temporary.unlink()
 
 
+def remove_leftovers(directory: Path) -> None:
+    """Remove the temporary files of `atomic_write` that killed processes left in a directory.
+
+    No other process may be writing to the directory. If the directory does not exist, nothing happens.
+    """
+    with suppress(OSError):
+        for name in os.listdir(directory):
+            if _TEMPORARY.fullmatch(name):
+                with suppress(OSError):
+                    (directory / name).unlink()
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that `atomic_write` can write a file, without leaving a new file behind.
 
@@ -152,6 +165,10 @@ def _target(path: str | os.PathLike[str]) -> Path:
         return Path(os.path.realpath(path))
     except ValueError as error:  # the name contains a null character
         raise _unwritable(path, error) from error
+
+
+# The names that `_temporary` returns.
+_TEMPORARY = re.compile(r"\.[0-9a-f]{32}(\.[^.]+)?")
 
 
 def _temporary(target: Path) -> Path:
