@@ -355,7 +355,8 @@ def directory(meshes, tmp_path_factory):
     place = tmp_path_factory.mktemp("meshes")
     for mesh, suffix in zip(meshes[:4], (".ply", ".off", ".obj", ".stl"), strict=True):
         write_mesh(place / f"{mesh.name}{suffix}", mesh)
-    (place / "notes.txt").write_text("not a mesh")
+    for companion in ("notes.txt", "shape0.mtl", "skin.PNG", "points.fcsv", ".DS_Store"):
+        (place / companion).write_text("not a mesh")
     (place / "broken.ply").write_text("ply\nformat")
     return place
 
@@ -449,6 +450,22 @@ def test_the_same_command_continues(result_directory, directory, run, matched):
     assert outcome.code == 0, outcome.errors
     assert matched == []
     assert "4 shapes" in outcome.output
+    assert "not read" not in outcome.errors  # the other files of the directory often accompany meshes
+
+
+def test_files_that_are_not_read_are_named_in_one_line(result_directory, directory, run, tmp_path):
+    place, output = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(directory, place)
+    shutil.copytree(result_directory, output)
+    (place / "folder.xyz").mkdir()
+    (place / "link.ply").symlink_to("nowhere")
+    for name in ("cloud.xyz", "Data.NPZ", "none", *(f"scan{number}.foo" for number in range(7))):
+        (place / name).touch()
+    outcome = run("collection", place, "--output", output, *OPTIONS, "--quiet")
+    (line,) = (line for line in outcome.errors.splitlines() if "not read" in line)
+    shown = [f"scan{number}.foo" for number in range(4)]
+    listed = ", ".join(["Data.NPZ", "cloud.xyz", "link.ply (a broken link)", "none", *shown])
+    assert f"{place}: these files are not read: {listed} and 3 more. Meshes have" in line
 
 
 def test_other_settings_need_another_directory(result_directory, directory, run):

@@ -151,6 +151,7 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
+        _note_other_files(options)
         landmarks = _read_landmarks(options)
         data, unreadable = _read(files, weld=options.weld)
     for option in ("template", "landmarks_of", "attributes_of"):
@@ -212,6 +213,34 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
             f"a directory with meshes ({', '.join(MESH_SUFFIXES)})."
         )
     return files
+
+
+# Files with these suffixes often accompany meshes: documents, tables, materials and pictures.
+_COMPANIONS = (".txt", ".json", ".csv", ".md", ".pdf", ".mtl", ".bin", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")  # fmt: skip
+# The most files that a note names.
+_NAMED_FILES = 8
+
+
+def _note_other_files(options: argparse.Namespace) -> None:
+    """Name the files of the directory that are neither meshes nor usual companions of meshes."""
+    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
+    from jaxsmw.io.mesh_data import MESH_SUFFIXES
+
+    known = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
+    names = []
+    for name in sorted(os.listdir(options.directory)):
+        path = os.path.join(options.directory, name)
+        if not os.path.exists(path):
+            names.append(f"{name} (a broken link)")
+        elif os.path.isfile(path) and not name.startswith(".") and not name.lower().endswith(known):
+            names.append(name)
+    if names:
+        listed = ", ".join(names[:_NAMED_FILES])
+        more = f" and {len(names) - _NAMED_FILES} more" if len(names) > _NAMED_FILES else ""
+        say(
+            f"note: {options.directory}: these files are not read: {listed}{more}. Meshes have the suffixes "
+            f"{', '.join(MESH_SUFFIXES)}."
+        )
 
 
 def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[str, Path]) -> str:
