@@ -1,5 +1,7 @@
-"""The exception for input that cannot be used, and a check of arguments that raises it."""
+"""The exception for input that cannot be used, and checks of arguments that raise it."""
 
+import math
+from numbers import Integral, Real
 from typing import Any, get_args
 
 
@@ -21,3 +23,42 @@ def check_choice(value: object, choices: Any, kind: str) -> None:
     """
     if value not in get_args(choices):
         raise InputError(f"{value!r} is not {kind}: choose {', '.join(get_args(choices))}.")
+
+
+def check_whole_number(name: str, value: Any, least: int | None = None, most: int | None = None) -> int:
+    """Return a whole number of any type as an `int`.
+
+    **Arguments:**
+
+    - `name`: the name of the argument.
+    - `value`: the value of the argument.
+    - `least`, `most`: the smallest and the largest valid number; None for no limit.
+
+    **Raises:** `InputError` if the value is not a whole number within the limits. Floats such as 3.0 and
+    truth values are no whole numbers.
+    """
+    limits = "" if least is None else f" of at least {least}" if most is None else f" from {least} to {most}"
+    number = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
+    if number is None or (least is not None and number < least) or (most is not None and number > most):
+        raise InputError(f"{name} is {value!r}: give a whole number{limits}.")
+    return number
+
+
+def check_number(name: str, value: Any, *, most: float = math.inf, positive: bool = False) -> None:
+    """Check that a number is finite and not negative.
+
+    **Arguments:**
+
+    - `name`: the name of the argument.
+    - `value`: the value of the argument.
+    - `most`: the largest valid number.
+    - `positive`: whether zero is not valid.
+
+    **Raises:** `InputError` if the value is not a finite number within these limits.
+    """
+    wanted = "a positive finite number" if positive else "a finite number of at least 0"
+    if math.isfinite(most):
+        wanted = f"a number from 0 to {most:g}"
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if not (0 <= number <= most and number < math.inf) or (positive and number == 0):
+        raise InputError(f"{name} is {value!r}: give {wanted}.")

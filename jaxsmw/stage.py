@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Int
 
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
@@ -16,7 +15,7 @@ from jaxsmw.core.refiner import Refiner, Samples
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 from jaxsmw.pair import common_range
 from jaxsmw.runtime.compilation import compile_ahead, compiled
@@ -82,7 +81,7 @@ class Stage:
         }
         if number_of_samples is not None:
             sizes["number_of_samples"] = number_of_samples
-        checked = {name: _whole_number(name, value) for name, value in sizes.items()}
+        checked = {name: check_whole_number(name, value) for name, value in sizes.items()}
         others = {"refiner": refiner, "number_of_samples": None, "stop_when_unchanged": stop_when_unchanged}
         for name, value in (others | checked).items():
             object.__setattr__(self, name, value)
@@ -263,9 +262,3 @@ def _derived(name: str, given: int | None, derived: int | None, default: int) ->
             f"{name} is {given!r}, but the refiner's levels require {derived}: leave {name} out."
         )
     return derived
-
-
-def _whole_number(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} is {value!r}: give a whole number.")
-    return int(value)

@@ -253,6 +253,12 @@ def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
         ({"mirror": "no"}, "give True or False"),
         ({"template": 5}, "from 0 to 4"),
         ({"template": "a"}, "from 0 to 4"),
+        ({"template": True}, "from 0 to 4"),
+        ({"devices": []}, "give at least one JAX device"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": "0"}, "seed is '0'"),
+        ({"stiffness": 0}, "stiffness is 0: give a positive finite number"),
+        ({"settings": None}, "settings is None"),
         ({"directory": "no/such/directory"}, "is not a directory"),
     ],
 )

@@ -1,5 +1,6 @@
 """The parts of collections: graph, cycles, hands, synchronisation and batches."""
 
+import re
 import warnings
 from dataclasses import replace
 from itertools import combinations, permutations
@@ -13,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxsmw import InputError, creature_pair, match
 from jaxsmw.collection import (
+    CollectionSettings,
     Network,
     SynchronizationSettings,
     choose_edges,
@@ -266,7 +268,18 @@ def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
         (np.full((3, 3), np.nan), {}, "finite"),
         (np.ones((3, 3)), {"edges_per_shape": -1}, "positive"),
         (np.ones((3, 3)), {"random_share": 2}, "share"),
+        (np.array([["a"]]), {}, "square matrix"),
+        (np.zeros((0, 0)), {}, "square matrix"),
+        (-np.ones((3, 3)), {}, "not negative"),
+        (np.ones((3, 3)), {"edges_per_shape": np.nan}, "edges_per_shape is nan"),
+        (np.ones((3, 3)), {"edges_per_shape": "4"}, "edges_per_shape is '4'"),
+        (np.ones((3, 3)), {"random_share": True}, "random_share is True"),
+        (np.ones((3, 3)), {"seed": -1}, "seed is -1: give a whole number of at least 0"),
+        (np.ones((3, 3)), {"seed": 1.0}, "seed is 1.0"),
         (np.ones((3, 3)), {"given": [(0, 3)]}, "3 shapes"),
+        (np.ones((3, 3)), {"given": [(0, 1), (0, 1.0)]}, "given edge 1 is"),
+        (np.ones((3, 3)), {"given": [3]}, "given edge 0 is 3"),
+        (np.ones((3, 3)), {"given": [(1, 1)]}, "joins shape 1 to itself"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -365,9 +378,57 @@ def test_programs_are_released_between_pairs(three, monkeypatch):
     assert len(dict(match_pairs(three, PAIRS[:2], preset="paper"))) == len(released) == 2
 
 
-def test_bad_pairs_are_refused(three):
+@pytest.mark.parametrize("pair", [(0, 3), (0, -1), (0, 1.0), (0,), (0, 1, 2), "01", 1])
+@pytest.mark.usefixtures("unchecked")
+def test_bad_pairs_are_refused(three, pair):
     with pytest.raises(InputError, match="pair 1 is"):
-        match_pairs(three, [(0, 1), (0, 3)])
+        match_pairs(three, [(0, 1), pair])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"devices": []}, "give at least one JAX device"),
+        ({"devices": "cpu"}, "devices is 'cpu'"),
+        ({"devices": jax.devices()[0]}, "give at least one JAX device"),
+        ({"batch_size": 0}, "batch_size is 0"),
+        ({"batch_size": 2.0}, "batch_size is 2.0"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_options_of_batches_are_refused(three, options, message):
+    with pytest.raises(InputError, match=message):
+        match_pairs(three, PAIRS, **options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (CollectionSettings, {"edges_per_shape": 0}),
+        (CollectionSettings, {"edges_per_shape": np.inf}),
+        (CollectionSettings, {"random_share": 1.5}),
+        (CollectionSettings, {"random_share": np.nan}),
+        (CollectionSettings, {"cycle_samples": 0}),
+        (CollectionSettings, {"cycle_samples": 200.0}),
+        (CollectionSettings, {"contradicted_from": -0.1}),
+        (CollectionSettings, {"distortion_weight": "2"}),
+        (CollectionSettings, {"distortion_tolerance": None}),
+        (CollectionSettings, {"outlier_from": 0.0}),
+        (CollectionSettings, {"rounds": -1}),
+        (CollectionSettings, {"rounds": True}),
+        (CollectionSettings, {"synchronization": {}}),
+        (SynchronizationSettings, {"iterations": 2.5}),
+        (SynchronizationSettings, {"robust_scale": 0}),
+        (SynchronizationSettings, {"discontinuity_distance": [0.1]}),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_settings_are_refused(kind, settings):
+    ((name, value),) = settings.items()
+    with pytest.raises(InputError, match=re.escape(f"{name} is {value!r}: give ")):
+        kind(**settings)
+    # NumPy's numbers are accepted.
+    kind(**{name: np.int64(1)} if name != "synchronization" else {})
 
 
 def test_reverse_surface_points_come_from_the_same_embeddings():

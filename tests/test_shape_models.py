@@ -352,26 +352,43 @@ def bad(index: int, value: float) -> np.ndarray:
         (bad(2, np.inf), {}, "shape 2 has coordinates that are not finite"),
         ([np.eye(3), np.ones((4, 3))], {}, "shape 1 has 4 vertices, but shape 0 has 3"),
         ([np.eye(3), np.full((3, 3), 0.1)], {}, "shape 1 is a single point"),
-        (random_shapes(), {"weights": np.ones(3)}, "there are 3 weights, but the shapes have 60 vertices"),
+        (None, {}, "there is no shape"),
+        (np.eye(3), {}, "shape 0: vertices must be a numeric array"),
+        ([np.eye(3), [["a", "b", "c"]]], {}, "shape 1: vertices must be a numeric array"),
+        ([np.eye(2)], {}, "shape 0: vertices must be a numeric array of shape (number of vertices, 3)"),
+        (random_shapes(), {"scale": "no"}, "scale is 'no': give True or False"),
+        (random_shapes(), {"weights": ["a"]}, "the weights are str32: give numbers"),
+        (random_shapes(), {"weights": 1.0}, "the weights have shape ()"),
+        (random_shapes(), {"reference": 1.0}, "reference is 1.0"),
+        (random_shapes(), {"number_of_modes": 2.5}, "number_of_modes is 2.5"),
+        (random_shapes(), {"weights": np.ones(3)}, "the weights have shape (3,): give 60 weights"),
         (random_shapes(), {"weights": -np.ones(VERTICES)}, "the weights must be finite, not negative"),
         (random_shapes(), {"weights": np.zeros(VERTICES)}, "the weights must be finite, not negative"),
         (random_shapes(), {"weights": np.full(VERTICES, np.nan)}, "the weights must be finite"),
-        (random_shapes(), {"reference": N}, "the reference shape is 8, but the shapes are 0 to 7"),
-        (random_shapes(), {"reference": -1}, "the reference shape is -1"),
-        (random_shapes(), {"number_of_modes": 0}, "the number of modes is 0: choose 1 or more"),
+        (random_shapes(), {"reference": N}, "reference is 8: give a whole number from 0 to 7"),
+        (random_shapes(), {"reference": -1}, "reference is -1"),
+        (random_shapes(), {"number_of_modes": 0}, "number_of_modes is 0: give a whole number of at least 1"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_invalid_shapes_and_options_are_refused(shapes: object, options: dict, message: str) -> None:
     with pytest.raises(InputError, match=re.escape(message)):
         shape_model(shapes, **options)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_invalid_uses_of_a_model_are_refused() -> None:
     model = shape_model(random_shapes())
     for call, message in (
         (lambda: model.shape(np.zeros(N)), "the scores have shape (8,): give at most 7 finite numbers"),
         (lambda: model.shape(np.array([np.nan])), "finite numbers"),
         (lambda: model.project(np.eye(3)), "the shape has 3 vertices, but the model has 60"),
+        (lambda: model.shape(["a"]), "the scores are str32: give numbers"),
+        (lambda: model.project("a"), "the shape: vertices must be a numeric array"),
+        (lambda: model.generalisation(3), "numbers_of_modes is 3: give a list of whole numbers"),
+        (lambda: model.specificity([1.5]), "the number of modes is 1.5: give a whole number"),
+        (lambda: model.specificity([1], seed=-1), "seed is -1"),
+        (lambda: model.specificity([1], samples=10.0), "samples is 10.0"),
         (lambda: model.project(bad(0, np.nan)[0]), "not finite"),
         (lambda: model.project(np.full((VERTICES, 3), 0.1)), "a single point"),
         (
@@ -380,7 +397,7 @@ def test_invalid_uses_of_a_model_are_refused() -> None:
         ),
         (lambda: model.specificity([N]), "the number of modes is 8, but the model has 7"),
         (lambda: model.specificity([-1]), "the number of modes is -1"),
-        (lambda: model.specificity([1], samples=1), "the number of samples is 1"),
+        (lambda: model.specificity([1], samples=1), "samples is 1: give a whole number of at least 2"),
     ):
         with pytest.raises(InputError, match=re.escape(message)):
             call()

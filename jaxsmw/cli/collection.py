@@ -216,7 +216,10 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
 
 
 # Files with these suffixes often accompany meshes: documents, tables, materials and pictures.
-_COMPANIONS = (".txt", ".json", ".csv", ".md", ".pdf", ".mtl", ".bin", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga")  # fmt: skip
+_COMPANIONS = (
+    *(".txt", ".json", ".csv", ".md", ".pdf", ".mtl", ".bin"),
+    *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga"),
+)
 # The most files that a note names.
 _NAMED_FILES = 8
 

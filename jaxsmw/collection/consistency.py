@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Float64, Int, Int64
+
+from jaxsmw.errors import InputError, check_whole_number
 
 # An edge (i, j) with i < j, as the numbers of its two shapes.
 Edge = tuple[int, int]
@@ -18,6 +21,30 @@ _LARGEST = 0.5
 # The sharpness of the weights in each iteration, in units of 1 / error, following the doubling sequence that
 # Lerman and Shi recommend. With the last value, cycles whose two other edges have an error of 0.1 count e^-4.
 _SHARPNESS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
+
+
+def check_pairs(pairs: Iterable[Any], number: int, kind: str) -> list[tuple[int, int]]:
+    """Return pairs of shapes as tuples of integers.
+
+    **Arguments:**
+
+    - `pairs`: the pairs, each with the numbers of two shapes.
+    - `number`: the number of shapes.
+    - `kind`: what a pair is called in messages.
+
+    **Raises:** `InputError` if a pair does not consist of the numbers of two shapes.
+    """
+    checked = []
+    for position, pair in enumerate(pairs):
+        try:
+            i, j = (check_whole_number(kind, shape, 0, number - 1) for shape in pair)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{kind} {position} is {pair!r}, but there are {number} shapes: give the numbers of two "
+                "shapes, counted from 0."
+            ) from None
+        checked.append((i, j))
+    return checked
 
 
 def triangles(edges: Sequence[Edge]) -> Int64[np.ndarray, "t 3"]:

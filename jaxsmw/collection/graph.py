@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from jaxsmw.collection.consistency import Edge
+from jaxsmw.collection.consistency import Edge, check_pairs
 from jaxsmw.collection.shapes import PreparedShape
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_number, check_whole_number
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
 _COMPARED_EIGENVALUES = 50
@@ -79,23 +79,29 @@ def choose_edges(
 
     **Returns:** The edges (i, j) with i < j, in ascending order.
 
-    **Raises:** `InputError` if the distances are not a square matrix of finite numbers, the number of edges
-    is not positive, the share is not from 0 to 1, or a given edge names no shape.
+    **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative,
+    the number of edges is not positive, the share is not from 0 to 1, the seed is negative, or a given edge
+    does not join two shapes.
     """
-    distances = np.asarray(distances, np.float64)
-    number = len(distances)
-    if distances.shape != (number, number) or not np.isfinite(distances).all():
+    distances = np.asarray(distances)
+    if not (
+        distances.dtype.kind in "iuf"
+        and distances.ndim == 2
+        and distances.shape[0] == distances.shape[1] > 0
+        and np.isfinite(distances).all()
+        and (distances >= 0).all()
+    ):
         raise InputError(
-            f"the distances have shape {distances.shape}: give a square matrix of finite numbers."
+            f"the distances are {distances.dtype.name} of shape {distances.shape}: give a square matrix of "
+            "finite numbers that are not negative."
         )
-    if not (edges_per_shape > 0 and 0 <= random_share <= 1):
-        raise InputError(
-            f"edges_per_shape is {edges_per_shape} and random_share is {random_share}: give a positive "
-            "number, and a share from 0 to 1."
-        )
-    if any(not 0 <= shape < number for edge in given for shape in edge):
-        raise InputError(f"a given edge names a shape that does not exist: there are {number} shapes.")
-    chosen = {(min(edge), max(edge)) for edge in given}
+    number, distances = len(distances), distances.astype(np.float64)
+    check_number("edges_per_shape", edges_per_shape, positive=True)
+    check_number("random_share", random_share, most=1.0)
+    check_whole_number("seed", seed, 0)
+    chosen = {(min(edge), max(edge)) for edge in check_pairs(given, number, "given edge")}
+    if alike := [i for i, j in chosen if i == j]:
+        raise InputError(f"a given edge joins shape {alike[0]} to itself: leave the edge out.")
     known = {shape for edge in chosen for shape in edge}
     wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]
     new = number - len(known)

@@ -23,6 +23,7 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors, find_outli
 from jaxsmw.collection.edges import EdgeMap, EdgeTask, compare_hands, match_edges
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.hands import choose_hands
+from jaxsmw.collection.pairs import check_devices
 from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.collection.shapes import (
@@ -33,7 +34,7 @@ from jaxsmw.collection.shapes import (
 )
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
 from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_number, check_whole_number
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components, count_of
@@ -306,10 +307,13 @@ def match_collection(
         )
     if not isinstance(mirror, bool | np.bool):
         raise InputError(f"mirror is {mirror!r}: give True or False.")
-    if template is not None and not (isinstance(template, int | np.integer) and 0 <= template < len(meshes)):
-        raise InputError(
-            f"the template is {template!r}: give the number of a mesh, from 0 to {len(meshes) - 1}."
-        )
+    if template is not None:
+        template = check_whole_number("template", template, 0, len(meshes) - 1)
+    check_number("stiffness", stiffness, positive=True)
+    if not isinstance(settings, CollectionSettings):
+        raise InputError(f"settings is {settings!r}: give CollectionSettings.")
+    seed = check_whole_number("seed", seed, 0)
+    check_devices(devices)
     if directory is not None and not Path(directory).is_dir():
         raise InputError(f"{directory}: is not a directory: create it first.")
     given = [_named_mesh(mesh, number, names) for number, mesh in enumerate(meshes)]

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import jax
 
 from jaxsmw.choices import DEFAULT_PRESET
+from jaxsmw.collection.consistency import check_pairs
 from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching import Correspondence, match_prepared
 from jaxsmw.preparation import PreparedPair
@@ -49,22 +50,19 @@ def match_pairs(
 
     **Returns:** An iterator over tuples: the number of a pair in `pairs`, and its `Correspondence`.
 
-    **Raises:** `InputError` if a mesh cannot be used or a pair names no shape. While the iterator runs,
-    `ArithmeticError` if the refinement of a pair fails numerically.
+    **Raises:** `InputError` if a mesh or an argument cannot be used, or a pair names no shape. While the
+    iterator runs, `ArithmeticError` if the refinement of a pair fails numerically.
     """
     given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
-    pairs = list(pairs)
-    for number, pair in enumerate(pairs):
-        if len(pair) != 2 or any(shape not in range(len(given)) for shape in pair):
-            raise InputError(
-                f"pair {number} is {tuple(pair)}, but there are {len(given)} meshes: give the numbers of two "
-                "meshes, counted from 0."
-            )
+    checked = check_pairs(pairs, len(given), "pair")
+    check_devices(devices)
+    if batch_size is not None:
+        check_whole_number("batch_size", batch_size, 1)
     chosen = choose_preset(preset)
     shapes, _ = prepare_shapes(given, chosen)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
-        prepared = ([prepare_pair(shapes[i], shapes[j])] for i, j in pairs)
+        prepared = ([prepare_pair(shapes[i], shapes[j])] for i, j in checked)
         outcomes = refined_starts(prepared, chosen, batch_size=batch_size, devices=devices)
         for number, (starts, fitted, refined) in enumerate(outcomes):
             pair = starts[0].pair
@@ -72,6 +70,18 @@ def match_pairs(
             yield number, found.correspondence
 
     return results()
+
+
+def check_devices(devices: Sequence[jax.Device] | None) -> None:
+    """Check that devices are a list of at least one JAX device, or None.
+
+    **Raises:** `InputError` if they are anything else.
+    """
+    if devices is None:
+        return
+    found = list(devices) if isinstance(devices, Iterable) else []
+    if not found or not all(isinstance(device, jax.Device) for device in found):
+        raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")
 
 
 def refined_starts(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jaxsmw.collection.synchronization import SynchronizationSettings
+from jaxsmw.errors import InputError, check_number, check_whole_number
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class CollectionSettings:
       one kind of body, the smallest error of the edges of a shape was at most 0.04.
     - `rounds`: the largest number of times that contradicted edges are matched again.
     - `synchronization`: the settings of `synchronize`.
+
+    **Raises:** `InputError` if a setting is not valid.
     """
 
     edges_per_shape: float | int = 4
@@ -41,3 +44,15 @@ class CollectionSettings:
     outlier_from: float = 0.1
     rounds: int = 2
     synchronization: SynchronizationSettings = SynchronizationSettings()  # noqa: RUF009 (immutable)
+
+    def __post_init__(self) -> None:
+        check_number("edges_per_shape", self.edges_per_shape, positive=True)
+        check_number("random_share", self.random_share, most=1.0)
+        check_whole_number("cycle_samples", self.cycle_samples, 1)
+        check_number("contradicted_from", self.contradicted_from)
+        check_number("distortion_weight", self.distortion_weight)
+        check_number("distortion_tolerance", self.distortion_tolerance, positive=True)
+        check_number("outlier_from", self.outlier_from, positive=True)
+        check_whole_number("rounds", self.rounds, 0)
+        if not isinstance(self.synchronization, SynchronizationSettings):
+            raise InputError(f"synchronization is {self.synchronization!r}: give SynchronizationSettings.")

@@ -7,7 +7,7 @@ in the unit of length of the shapes, and does not depend on the resolution.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,7 +16,8 @@ import scipy.linalg
 from jaxtyping import Bool, Float64, Real
 from scipy.spatial.distance import cdist
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_whole_number
+from jaxsmw.geometry.mesh import numeric_rows
 from jaxsmw.runtime.threads import one_blas_thread
 
 # The alignment ends when the mean changes by less than this multiple of its size, or after `_MOST_ROUNDS`.
@@ -90,13 +91,14 @@ def align(
 
     **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
     coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
-    the reference do not fit the shapes.
+    the reference do not fit the shapes, or `scale` is not a truth value.
     """
     points = _checked(shapes)
     count, n, _ = points.shape
     shares = _checked_weights(weights, n)
-    if not 0 <= reference < count:
-        raise InputError(f"the reference shape is {reference}, but the shapes are 0 to {count - 1}.")
+    reference = check_whole_number("reference", reference, 0, count - 1)
+    if not isinstance(scale, bool | np.bool):
+        raise InputError(f"scale is {scale!r}: give True or False.")
     centroids = np.einsum("v,ivc->ic", shares, points)
     products = _inner_products(points, centroids, shares)
     squared_sizes = np.einsum("icic->i", products)
@@ -183,7 +185,7 @@ class ShapeModel:
 
         **Raises:** `InputError` if there are more scores than modes, or a score is not finite.
         """
-        scores = np.asarray(scores, np.float64)
+        scores = _numbers("scores", scores)
         if scores.ndim != 1 or len(scores) > len(self.modes) or not np.isfinite(scores).all():
             raise InputError(
                 f"the scores have shape {scores.shape}: give at most {len(self.modes)} finite numbers, one "
@@ -204,6 +206,7 @@ class ShapeModel:
         **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
         the shape is a single point.
         """
+        shape = numeric_rows(shape, "vertices", "the shape").astype(np.float64)
         if len(shape) != len(self.mean):
             raise InputError(f"the shape has {len(shape)} vertices, but the model has {len(self.mean)}.")
         if not np.isfinite(shape).all():
@@ -289,10 +292,11 @@ class ShapeModel:
 
         **Returns:** The mean distance for each number, and its standard error.
 
-        **Raises:** `InputError` if there are fewer than two samples, or a number is not between 0 and k.
+        **Raises:** `InputError` if there are fewer than two samples, the seed is negative, or a number is not
+        between 0 and k.
         """
-        if samples < 2:
-            raise InputError(f"the number of samples is {samples}: choose 2 or more.")
+        samples = check_whole_number("samples", samples, 2)
+        seed = check_whole_number("seed", seed, 0)
         numbers = _checked_numbers(numbers_of_modes, len(self.modes), "the model has")
         coordinates = _coordinates(self.alignment)
         # The numbers of one mode after the other, so that further modes do not change the first numbers.
@@ -344,8 +348,8 @@ def shape_model(
 
     **Raises:** `InputError` as `align` does, or if the number of modes is below 1.
     """
-    if number_of_modes is not None and number_of_modes < 1:
-        raise InputError(f"the number of modes is {number_of_modes}: choose 1 or more.")
+    if number_of_modes is not None:
+        number_of_modes = check_whole_number("number_of_modes", number_of_modes, 1)
     alignment = align(shapes, scale=scale, weights=weights, reference=reference)
     coordinates = _coordinates(alignment)
     squared = (coordinates**2).sum(axis=0)
@@ -360,8 +364,9 @@ def shape_model(
 
 def _checked(shapes: Shapes) -> Float64[np.ndarray, "N n 3"]:
     """Return the shapes as one array in float64."""
-    if len(shapes) == 0:
+    if not isinstance(shapes, Iterable) or len(shapes) == 0:
         raise InputError("there is no shape; give at least one shape.")
+    shapes = [numeric_rows(shape, "vertices", f"shape {index}") for index, shape in enumerate(shapes)]
     sizes = [len(shape) for shape in shapes]
     for index, size in enumerate(sizes):
         if size != sizes[0]:
@@ -371,8 +376,6 @@ def _checked(shapes: Shapes) -> Float64[np.ndarray, "N n 3"]:
             )
         if not np.isfinite(shapes[index]).all():
             raise InputError(f"shape {index} has coordinates that are not finite; leave the shape out.")
-    if sizes[0] == 0:
-        raise InputError("the shapes have no vertices; give shapes with vertices.")
     return np.asarray(shapes, dtype=np.float64)
 
 
@@ -387,21 +390,32 @@ def _checked_weights(weights: Real[np.ndarray, " _"] | None, n: int) -> Float64[
     """Return the weights of n vertices with the sum 1."""
     if weights is None:
         return np.full(n, 1 / n)
-    if len(weights) != n:
-        raise InputError(f"there are {len(weights)} weights, but the shapes have {n} vertices.")
-    values = np.asarray(weights, dtype=np.float64)
+    values = _numbers("weights", weights)
+    if values.shape != (n,):
+        raise InputError(f"the weights have shape {values.shape}: give {n} weights, one for each vertex.")
     if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
         raise InputError("the weights must be finite, not negative and not all zero, such as vertex areas.")
     values = values / values.max()
     return values / values.sum()
 
 
+def _numbers(name: str, values: object) -> Float64[np.ndarray, ...]:
+    """Return numbers as an array."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"the {name} are {array.dtype.name}: give numbers.")
+    return array.astype(np.float64)
+
+
 def _checked_numbers(numbers: Sequence[int], most: int, reason: str) -> tuple[int, ...]:
     """Return numbers of modes as a tuple."""
-    for number in numbers:
+    if not isinstance(numbers, Iterable):
+        raise InputError(f"numbers_of_modes is {numbers!r}: give a list of whole numbers.")
+    checked = tuple(check_whole_number("the number of modes", number) for number in numbers)
+    for number in checked:
         if not 0 <= number <= most:
             raise InputError(f"the number of modes is {number}, but {reason} {most}; choose 0 to {most}.")
-    return tuple(int(number) for number in numbers)
+    return checked
 
 
 def _inner_products(

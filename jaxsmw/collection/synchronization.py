@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.collection.consistency import Edge
+from jaxsmw.errors import check_number, check_whole_number
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
@@ -31,11 +32,18 @@ class SynchronizationSettings:
       zero. Points of wrong maps are much farther away.
     - `discontinuity_distance`: if the matches of the corners of a triangle are farther apart, a point inside
       the triangle follows the match of the nearest corner instead of an average.
+
+    **Raises:** `InputError` if a setting is not valid.
     """
 
     iterations: int = 5
     robust_scale: float = 0.02
     discontinuity_distance: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_whole_number("iterations", self.iterations, 0)
+        check_number("robust_scale", self.robust_scale, positive=True)
+        check_number("discontinuity_distance", self.discontinuity_distance, positive=True)
 
 
 def vertices_as_points(mesh: Mesh) -> SurfacePoints:
