@@ -399,7 +399,7 @@ def _checked_weights(weights: Real[np.ndarray, " _"] | None, n: int) -> Float64[
     return values / values.sum()
 
 
-def _numbers(name: str, values: object) -> Float64[np.ndarray, ...]:
+def _numbers(name: str, values: object) -> Float64[np.ndarray, "*shape"]:
     """Return numbers as an array."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":

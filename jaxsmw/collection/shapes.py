@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 
 import jax
@@ -23,7 +24,7 @@ from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
 
 
-def _warned_already() -> warnings.catch_warnings[None]:
+def _warned_already() -> AbstractContextManager[object]:
     """Ignore warnings about coarse meshes in the block, because `prepare_shape` has issued them."""
     return warnings.catch_warnings(action="ignore", category=UserWarning)
 
