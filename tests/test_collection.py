@@ -412,7 +412,9 @@ def test_the_command_writes_everything(result_directory):
     assert [row[0] for row in rows] == ["mesh", *names] and len(rows[1]) == 4
     assert read_mesh(result_directory / "mean.ply").vertices.shape == template.vertices.shape
     assert sorted(os.listdir(result_directory / "attributes")) == ["shape1.ply", "shape2.ply", "shape3.ply"]
-    assert "<html" in (result_directory / "index.html").read_text("utf-8")
+    page = (result_directory / "index.html").read_text("utf-8")
+    # The page has a list of its own for meshes that were left out, and does not name them a second time.
+    assert "<html" in page and "<b>broken.ply</b>" in page and "Left out: broken.ply" not in page
 
 
 def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):

@@ -524,7 +524,7 @@ def _write(
         ],
         model=model,
         title=f"Collection {Path(options.directory).resolve().name}",
-        notes=collection.sentences(),
+        notes=collection.decisions(),
         left_out=collection.left_out,
         warning=collection.warning,
     )

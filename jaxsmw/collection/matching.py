@@ -142,6 +142,12 @@ class Collection:
 
     def sentences(self) -> tuple[str, ...]:
         """Return sentences about the template, the decisions, the hands, the outliers and missing meshes."""
+        warning = [self.warning] if self.warning else []
+        left_out = [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
+        return (*self.decisions(), *warning, *left_out)
+
+    def decisions(self) -> tuple[str, ...]:
+        """Return sentences about the template, the decisions and the hands."""
         decisions = Counter(edge.decision for edge in self.edges)
         found = [
             f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
@@ -158,9 +164,6 @@ class Collection:
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
             found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
-        if self.warning:
-            found.append(self.warning)
-        found += [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return tuple(found)
 
     @property
