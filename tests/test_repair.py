@@ -109,6 +109,24 @@ def test_a_large_fault_makes_a_map_suspicious(body, swapped, identity):
     assert wrong < 0.02 and not found.suspicious
 
 
+@pytest.mark.parametrize("non_isometric", [0.0, 10.0])
+def test_stages_run_again_for_shapes_that_are_not_isometric(body, non_isometric):
+    vertices, stage = body[0].vertices, Stage(FeatureRegression((30,)))
+    noise = np.random.default_rng(0).normal(scale=0.3, size=vertices.shape)
+    start = KDTree(vertices).query(vertices + noise)[1]
+    settings = replace(REPAIR, suspicious=2.0, suspicious_area=1.0, non_isometric=non_isometric, passes=2)
+    _, once = outcome(body, start, replace(settings, passes=0), [stage])
+    _, found = outcome(body, start, settings, [stage])
+    expected = once
+    for _ in range(2 if non_isometric == 0 else 0):
+        following = np.asarray(expected.pointwise_map)[: len(start)].astype(np.int64)
+        _, expected = outcome(body, following, None, [stage])
+    np.testing.assert_array_equal(found.pointwise_map, expected.pointwise_map)
+    assert not found.suspicious
+    changed = bool(np.any(np.asarray(found.pointwise_map) != np.asarray(once.pointwise_map)))
+    assert changed == (non_isometric == 0)
+
+
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):
     def none():
         raise AssertionError("an alternative initial map was computed")

@@ -12,6 +12,7 @@ from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.pair import Pair
 from jaxsmw.repair.expected_error import expected_error
 from jaxsmw.repair.scores import (
+    area_shape_difference,
     dirichlet_energy_ratio,
     discontinuous_parts,
     distortion,
@@ -37,6 +38,29 @@ def test_the_identity_has_no_faults(mesh, spectrum):
     assert dirichlet_energy_ratio(Pair(mesh, mesh), identity, spectrum) == 1
     assert not discontinuous_parts(Pair(mesh, mesh), identity).any()
     assert not orientation_reversal(Pair(mesh, mesh), identity, spectrum).any()
+
+
+def test_the_area_shape_difference_is_zero_for_isometries_and_known_for_a_constant_map(mesh, spectrum):
+    pair, n = Pair(mesh, mesh), len(mesh.vertices)
+    identity = np.arange(n)
+    assert area_shape_difference(pair, identity, spectrum, spectrum) == pytest.approx(0, abs=1e-5)
+    padded = spectrum.pad(n + 7)
+    assert area_shape_difference(pair, identity, padded, padded) == pytest.approx(0, abs=1e-5)
+    # Pulled back by a constant map, all functions are constant: the operator has rank 1.
+    values = np.asarray(spectrum.eigenvectors)[5, :20]
+    expected = np.sqrt((19 + (values @ values - 1) ** 2) / 20)
+    constant = np.full(n, 5)
+    assert area_shape_difference(pair, constant, spectrum, spectrum) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_head_that_grows_has_a_larger_area_shape_difference_than_a_bent_body():
+    mesh = bumpy_mesh(3)
+    grown = make_mesh(
+        mesh.vertices * np.where(mesh.vertices[:, 2:] > 0, 1 + mesh.vertices[:, 2:], 1), mesh.faces
+    )
+    identity, spectrum = np.arange(len(mesh.vertices)), compute_spectrum(mesh, 30)
+    difference = area_shape_difference(Pair(mesh, grown), identity, spectrum, compute_spectrum(grown, 30))
+    assert difference > 0.3
 
 
 def test_scores_do_not_depend_on_unit_or_numbering():

@@ -74,8 +74,8 @@ class Alternatives:
             self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
         )
         self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
-        coarse = prepared.spectrum_x.truncate(chosen.eigenvectors)
-        self.judge = Judge(self.pair, coarse, settings, self.deformation)
+        coarse = (side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y))
+        self.judge = Judge(self.pair, *coarse, settings, self.deformation)
 
     def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
         mesh, spectrum, unit = side

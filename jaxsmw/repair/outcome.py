@@ -13,7 +13,13 @@ from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.pair import Pair
-from jaxsmw.repair.scores import discontinuous_parts, distortion, orientation_reversal, same_map
+from jaxsmw.repair.scores import (
+    area_shape_difference,
+    discontinuous_parts,
+    distortion,
+    orientation_reversal,
+    same_map,
+)
 from jaxsmw.repair.settings import RepairSettings
 
 
@@ -50,14 +56,14 @@ class Outcome(NamedTuple):
 def score(outcome: Outcome, settings: RepairSettings = RepairSettings()) -> float:  # noqa: B008 (immutable)
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
 
-    The score is the logarithm of the distortion plus the weighted uncertainty. The uncertainty comes from the
-    last stage whose refiner computes an uncertainty. If no refiner computes an uncertainty, the uncertainty
-    is zero.
+    The score is the logarithm of the distortion plus the weighted uncertainty and the weighted deformation.
+    The uncertainty comes from the last stage whose refiner computes an uncertainty. If no refiner computes an
+    uncertainty, the uncertainty is zero.
 
     **Arguments:**
 
     - `outcome`: the outcome. If the outcome's distortion is None, 1 is used instead.
-    - `uncertainty_weight`: the weight of the uncertainty; see `RepairSettings`.
+    - `settings`: the weights of the score.
 
     **Returns:** The score, without unit. The score is infinite if a stage failed.
     """
@@ -80,13 +86,16 @@ class Judge:
     **Attributes:**
 
     - `pair`: the source X (m vertices) and the target Y.
-    - `spectrum_x`: the spectrum of X with the largest available number of eigenvectors, because more
-      eigenvectors make faults easier to detect. The spectrum may be padded.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the largest available number of eigenvectors,
+      because more eigenvectors make faults easier to detect. The spectra may be padded.
     - `settings`: the thresholds and weights of the repair.
+    - `measure_deformation`: a function from a map X -> Y (m,) to its deformation; None if outcomes are judged
+      without deformations.
     """
 
     pair: Pair
     spectrum_x: Spectrum
+    spectrum_y: Spectrum
     settings: RepairSettings
     measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
 
@@ -109,7 +118,7 @@ class Judge:
         return outcome
 
     def score(self, outcome: Outcome) -> float:
-        """Return the `score` of an outcome with the uncertainty weight of the settings; lower is better."""
+        """Return the `score` of an outcome with the weights of the settings; lower is better."""
         return score(outcome, self.settings)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
@@ -137,6 +146,18 @@ class Judge:
         assert outcome.distortion is not None
         slightly_distorted = outcome.distortion < self.settings.doubtful
         return not outcome.suspicious or (slightly_distorted and not self.faults(outcome))
+
+    def isometric(self, outcome: Outcome) -> bool:
+        """Return whether a map preserves areas about as well as maps between poses of one body do.
+
+        Maps of partial pairs count as isometric, because areas of the full shape have no match.
+        """
+        if self.pair.partial:
+            return True
+        difference = area_shape_difference(
+            self.pair, self._matches(outcome), self.spectrum_x, self.spectrum_y, self.settings.scores
+        )
+        return difference < self.settings.non_isometric
 
     def same(self, first: Outcome, second: Outcome) -> bool:
         """Return whether the maps of two outcomes agree on nearly all of X; see `same_map`."""

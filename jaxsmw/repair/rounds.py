@@ -51,6 +51,9 @@ def refine_in_stages(
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
 
+    With `repair`, maps between non-isometric shapes are also refined further, because they converge slowly:
+    the repeated stage and all later stages run `repair.passes` more times.
+
     **Arguments:**
 
     - `prepared`: the pair with its spectra and its initial map.
@@ -70,11 +73,13 @@ def refine_in_stages(
     views = [prepared.view(stage) for stage in stages]
     runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
     first = prepared.padded_map(prepared.initial_map)
-    finest = max((of_x for of_x, _ in views), key=lambda of_x: of_x.eigenvalues.shape[0])
-    judge = Judge(prepared.pair, finest, repair or WITHOUT_REPAIR)
+    finest = max(views, key=lambda view: view[0].eigenvalues.shape[0])
+    judge = Judge(prepared.pair, *finest, repair or WITHOUT_REPAIR)
     best = judge.judged(refined or runner.run(0, Outcome([], first)))
-    if repair is None or not (best.successful and best.suspicious):
+    if repair is None or not best.successful:
         return best
+    if not best.suspicious:
+        return _Repairer(runner, judge, repair).refined_further(best)
     logger.info(
         "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
         best.distortion,
@@ -87,7 +92,8 @@ def refine_in_stages(
             judge = replace(judge, measure_deformation=proxies.deformation)
             alternatives = proxies.best(prepared.unpadded_map(best.pointwise_map))
     repairer = _Repairer(runner, judge, repair)
-    return repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives))
+    best = repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives))
+    return repairer.refined_further(best)
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -149,6 +155,18 @@ class _Repairer:
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best
+
+    def refined_further(self, outcome: Outcome) -> Outcome:
+        """Run the repeated stage and all later stages a few more times if the shapes are not isometric."""
+        if self.judge.isometric(outcome):
+            return outcome
+        further = outcome
+        for _ in range(self.settings.passes):
+            further = self._from_repeated(further)
+            if not further.successful:
+                return outcome
+        # A map that looked right before stays near that map, so it does not become suspicious.
+        return further._replace(suspicious=outcome.suspicious and not self.judge.looks_right(further))
 
     def _by_rounds(self, outcome: Outcome) -> Outcome:
         """Repair an outcome by rounds and by the fallback."""

