@@ -74,8 +74,10 @@ class Alternatives:
             self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
         )
         self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
-        coarse = (side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y))
-        self.judge = Judge(self.pair, *coarse, settings, self.deformation)
+        coarse_x, coarse_y = (
+            side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
+        )
+        self.judge = Judge(self.pair, coarse_x, coarse_y, settings, self.deformation)
 
     def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
         mesh, spectrum, unit = side
