@@ -480,9 +480,9 @@ def _write(
     from jaxsmw.report.collection_page import PageEdge, write_collection_page
     from jaxsmw.runtime.provenance import machine
 
-    by_name = dict(zip(_names(data), data.values(), strict=True))
-    kept = [by_name[name] for name in collection.names]
     names = dict(zip(data, _names(data), strict=True))
+    by_name = {names[file]: contents for file, contents in data.items()}
+    kept = [by_name[name] for name in collection.names]
     sources = {
         option: _number(collection, names[Path(file).name], file)
         for option in ("landmarks_of", "attributes_of")
