@@ -2,7 +2,7 @@
 
     python scripts/benchmark_batches.py [--vertices N] [--eigenvectors K] [--batch-sizes B ...] [--quick]
 
-The script refines the same random pairs in float32, with 3 iterations per pair. The following candidates
+Each candidate refines the same random pairs in float32, with 3 iterations per pair. The following candidates
 take turns in one process:
 
 - a Python loop over `refine`;
@@ -10,8 +10,8 @@ take turns in one process:
 - `jax.vmap` with several batch sizes;
 - `jaxsmw.refine_pairs`. The time of `refine_pairs` includes the transfer of initial maps and results.
 
-The lower bound is the time that the matrix products of all iterations take in full float32 precision. The
-table also states the temporary memory of each compiled program, without the program's arguments.
+The lower bound is the time of the matrix products of all iterations, computed in full float32 precision. The
+table also states the temporary memory of each compiled program. This memory excludes the program's arguments.
 """
 
 from __future__ import annotations

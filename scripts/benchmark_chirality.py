@@ -50,7 +50,7 @@ def _sides(file: Path) -> dict[str, str]:
 
 
 def _side(sides: dict[str, str], file: Path) -> str | None:
-    """Return the side of a shape. The file name may end in `_sas`, which the names in `sides` may lack."""
+    """Return the side of a shape. The file name may end in `_sas` even if the name in `sides` does not."""
     return sides.get(file.stem, sides.get(file.stem.removesuffix("_sas")))
 
 

@@ -1,4 +1,4 @@
-"""Measures consistent maps of collections against maps of single pairs, and ablations of their parts.
+"""Compares consistent maps of collections with maps of single pairs, and measures ablations of collections.
 
     pip install -e ".[benchmark]"
     python scripts/benchmark_collection.py DATA_DIRECTORY faust_r smal_r shrec19_r tosca_nonisometric
@@ -7,15 +7,16 @@
     python scripts/benchmark_collection.py DATA_DIRECTORY smal_r --ablations
     python scripts/benchmark_collection.py DATA_DIRECTORY faust_r --growth 35 70 140 280
 
-Each data set is matched as one collection. `SET/CLASS` selects the shapes whose names begin with CLASS. On
-random ordered pairs (seed 0), the errors of the maps through the template are compared with the errors of
-`jaxsmw.match` on the same pairs. Errors are mean geodesic distances to the ground truth, in thousandths of
-the square root of the target's area. For sets with landmarks, the error is the mean distance of carried
-landmarks to manual landmarks, in thousandths of the diagonal of the target's bounding box; `match` then
-carries the landmarks with its registered mesh, as `scripts/benchmark_transfer.py` does.
+Each data set is matched as one collection. `SET/CLASS` selects the shapes whose names begin with CLASS. The
+script draws random ordered pairs (seed 0). On these pairs, the script compares the errors of the maps through
+the template with the errors of `jaxsmw.match`. Errors are mean geodesic distances to the ground truth, in
+thousandths of the square root of the target's area. For sets with landmarks, the error is the mean distance
+of carried landmarks to manual landmarks. The unit is then a thousandth of the diagonal of the target's
+bounding box. On these sets, the registered mesh of `match` carries the landmarks, as in
+`scripts/benchmark_transfer.py`.
 
-`--growth` measures the time and the memory of collections with the given numbers of shapes. The shapes are
-those of the data set, decimated to about 1500 vertices. If more shapes are needed, each shape is repeated
+`--growth` measures the time and the memory of collections with the given numbers of shapes. The script
+decimates the shapes of the data set to about 1500 vertices. If more shapes are needed, each shape is repeated
 with other numbers of vertices, so that all triangulations differ.
 
 Finished pairs are kept in OUTPUT, so that an interrupted benchmark can be continued.
@@ -53,7 +54,7 @@ from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import transfer_landmarks
 
-# A pair is lost if its mean error is above this number of thousandths.
+# A pair is counted as lost if its mean error exceeds this number of thousandths.
 _LOST = 100
 _TRIANGLES = 1000
 
@@ -178,7 +179,7 @@ def _measure(
 
 
 def _growth(directory: Path, name: str, number: int) -> dict[str, Any]:
-    """Measure the time and the memory of a collection of small meshes, in a process of its own."""
+    """Measure the time and the memory of a collection of small meshes, in a separate process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(_matched_growth, _files(directory, name), number).result()
 
@@ -203,7 +204,7 @@ def _matched_growth(files: list[Path], number: int) -> dict[str, Any]:
 
 
 class _Unregistered:
-    """The map of a pair by the consistent points alone, without registered meshes."""
+    """The map of a pair, computed from the consistent points alone, without registered meshes."""
 
     def __init__(self, found: Collection, i: int, j: int):
         self.pointwise_map = vertex_map_between(
@@ -236,7 +237,10 @@ def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, sin
 
 
 def _cycles(found: Collection) -> dict[str, float]:
-    """Return mean cycle errors in thousandths: of random triangles through the template, and of the graph."""
+    """Return the cycle errors of random triangles through the template and of the graph, in thousandths.
+
+    The dictionary contains the mean of each kind of error. For the triangles, it also contains the median.
+    """
     generator = np.random.default_rng(0)
     number = len(found.meshes)
     errors = []

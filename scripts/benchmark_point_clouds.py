@@ -2,9 +2,9 @@
 
     python scripts/benchmark_point_clouds.py DATA_DIRECTORY/faust_r --pairs 20
 
-Pairs are drawn with seed 0. The points are all vertices of a mesh, displaced by normally distributed noise
-(seed 0). Each pair is matched as two meshes, as two point clouds, and as a point cloud and a mesh. Errors are
-geodesic errors on the mesh of the target, in thousandths of the square root of its area.
+Pairs are drawn with seed 0. A point cloud consists of all vertices of a mesh, displaced by normally
+distributed noise (seed 0). Each pair is matched as two meshes, as two point clouds, and as a point cloud and
+a mesh. Errors are geodesic errors on the mesh of the target, in thousandths of the square root of its area.
 """
 
 from __future__ import annotations

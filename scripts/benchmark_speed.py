@@ -16,10 +16,10 @@
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
 - `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
-  each size in a new process. The table states times, peak memory and errors. The table also states the
-  exponents of power laws in the number of vertices, fitted to time and memory.
+  each size in a new process. The table states times, peak memory and errors. The script also fits power laws
+  in the number of vertices to the times and the memory, and the table states their exponents.
 
-The candidates of a comparison take turns in one process, so other load on the machine affects all candidates.
+The candidates of a comparison take turns in one process, so that other load affects all candidates.
 Each ratio is computed from median times. The shapes are procedural creatures. To obtain the large shapes, the
 script splits edges of a creature and moves its vertices at random. With `--data`, the parts `peers` and
 `scale` use two people of the remeshed FAUST set instead of creatures. The script writes three files to DIR:
@@ -92,7 +92,7 @@ XLA_DEFAULTS = ", XLA's defaults"
 STORED = 10_000
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
-"""The title of a table, a note on the measurement, the rows of the table, and all measured numbers."""
+"""A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
 
 
 class PlainSearch(WaveletPreservation):
@@ -137,10 +137,10 @@ def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
 
 
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Return several implementations of the product of the eigenvector matrices of X and Y.
+    """Return a dictionary from names to functions that multiply the eigenvector matrices of X and Y.
 
-    The keys are names. Each function computes the product `ITERATIONS` times. The time of the fastest
-    function is a lower bound for the time of an exhaustive search.
+    The functions are different implementations. Each function computes the product `ITERATIONS` times. The
+    time of the fastest function is a lower bound for the time of an exhaustive search.
     """
     # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
@@ -397,8 +397,8 @@ class Truth(NamedTuple):
     def error(self, pointwise_map: np.ndarray, target: Mesh) -> float:
         """Return the mean geodesic error in thousandths of the square root of the target's area.
 
-        `target` may be a subdivided version of the target (see `finer`). Each match is replaced by the
-        nearest vertex of the original target.
+        The argument `target` may be a subdivided version of the target in `meshes` (see `finer`). Each match
+        is replaced by the nearest vertex of the target in `meshes`.
         """
         coarse = self.meshes[1]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
@@ -425,10 +425,11 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
 
 
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
-    """Split the longest edges of a mesh until there are `number_of_vertices`, and add noise to the positions.
+    """Split the longest edges of a mesh until it has `number_of_vertices` vertices, and move the vertices.
 
-    The standard deviation of the noise is 10 % of the mean edge length. The vertices of the given mesh keep
-    their indices. If the given mesh already has enough vertices, it is returned without noise.
+    The vertices move by random noise, whose standard deviation is 10 % of the mean edge length. The vertices
+    of the given mesh keep their indices. If the given mesh already has enough vertices, it is returned
+    without noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -455,7 +456,7 @@ def split_faces(
     **Arguments:**
 
     - `faces`: the faces of the mesh (f, 3).
-    - `middles` (f, 3): the new vertex on the edge from each corner to the next corner; -1 if the edge is not
+    - `middles`: for each corner, the new vertex on the edge to the next corner (f, 3); -1 if the edge is not
       split.
     - `number`: the number of split edges, 0 to 3. With 3 split edges, a face becomes four similar faces.
 
@@ -522,7 +523,7 @@ def matched_from_files(
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times and the memory of the presets `paper` and `accurate` for shapes of several sizes."""
+    """For each of the presets `paper` and `accurate`, yield times and memory for shapes of several sizes."""
     large = () if options.quick else LARGE
     yield scaled(options, "paper", (10_000, 30_000, *large))
     yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
@@ -648,7 +649,7 @@ def ours_from_files(
 def our_initial_map(*files: str) -> np.ndarray:
     """Return the initial map of `match`.
 
-    The map is cached, so the times of other libraries do not include its computation.
+    The map is cached, so the times of other libraries do not include the computation of the map.
     """
     return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
@@ -697,8 +698,8 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
 def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     """Refine our initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
 
-    The conversion from pointwise to functional maps uses vertex areas. geomfum's default conversion from
-    pointwise to functional maps ignores vertex areas. It is slower and less accurate.
+    The conversion from pointwise to functional maps uses vertex areas. geomfum's default conversion ignores
+    vertex areas, and is slower and less accurate.
     """
     from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
     from geomfum.laplacian import LaplacianSpectrumFinder
@@ -744,8 +745,8 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # A dotted line shows a run without our compiler options, in the colour of the run with these
-            # options.
+            # A dotted line shows a run without our compiler options. The line has the same colour as the line
+            # of the run with these options.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

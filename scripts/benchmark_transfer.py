@@ -1,4 +1,4 @@
-"""Measures registered meshes on remeshed bodies, and landmarks carried between teeth, jaws and skulls.
+"""Measures registered meshes of remeshed bodies, and landmarks carried between teeth, jaws and skulls.
 
     pip install -e ".[benchmark,peers]"
     python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
@@ -16,9 +16,9 @@ Four methods carry landmarks from the source to the target:
 - rigid alignment, and then projection to the nearest point of the target;
 - rigid alignment, non-rigid coherent point drift (pycpd), and then the same projection.
 
-Coherent point drift runs with three settings of alpha and beta. These settings were the best of twelve on six
-pairs of molars and six pairs of mandibles. Molars of opposite sides are matched with `mirror="yes"`, and all
-methods then use the mirror image of the source.
+Coherent point drift runs with three settings of alpha and beta. Twelve settings were tested on six pairs of
+molars and six pairs of mandibles, and these three were the best. Molars of opposite sides are matched with
+`mirror="yes"`. For such pairs, all methods use the mirror image of the source.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import RegisteredMesh, transfer_landmarks
 
-# The number of points of each shape for rigid alignment and for coherent point drift.
+# Rigid alignment and coherent point drift use this number of points of each shape.
 _POINTS = 1000
 
 
@@ -81,7 +81,10 @@ _BODIES = ("faust_r", "tosca_r", "smal_r")
 
 
 def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
-    """Return random pairs of meshes of a data set, or all pairs if there are fewer."""
+    """Return pairs of meshes of a data set in random order, at most `number`.
+
+    If there are fewer pairs, all pairs are followed by pairs in the reverse direction.
+    """
     listing = directory / "test_pairs.txt"
     if listing.exists():
         by_name = {file.stem: file for file in directory.rglob("*.off")}
@@ -115,7 +118,7 @@ def _measure_body(source: Path, target: Path) -> dict[str, Any]:
 def _register(
     mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool, init: MatchInit = "auto"
 ) -> tuple[Correspondence, RegisteredMesh, dict[str, float]]:
-    """Match and register a pair, and measure both times."""
+    """Match and register a pair, and measure the time of each of these two steps."""
     start = time.perf_counter()
     found = match(mesh_x, mesh_y, init=init, mirror="yes" if mirrored else "no")
     matched = time.perf_counter()
@@ -176,7 +179,7 @@ def _side(file: Path) -> str:
 def _aligned(
     mesh_x: Mesh, mesh_y: Mesh, marks: Float64[np.ndarray, "l 3"], hand: Float64[np.ndarray, " 3"]
 ) -> dict[str, Float64[np.ndarray, "l 3"]]:
-    """Carry landmarks by rigid alignment alone, and by rigid alignment followed by coherent point drift."""
+    """Carry landmarks by rigid alignment, once without and once with subsequent coherent point drift."""
     samples_x = mesh_x.vertices[farthest_point_samples(mesh_x, _POINTS)] * hand
     samples_y = mesh_y.vertices[farthest_point_samples(mesh_y, _POINTS)]
     (middle_x, size_x), (middle_y, size_y) = map(_placement, (samples_x, samples_y))
@@ -198,7 +201,7 @@ def _drifted(
 ) -> dict[str, Float64[np.ndarray, "l 3"]]:
     """Move landmarks by coherent point drift from x to y, once for each of several settings.
 
-    pycpd moves only the points that it aligns, so the landmarks are appended to x.
+    The landmarks are appended to x, because pycpd moves only the points that it aligns.
     """
     from pycpd import DeformableRegistration
 

@@ -11,7 +11,7 @@ line. The script writes the figures and these files to the output directory:
 
 - `summary.md`: all tables;
 - `results.csv`: the results of each variant on each pair;
-- `parameters.csv`: the errors for each number of eigenvectors, filters and iterations;
+- `parameters.csv`: the errors for each combination of the numbers of eigenvectors, filters and iterations;
 - `invariance.csv`: the similarity of wavelets around corresponding points;
 - `times.csv`: the times of each way to compute the functional map, and of the nearest-neighbour search;
 - `provenance.json`: versions, machine, seeds and settings.
@@ -71,7 +71,7 @@ QUICK = Settings(
 
 
 def evenly_spread(items: Sequence, count: int) -> list:
-    """Return `count` items that are evenly spread from first to last, or all items if there are fewer."""
+    """Return `count` items, spread evenly from the first to the last, or all items if there are fewer."""
     places = np.linspace(0, len(items) - 1, min(count, len(items)))
     return [items[int(place)] for place in np.round(places)]
 

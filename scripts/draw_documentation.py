@@ -5,8 +5,8 @@
 
 The script runs the code of the tutorial to draw the tutorial's pictures. The failure cases use procedural
 shapes. With a DATA_DIRECTORY (see docs/datasets.md), the script adds two failure cases with real shapes.
-One is a pair of SHREC'16 topology (`shrec16_topology`), and one is a non-isometric pair of TOSCA
-(`tosca_nonisometric`). The script takes several minutes.
+The first case is a pair of SHREC'16 topology (`shrec16_topology`). The second case is a non-isometric pair of
+TOSCA (`tosca_nonisometric`). The script takes several minutes.
 """
 
 import argparse
@@ -36,8 +36,8 @@ from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PICTURES = DOCS / "pictures"
-# A palette of 256 dithered colours suffices for smoothly coloured bodies. The files are then a third as large
-# as in full colour.
+# A palette of 256 dithered colours suffices for smoothly coloured bodies. With this palette, the files are a
+# third as large as with full colour.
 COLORS = 256
 
 
@@ -63,7 +63,7 @@ class Case(NamedTuple):
 
 
 def procedural_cases() -> Iterator[Case]:
-    """Yields the failure cases with procedural shapes, which need no data set."""
+    """Yield the failure cases with procedural shapes, which need no data set."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     truth = jaxsmw.evaluation.GroundTruth.of_all_vertices(pair.truth)
     yield Case("swapped_limbs", pair.source, pair.target, truth, {"init": "wks"}, {"init": "shot"})
@@ -83,7 +83,7 @@ def procedural_cases() -> Iterator[Case]:
 
 
 def real_cases(data: Path) -> Iterator[Case]:
-    """Yields the failure cases with real shapes."""
+    """Yield the failure cases with real shapes."""
     for name, directory, names, cure in (
         ("glued", "shrec16_topology", ("kid15", "kid00"), {"preset": "accurate"}),
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
@@ -96,7 +96,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Returns a sphere that is deformed into a body with five equal arms, and its undeformed vertices."""
+    """Return a sphere that is deformed into a body with five equal arms, and the vertices of the sphere."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -115,13 +115,13 @@ def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"
 def landmarks_on_arms(
     at_source: Float[np.ndarray, "m 3"], at_target: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "2 2"]:
-    """Returns the tips of two neighbouring arms as landmarks."""
+    """Return the tips of two neighbouring arms as landmarks."""
     tips = np.array([[1, 0, 0], [np.cos(2 * np.pi / 5), np.sin(2 * np.pi / 5), 0]])
     return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
 
 
 def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Returns the front part of the source as a separate mesh, and the ground truth of this mesh."""
+    """Return the front part of the source as a separate mesh, and the ground truth of this mesh."""
     full, ahead = pair.source, pair.source.vertices[:, 2]
     faces = full.faces[(ahead[full.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
     used, numbers = np.unique(faces, return_inverse=True)
@@ -133,7 +133,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 def coarser(
     pair: jaxsmw.geometry.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
-    """Returns a decimated target and its ground truth.
+    """Return a decimated target and its ground truth.
 
     Each true match is replaced by the nearest vertex of the decimated target.
     """
@@ -144,7 +144,7 @@ def coarser(
 
 
 def draw_case(case: Case) -> str:
-    """Writes the picture of a failure case, and returns the table row of this case."""
+    """Write the picture of a failure case, and return the table row of this case."""
     cells = []
     for settings in (case.failing, case.cure):
         if settings is None:
@@ -171,7 +171,7 @@ def draw_case(case: Case) -> str:
 
 
 def save_small(path: Path, figure: Figure | Path) -> None:
-    """Writes a figure or an image file as a PNG at most 1200 pixels wide, with few colours."""
+    """Write a figure or an image file as a PNG at most 1200 pixels wide, with few colours."""
     if isinstance(figure, Path):
         image = Image.open(figure)
     else:
@@ -190,7 +190,7 @@ def save_small(path: Path, figure: Figure | Path) -> None:
 
 
 def draw_tutorial() -> None:
-    """Runs the code of the tutorial, and saves the pictures that the tutorial shows."""
+    """Run the code of the tutorial, and save the pictures that the tutorial shows."""
     page = (DOCS / "tutorial.md").read_text("utf-8")
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL))
     previous_directory = Path.cwd()
@@ -205,7 +205,7 @@ def draw_tutorial() -> None:
 
 
 def draw_transfers() -> None:
-    """Draws landmarks, a registered mesh and a transferred texture on a pair of creatures."""
+    """Draw landmarks, a registered mesh and a transferred texture on a pair of creatures."""
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     mesh_x, mesh_y = pair.source, pair.target
     registered = jaxsmw.match(mesh_x, mesh_y).registered_mesh()
@@ -235,7 +235,7 @@ def draw_transfers() -> None:
 
 
 def draw_another_kind() -> None:
-    """Draws a collection of quadrupeds and one biped, each with the colours of the template."""
+    """Draw a collection of quadrupeds and one biped, each with the colours of the template."""
     kinds = [
         ("quadruped", pose, seed) for pose, seed in (("rest", 0), ("stand", 1), ("walk", 2), ("rest", 7))
     ]
@@ -252,7 +252,7 @@ def draw_another_kind() -> None:
 
 
 def draw_without_repair() -> None:
-    """Draw two different quadrupeds of a collection that was matched by `paper`, and by `accurate`."""
+    """Draw two different quadrupeds of a collection that was matched twice, by `paper` and by `accurate`."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
     found = {
         preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror=False)
@@ -274,21 +274,21 @@ def draw_without_repair() -> None:
 def spots(
     mesh: jaxsmw.Mesh, points: Float[np.ndarray, "l 3"], hues: Float[np.ndarray, "l 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns the colours of a grey mesh with a coloured spot at each point."""
+    """Return the colours of a grey mesh with a coloured spot at each point."""
     distances, nearest = KDTree(points).query(mesh.vertices)
     near = distances < 0.025 * np.sqrt(mesh.area)
     return np.where(near[:, None], hues[nearest], 0.8)
 
 
 def fold_lines(mesh: jaxsmw.Mesh) -> Float[np.ndarray, "n 3"]:
-    """Returns the colours of a mesh whose every fourth vertex is dark, which shows the triangulation."""
+    """Return colours that show the triangulation of a mesh. Every fourth vertex is dark."""
     dark = np.zeros(len(mesh.vertices), bool)
     dark[::4] = True
     return np.where(dark[:, None], [0.25, 0.3, 0.4], [0.85, 0.87, 0.9])
 
 
 def draw_side_by_side(name: str, panels: dict[str, tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]]) -> None:
-    """Writes a picture with one coloured mesh per panel."""
+    """Write a picture with one coloured mesh per panel."""
     images = []
     for mesh, colors in panels.values():
         buffer = io.BytesIO()

@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 1280, 850
 
 
 def main() -> None:
-    """Opens the page, and writes a screenshot."""
+    """Open the page, and write a screenshot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", metavar="PAGE.html", type=Path)
     parser.add_argument("picture", metavar="PICTURE.png", type=Path)
@@ -61,7 +61,7 @@ def main() -> None:
         finally:
             browser.quit()
     with atomic_write(options.picture) as temporary:
-        # A palette of 256 dithered colours looks the same as full colour, and halves the size of the file.
+        # A picture with 256 dithered colours looks the same as in full colour, and its file is half as large.
         picture.quantize(palette=picture.quantize(256)).save(temporary, format="png", optimize=True)
 
 

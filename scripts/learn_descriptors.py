@@ -12,9 +12,9 @@ of Adam (optax) uses one pair of the first five people of FAUST. The script trai
 `labels`, which needs ground truth, and one network with the loss `cycles`, which needs no ground truth.
 
 The script then tests both networks on pairs of the other five people of FAUST and on pairs of TOSCA. The
-preset `paper` refines each pair from four initial maps. Each initial map sends each vertex of X to the vertex
-of Y with the nearest descriptors. The four kinds of descriptors are SHOT, and the outputs of the untrained
-network and of the two trained networks. The script writes:
+preset `paper` refines each pair from four initial maps, which differ in their descriptors. Each initial map
+sends each vertex of X to the vertex of Y with the nearest descriptors. The four kinds of descriptors are
+SHOT, the output of the untrained network, and the outputs of the two trained networks. The script writes:
 
 - `summary.md`: the comparison;
 - `curves.png`: the losses against the training steps;
@@ -121,9 +121,10 @@ class WaveletBlock(eqx.Module):
     """A residual block that combines the features of each vertex with features of its neighbourhood.
 
     The block filters every channel on the surface. The filter of a channel is a weighted sum of the squared
-    filters of a Meyer frame, with learned weights. At each vertex, two dense layers take the normalised and
-    the filtered features. The output of the dense layers is added to the features. The result does not depend
-    on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the result.
+    filters of a Meyer frame, with learned weights. At each vertex, the normalised features and the filtered
+    features are the input of two dense layers. The output of these layers is added to the features. The
+    result does not depend on the signs of the eigenvectors. Renumbering the vertices permutes the rows of the
+    result.
     """
 
     shares: Float[Array, "filters width"]
@@ -182,7 +183,7 @@ class DescriptorNetwork(eqx.Module):
                 "Spectrum.with_descriptors"
             )
         waves = wave_kernel_signature(spectrum, dimensions=self.sizes.waves) - 1
-        # This factor scales the entries of SHOT descriptors, which have norm 1, to a mean square of 1.
+        # SHOT descriptors have norm 1. This factor scales their entries to a mean square of 1.
         inputs = jnp.concatenate([given * self.sizes.inputs**0.5, waves], axis=1)
         features = jax.vmap(self.enter)(inputs)
         for block in self.blocks:
@@ -198,7 +199,7 @@ def layer() -> WaveletPreservationLayer:
 
 
 class Shape(NamedTuple):
-    """The s sampled vertices of a shape: their spectrum with SHOT descriptors, and their positions."""
+    """The spectrum, with SHOT descriptors, and the positions of the s sampled vertices of a shape."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]

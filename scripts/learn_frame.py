@@ -6,21 +6,21 @@
 The script needs the extra `learn`: `pip install -e ".[learn]"`.
 
 DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The script trains a `SoftmaxFrame`, which
-is a Parseval frame for all parameters. Training starts close to the Meyer frame with six filters. Each step
-of Adam (optax) uses one pair of shapes of the first five people of FAUST. Gradients pass through
-`refine_softly` on samples of both shapes. The script trains one frame with each of these losses:
+is a Parseval frame for all values of its parameters. Training starts close to the Meyer frame with six
+filters. Each step of Adam (optax) uses one pair of shapes of the first five people of FAUST. Gradients pass
+through `refine_softly` on samples of both shapes. The script trains one frame with each of these losses:
 
 - `labels`: the distance between matches and the ground truth;
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
   This loss needs no ground truth.
 
-Both losses measure the distance of a soft match as a root mean square, weighted by the shares of the soft
-map.
+A soft match is a weighted set of points, and its weights are the shares of the soft map. In both losses, the
+distance of a soft match is the weighted root mean square of the distances of these points.
 
-The script then tests the frames on pairs of the other five people of FAUST and on pairs of TOSCA.
-`jaxsmw.refine` refines each pair with the Meyer frame and with both trained frames, from the same initial
-map. The script writes `summary.md` with the errors, and `frames.png` with the filters and losses. The script
-also writes the logits of the trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
+The script then tests the frames on pairs of the other five people of FAUST and on pairs of TOSCA. From the
+same initial map, `jaxsmw.refine` refines each pair with the Meyer frame and with both trained frames. The
+script writes `summary.md` with the errors, and `frames.png` with the filters and losses. The script also
+writes the logits of the trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
 `Warped(SoftmaxFrame(logits), Power())`. After an interruption, the same command continues from the saved
 state.
 """

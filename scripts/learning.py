@@ -29,10 +29,11 @@ from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, m
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10
 EVALUATED_POINTS = 500
-# The numbers of steps between two saves, and between two evaluations of the loss on the watched pairs.
+# The state is saved after every `_SAVED_EVERY` steps. The loss on the watched pairs is evaluated after every
+# `_WATCHED_EVERY` steps.
 _SAVED_EVERY, _WATCHED_EVERY = 10, 20
-# Shapes are padded to a multiple of this number of vertices. Shapes of similar size then share one compiled
-# program.
+# Shapes are padded to a multiple of this number of vertices, so that shapes of similar size share one
+# compiled program.
 _SIZES = 512
 
 Model = TypeVar("Model", bound=eqx.Module)
@@ -44,7 +45,8 @@ class Data(NamedTuple):
 
     **Attributes:**
 
-    - `seen`: the pairs in the pair list of FAUST that show only the first `TRAINING_PEOPLE` people.
+    - `seen`: those pairs in the pair list of FAUST in which both shapes belong to the first `TRAINING_PEOPLE`
+      people.
     - `seen_further`: all other pairs of these people that have ground truth.
     - `unseen`: the pairs of the other people in the pair list of FAUST, for evaluation.
     - `animals`: the pairs of TOSCA, for evaluation.
@@ -57,7 +59,7 @@ class Data(NamedTuple):
 
 
 def person(shape: str) -> int:
-    """Return the person's number for a shape. FAUST numbers the ten poses of a person consecutively."""
+    """Return the number of a shape's person. FAUST numbers the ten poses of each person consecutively."""
     return int(shape.rsplit("_", 1)[1]) // POSES
 
 
@@ -98,7 +100,8 @@ def root_mean_square(
 ) -> Float[Array, ""]:
     """Return the mean distance between the soft match of each point and its target position.
 
-    The distance of a soft match is a root mean square, weighted by the shares of the soft map.
+    A soft match is a set of points with weights, which are the shares of the soft map. The distance of a soft
+    match is the weighted root mean square of the distances of these points.
 
     **Arguments:**
 
@@ -250,7 +253,7 @@ def _evaluate(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """Open a file of arrays that equinox wrote. The body of the `with` statement must read the whole file.
+    """Open a file of arrays that equinox wrote. The body of a `with` statement must read the whole file.
 
     **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if the body leaves
     data unread.
@@ -295,7 +298,10 @@ def errors(
 
 
 Measured = dict[str, list[dict[str, float]]]
-"""A list for each data set. For each pair, the list contains a dictionary from map names to errors."""
+"""A dictionary from each data set to a list.
+
+For each pair, the list contains a dictionary from map names to errors.
+"""
 
 
 def measure(
@@ -309,8 +315,8 @@ def measure(
     """Measure the errors of random test pairs of FAUST and TOSCA.
 
     The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the file
-    already contains are not measured again. With the same seed, a smaller `number_of_pairs` selects a subset
-    of the pairs that a larger number selects.
+    already contains are not measured again. If the seed stays the same, the pairs for a smaller
+    `number_of_pairs` are a subset of the pairs for a larger number.
 
     **Arguments:**
 
@@ -398,7 +404,7 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
     """Read the arguments, open the data, and reserve the output directory for this process.
 
     `jaxsmw.runtime.journal.claimed_directory` writes the provenance of the results to `provenance.json` in
-    the output directory. Bad input and interruptions end the process with a message of one sentence.
+    the output directory. After bad input or an interruption, the process prints one sentence and ends.
 
     **Arguments:**
 

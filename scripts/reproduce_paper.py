@@ -4,10 +4,11 @@
         [--sets NAME ...] [--pairs N] [--quick]
 
 DATA_DIRECTORY contains data sets in the layouts of `docs/datasets.md`, each in its own directory. Each
-experiment uses only the data sets that suit this experiment:
+experiment uses only the data sets that suit it:
 
-- `table1`: all methods, on data sets in which each pair belongs to one class. The results are errors and
-  refinement times (Table 1), times with precomputation (Table 2), and correspondence quality curves (Fig. 4);
+- `table1`: all methods, on data sets in which both shapes of each pair belong to the same class. The results
+  are errors and refinement times (Table 1), times with precomputation (Table 2), and correspondence quality
+  curves (Fig. 4);
 - `fig6`: partial shapes, separately for cuts and holes;
 - `fig7`: shapes with topological noise;
 - `fig9`: targets with other triangulations and resolutions, and other initial maps;
@@ -16,8 +17,8 @@ experiment uses only the data sets that suit this experiment:
 - `settings`: MWP and the other methods with settings that differ from the published settings, on the data
   sets of `table1`.
 
-In the output directory, the script creates one directory for each run, with the same files as
-`jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same
+In the output directory, the script creates one directory for each run. This directory contains the same files
+that `jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same
 command continues from the saved results. With `--quick`, the script takes minutes on shapes with 5000
 vertices.
 """
@@ -51,11 +52,12 @@ from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.workers import open_executor
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# The number of pairs in `fig9` is `--pairs` (40 if not given) divided by this number, but at least 2.
+# The number of pairs in `fig9` is the value of `--pairs` divided by this number, but at least 2. Without
+# `--pairs`, 40 is divided by this number.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
 # These initial maps come from descriptors that cannot distinguish left from right. The maps "shot" and
-# "functional" come from SHOT, which can.
+# "functional" come from SHOT, which can distinguish left from right.
 _MIRRORED = {"wks", "hks", "wavelet"}
 
 
@@ -71,7 +73,7 @@ class Run(NamedTuple):
 
 
 def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
-    """Opens the data sets with the given names in a directory, or all data sets if no names are given.
+    """Open the data sets with the given names in a directory, or all data sets if no names are given.
 
     **Raises:** `InputError` if a named data set cannot be opened, or if there is no data set.
     """
@@ -91,21 +93,21 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
 
 
 def is_isometric(data_set: DataSet) -> bool:
-    """Returns whether all pairs consist of two full shapes of one class without topological noise."""
+    """Return whether all pairs consist of two full shapes of one class without topological noise."""
     special = ("SHREC'16 partial", "SHREC'16 topology")
     within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
     return within and data_set.layout not in special
 
 
 def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs of all methods on full near-isometric shapes."""
+    """Yield the runs of all methods on full near-isometric shapes."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("table1", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs that match partial shapes to full shapes."""
+    """Yield the runs that match partial shapes to full shapes."""
     for data_set in data_sets:
         if data_set.layout != "SHREC'16 partial":
             continue
@@ -124,7 +126,7 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs on shapes with topological noise."""
+    """Yield the runs on shapes with topological noise."""
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
             pairs = chosen(data_set, options)
@@ -132,7 +134,7 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs with remeshed targets, and the runs from other initial maps."""
+    """Yield the runs with remeshed targets, and the runs from other initial maps."""
     some = {name: METHODS[name] for name in FIG9_METHODS}
     few = argparse.Namespace(**{**vars(options), "pairs": max(2, (options.pairs or 40) // FIG9_SHARE)})
     for data_set in filter(is_isometric, data_sets):
@@ -150,7 +152,7 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
 
 
 def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs on non-isometric shapes, with published results from the same initial maps."""
+    """Yield the runs on non-isometric shapes, with published results from the same initial maps."""
     for data_set in data_sets:
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
@@ -170,14 +172,14 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yields the runs with settings that differ from the published settings."""
+    """Yield the runs with settings that differ from the published settings."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
 
 
 def other_settings() -> dict[str, Method]:
-    """Returns the methods with their published settings, and with each change in `_CHANGES`."""
+    """Return the methods with their published settings, and with each change in `_CHANGES`."""
     found = {"initial": METHODS["initial"]}
     for name, changes in _CHANGES.items():
         method = found[name] = METHODS[name]
@@ -208,38 +210,39 @@ EXPERIMENTS = {f.__name__: f for f in (table1, fig6, fig7, fig9, nonisometric, s
 
 
 def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
-    """Returns the pairs of a data set that the run measures."""
+    """Return the pairs of a data set that the run measures."""
     return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
 
 
 def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str, Method]:
-    """Returns all methods that can match the pairs. With `--quick`, returns only three fast methods."""
+    """Return all methods that can match the pairs. With `--quick`, return only three fast methods."""
     every = suited_methods(pairs)
     return {name: every[name] for name in ("initial", "mwp", "zoomout-sampled")} if options.quick else every
 
 
 def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
-    """Returns the benchmark settings of a run. Only the initial map and mirroring differ between runs."""
+    """Return the benchmark settings of a run. Only the initial map and mirroring differ between runs."""
     return Settings(init, mirrored, 200 if options.quick else None, options.seed)
 
 
 def published(data_set: DataSet) -> list[str]:
-    """Returns the directories of the published maps of a data set."""
+    """Return the directories of the published maps of a data set."""
     return sorted(str(path) for path in (data_set.directory / "maps").glob("*") if path.is_dir())
 
 
 def _can_mirror(init: str, pairs: list[DataPair]) -> bool:
-    """Returns whether maps refined from `init` may also be compared with the mirrored ground truth."""
+    """Return whether maps refined from `init` may also be compared with the mirrored ground truth."""
     ambiguous = init in _MIRRORED or "symm" in Path(init).name
     return ambiguous and all(pair.mirrored_truth is not None for pair in pairs)
 
 
-# A new mesh and, for each of its vertices, the old vertex at the same position (-1 if there is none).
+# A pair of a new mesh and an array. For each vertex of the new mesh, the array contains the old vertex at the
+# same position, or -1 if there is no such vertex.
 Remeshed = tuple[Mesh, Int64[np.ndarray, " n"]]
 
 
 def finer(mesh: Mesh) -> Remeshed:
-    """Splits every face into four faces."""
+    """Split every face into four faces."""
     vertices, faces = igl.upsample(mesh.vertices, mesh.faces, 1)
     old = np.full(len(vertices), -1)
     old[: len(mesh.vertices)] = np.arange(len(mesh.vertices))
@@ -247,12 +250,12 @@ def finer(mesh: Mesh) -> Remeshed:
 
 
 def coarser(mesh: Mesh) -> Remeshed:
-    """Collapses edges, the shortest edges first, until a quarter of the faces are left."""
+    """Collapse edges, the shortest edges first, until a quarter of the faces are left."""
     return _decimate(mesh, mesh.vertices, len(mesh.faces) // 4)
 
 
 def uneven(mesh: Mesh) -> Remeshed:
-    """Collapses edges until half of the faces are left. Faces are smaller towards one end of the body."""
+    """Collapse edges until half of the faces are left. Faces are smaller towards one end of the body."""
     centered = mesh.vertices - mesh.vertices.mean(axis=0)
     _, _, axes = np.linalg.svd(centered, full_matrices=False)
     along = centered @ axes[0]
@@ -269,7 +272,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """Writes a data set with the sources of the pairs and their remeshed targets, and opens this data set."""
+    """Write a data set with the sources of the pairs and their remeshed targets, and open this data set."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")
@@ -291,7 +294,7 @@ def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[
 
 
 def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[str, MethodSummary]]:
-    """Measures the missing results of a run, and writes its tables."""
+    """Measure the missing results of a run, and write its tables."""
     directory = make_directory(output / run.experiment / run.name)
     print(f"{run.experiment}: {run.name}, {len(run.pairs)} of {len(run.data_set.pairs)} pairs")
     results = run_benchmark(run.data_set, run.pairs, directory, run.methods, run.settings, executor)
@@ -301,7 +304,7 @@ def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[s
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
-    """Returns a table for each experiment, with the mean error and the seconds of each method in each run."""
+    """Return a table for each experiment, with the mean error and the seconds of each method in each run."""
     parts = [
         "# The paper's comparisons",
         "Each cell contains the mean error x 10⁻³ √area, and the seconds from the initial map to the result.",

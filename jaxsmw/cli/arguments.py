@@ -57,7 +57,7 @@ def path(text: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """Return the beginning of a long text, for a message."""
+    """Shorten a text for a message. A long text is cut, and an ellipsis marks the cut."""
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 

@@ -30,15 +30,15 @@ BANKS = {
     "identity": "Identity",
 }
 _PAPER_BANK = next(iter(BANKS))
-# A filter bank whose name has this prefix is warped by the distribution of the eigenvalues.
+# If the name of a filter bank has this prefix, the bank is warped by the distribution of the eigenvalues.
 _ADAPTED = "adapted-"
-# The largest accepted number of filters. Filter banks need at most as many filters as there are eigenvalues,
-# and spectra contain fewer than 10 000 eigenvalues.
+# The largest accepted number of filters. A bank never needs more filters than there are eigenvalues, and
+# spectra contain fewer than 10 000 eigenvalues.
 _MOST_FILTERS = 10_000
 
 
 def add_bank(parser: argparse._ActionsContainer) -> None:
-    """Add `--bank` and `--filters`. If the user omits an option, its value is None."""
+    """Add `--bank` and `--filters`. If the user omits one of these options, its value is None."""
     parser.add_argument(
         "--bank",
         choices=tuple(BANKS),

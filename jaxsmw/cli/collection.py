@@ -185,7 +185,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
-    """Return the mesh files of a collection: a dictionary from file names to paths, in alphabetical order.
+    """Return a dictionary from the name of each mesh file of a collection to its path, in alphabetical order.
 
     **Raises:** `InputError` if the directory cannot be read, contains fewer than two mesh files, or does not
     contain an excluded file.
@@ -220,12 +220,12 @@ _COMPANIONS = (
     *(".txt", ".json", ".csv", ".md", ".pdf", ".mtl", ".bin"),
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".tga"),
 )
-# The most files that a note names.
+# A note names at most this number of files.
 _NAMED_FILES = 8
 
 
 def _note_other_files(options: argparse.Namespace) -> None:
-    """Name the files of the directory that are neither meshes nor usual companions of meshes."""
+    """Print a note that names the files that are neither meshes nor usual companions of meshes."""
     from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
     from jaxsmw.io.mesh_data import MESH_SUFFIXES
 
@@ -247,7 +247,7 @@ def _note_other_files(options: argparse.Namespace) -> None:
 
 
 def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[str, Path]) -> str:
-    """Return the path of a mesh of the directory, which can be given by its path or by its name alone.
+    """Return the path of a mesh in the directory. The user gives either the path or only the file name.
 
     **Raises:** `InputError` if there is no such mesh.
     """
@@ -291,14 +291,14 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
         )
 
 
-# The directories of the results, from which outdated files are removed.
+# The directories of the results. Temporary files that killed runs left in these directories are removed.
 _RESULTS = ("maps", "registered", "landmarks", "attributes", "work")
 # The longest file name that usual file systems allow, in bytes.
 _LONGEST_NAME = 255
 
 
 def _refuse_results_as_inputs(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
-    """Refuse inputs that the results would replace, and names that are too long for the files of results."""
+    """Refuse inputs that the results would replace, and mesh names that are too long for result files."""
     output = Path(os.path.realpath(options.output))
     for file in filter(None, [*map(str, files.values()), options.landmarks]):
         path = Path(os.path.realpath(file))
@@ -319,7 +319,7 @@ def _same(file: str, other: Path) -> bool:
 
 
 def _landmark_suffix(file: str) -> str:
-    """Return the suffix with which transferred landmarks are written."""
+    """Return the suffix of the files to which transferred landmarks are written."""
     name = Path(file).name.lower()
     if name.endswith(".mps"):
         return ".csv"
@@ -327,7 +327,7 @@ def _landmark_suffix(file: str) -> str:
 
 
 def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
-    """Return the mesh file with the name of a landmark file.
+    """Return the mesh file that has the same name as a landmark file, apart from the suffix.
 
     **Raises:** `InputError` if there is not exactly one such mesh.
     """
@@ -344,8 +344,8 @@ def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
 def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData], dict[str, str]]:
     """Read all meshes.
 
-    **Returns:** A dictionary from file names to meshes, and a dictionary from the names of unreadable files
-    to the reasons.
+    **Returns:** A dictionary from file names to meshes, and a dictionary from the name of each unreadable
+    file to the reason why it cannot be read.
 
     **Raises:** `InputError` if fewer than two meshes can be read.
     """
@@ -392,7 +392,11 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 
 def _names(data: Mapping[str, MeshData]) -> list[str]:
-    """Return the file names without suffix, unless two of these names are equal."""
+    """Return a different name for each mesh. The name is the file name without suffix if possible.
+
+    If two of these names are equal, dots in the file names are replaced by underscores instead. If two of the
+    resulting names are also equal, the complete file names are used.
+    """
     stems = [Path(name).stem for name in data]
     for names in (stems, [name.replace(".", "_") for name in data]):
         if len(set(names)) == len(names):
@@ -453,10 +457,12 @@ def _measures(model: ShapeModel) -> dict[str, Any]:
     return found
 
 
-# If sizes differ by a larger factor, the meshes probably have different units of length.
+# If the sizes of two meshes differ by more than this factor, the meshes probably have different units of
+# length.
 _DIFFERENT_SIZES = 4
 
-# Generalisation and specificity are reported for these numbers of modes, as far as the model has them.
+# Generalisation and specificity are reported for these numbers of modes. Numbers that are too large for the
+# model are left out.
 _REPORTED_MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 
 
@@ -501,7 +507,7 @@ def _write(
         files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
     shared = _provenance(options)
     changeable = ["edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of"]
-    changeable += ["workers", "scheduler"]  # which hardly change results, but change times
+    changeable += ["workers", "scheduler"]  # these options hardly change the results, but change the times
     settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
     provenance = {**shared, "settings": settings, "machine": machine()}
     write_summary(collection, measures, directory, provenance, [*files, directory / "index.html"])
@@ -531,7 +537,7 @@ def _write(
 
 
 def _number(collection: Collection, name: str, file: str) -> int:
-    """Return the number of the mesh with the given name, which was read from `file`."""
+    """Return the number of the mesh with the given name. The mesh was read from `file`."""
     if name not in collection.names:
         raise InputError(f"{file}: was left out of the collection: choose another mesh.")
     return collection.names.index(name)

@@ -35,8 +35,8 @@ def measure_match(
     - `truth`: the ground truth, or None.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
     - `stopwatch`: the stopwatch to which the time of the measurement is added.
-    - `others`: a dictionary from the name of each further map to this map. The initial map and the refined
-      map are always measured.
+    - `others`: a dictionary from names to further maps that are measured. The initial map and the refined map
+      are always measured.
 
     **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
     `others`, and `refined`. The dictionary is empty if there is no ground truth.
@@ -60,7 +60,7 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 
 
 def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarray, " m"] | None) -> None:
-    """Print one line with the quality of a match. Nothing is printed if nothing is known.
+    """Print one line with the quality of a match. If nothing is known about the quality, print nothing.
 
     **Arguments:**
 
@@ -96,7 +96,7 @@ def write_match_report(
     - `errors`: the dictionary that `measure_match` returns.
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
-    - `registered`: the registered mesh, if it was already computed.
+    - `registered`: the registered mesh if it was already computed; None otherwise.
     """
     from jaxsmw.report.summary import write_report
 

@@ -83,7 +83,7 @@ class Stopwatch:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Return a context manager that measures the time of its block, as a step with the given name.
+        """Return a context manager that records the time of its block as a step with the given name.
 
         If several steps have the same name, their times are added up.
         """

@@ -67,7 +67,7 @@ def read_maps(
 ) -> dict[str, Int64[np.ndarray, " m"]]:
     """Read pointwise maps X -> Y with `jaxsmw.read_pointwise_map`.
 
-    **Returns:** A dictionary from the name of each file to its map (m,), as 0-based vertices of Y.
+    **Returns:** A dictionary from the name of each file to its map, an array (m,) of 0-based vertices of Y.
 
     **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
     """
@@ -101,7 +101,7 @@ def initial_map(text: str) -> str:
 def initial_map_files(init: str) -> list[str]:
     """Return the names of the files in a value of `--init`.
 
-    For `landmarks:A,B`, the names are A and B, unless a file named `A,B` exists.
+    For `landmarks:A,B`, the names are A and B. If a file named `A,B` exists, its name is returned instead.
     """
     kind, _, file = init.partition(":")
     source, _, target = file.partition(",")
@@ -113,8 +113,9 @@ def initial_map_files(init: str) -> list[str]:
 def check_initial_map(init: str) -> None:
     """Check the suffixes of landmark files in a value of `--init`, before any file is read.
 
-    **Raises:** `InputError` if a file contains landmarks of one mesh, but the value does not name the file of
-    the other mesh. `InputError` is also raised if the landmarks of a mesh are not in a known format.
+    **Raises:** `InputError` if the value names one file with the landmarks of one mesh, but no file with the
+    landmarks of the other mesh. `InputError` is also raised if the value names two files, and the format of
+    one of them is unknown.
     """
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
@@ -124,7 +125,7 @@ def check_initial_map(init: str) -> None:
     if len(files) > 1:
         for file in files:
             check_readable_suffix(file)
-    # A single file contains a source and a target vertex per line, under any other suffix.
+    # A single file with any other suffix contains a source vertex and a target vertex per line.
     elif files[0].lower().endswith(LANDMARK_SUFFIXES):
         raise InputError(
             f"{files[0]}: contains landmarks of one mesh only: give the landmarks of both meshes, as --init "
@@ -155,7 +156,8 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks on the source and on the target, and match them by name.
 
-    **Returns:** For each name in both files, the nearest vertex of X and of Y, an array (l, 2).
+    **Returns:** An array (l, 2) with one row for each name that is in both files. A row contains the vertex
+    of X nearest to the source landmark, and the vertex of Y nearest to the target landmark.
     """
     from jaxsmw.geometry.mesh import count_of
     from jaxsmw.io.landmark_files import read_landmark_file
@@ -174,7 +176,7 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
-    """For a `.mat` file without `--index-base`, print a note that indices are read as 1-based."""
+    """Print a note that the indices of a `.mat` file are read as 1-based, unless `--index-base` is given."""
     from jaxsmw.io.mat_files import is_mat_file
 
     if index_base is None and is_mat_file(file):

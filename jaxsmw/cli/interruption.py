@@ -34,8 +34,8 @@ _ending = allocate_lock()
 def end_when_interrupted() -> None:
     """Install a handler that ends this process on SIGINT.
 
-    If the process was started with SIGINT ignored, no handler is installed. The function must be called in
-    the main thread.
+    If SIGINT was already ignored when the process started, no handler is installed. The function must be
+    called in the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         return
@@ -53,8 +53,8 @@ def announce_consequence(consequence: str) -> None:
 
     **Arguments:**
 
-    - `consequence`: a clause that says what happens to the results of an interrupted command. It does not end
-      with a full stop.
+    - `consequence`: a clause that says what happens to the results of an interrupted command. The clause does
+      not end with a full stop.
     """
     global _message
     # The message begins with a newline because the cursor is at the end of the progress bar.
@@ -67,7 +67,7 @@ def quiet_children() -> Iterator[None]:
 
     The context manager applies to processes that this thread starts in the block. On Ctrl-C, a terminal also
     sends SIGINT to these processes. Therefore the context manager blocks SIGINT in this thread, and the child
-    processes inherit this setting. This process still receives SIGINT, in another thread. The context manager
+    processes inherit this setting. Another thread of this process still receives SIGINT. The context manager
     also silences the warning of Python's resource tracker about leaked semaphores.
     """
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
@@ -117,7 +117,7 @@ def _remove_unfinished_files() -> None:
 
 
 def _die() -> None:
-    """End the process by SIGINT. A shell ends a loop only if SIGINT terminated the command in the loop."""
+    """End the process by SIGINT, because a shell ends a loop only if SIGINT terminated the loop's command."""
     with suppress(Exception):
         try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -156,7 +156,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Return each requested directory with the names of the files that the command writes to it."""
+    """Return the requested directories, each with the names of the files that the command writes to it."""
     directories: list[tuple[str, tuple[str, ...]]] = []
     if options.texture:
         from jaxsmw.report.figures import check_drawable

@@ -83,8 +83,8 @@ def measure_errors(
 
     **Arguments:**
 
-    - `maps`: a dictionary from names to maps X -> Y. A map is an array (m,) of 0-based vertices of Y, or m
-      `SurfacePoints` on Y.
+    - `maps`: a dictionary from names to maps X -> Y. A map is an array (m,) of 0-based vertices of Y, or one
+      `SurfacePoints` with m points on Y.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
 
     **Returns:** A dictionary from the name of each map to its geodesic errors.

@@ -39,7 +39,7 @@ _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _PAPER_SOLUTION = next(iter(_SOLUTIONS))
 
-# The options that change the method of the MWP paper, as attribute names of the parsed options.
+# These attributes of the parsed options belong to the options that change the method of the MWP paper.
 _CHANGES = (
     "eigenvectors",
     "bank",
@@ -159,14 +159,14 @@ def check_preset(options: argparse.Namespace) -> None:
 def preset_name(options: argparse.Namespace) -> PresetName:
     """Return the name of the preset to use.
 
-    Without `--preset`, the preset is `paper` if the user sets an option that changes the paper's method.
-    Otherwise, the default preset is used.
+    If `--preset` is missing, and an option changes the paper's method, the preset is `paper`. If `--preset`
+    and all such options are missing, the default preset is used.
     """
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
 
 def given_method(options: argparse.Namespace) -> list[str]:
-    """Return the names of the given options that have no effect without a match, such as `--preset`."""
+    """Return the names of the given options that have an effect only on a match, such as `--preset`."""
     given = _changes(options)
     given += ["--preset"] if options.preset else []
     defaults = {"init": DEFAULT_MATCH_INIT, "mirror": DEFAULT_MIRROR}
@@ -236,7 +236,7 @@ def _say_hand(correspondence: Correspondence) -> None:
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
-    """Return a stage with the MWP paper's method and the changes that the options request."""
+    """Return a stage that runs the MWP paper's method with the changes that the options request."""
     from jaxsmw.stage import Stage
 
     settings: dict[str, Any] = {

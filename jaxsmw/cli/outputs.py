@@ -35,8 +35,8 @@ def check_outputs(
     - `files`: the files that the command writes, except figures and pages.
     - `figures`: the pictures that the command writes (PNG, PDF or SVG).
     - `pages`: the interactive HTML pages that the command writes.
-    - `directories`: each directory that the command creates, with the names of the files in it. A directory
-      may occur several times.
+    - `directories`: a list of pairs. Each pair contains a directory that the command creates, and the names
+      of the files in this directory. A directory may occur several times.
 
     **Raises:** `InputError` that names the first path that cannot be written.
     """
@@ -82,7 +82,7 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
 
 
 def report_directories(directory: str | None) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the directory of a report with the names of its files, for `check_outputs`.
+    """Return a list with the directory of a report and the names of its files, as `check_outputs` expects.
 
     The list is empty if `directory` is None.
 

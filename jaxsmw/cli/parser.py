@@ -36,7 +36,8 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse the words of a command line like argparse, but first refuse unknown options.
 
-        argparse would first report the missing options, for example `--output` if the user wrote `--outptu`.
+        argparse alone would first report missing options. For example, if the user wrote `--outptu`, argparse
+        would report that `--output` is missing.
         """
         words = sys.argv[1:] if args is None else list(args)
         if (unknown := self._unknown_option(words)) is not None:
@@ -48,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(words, namespace)
 
     def _unknown_option(self, words: Sequence[str]) -> str | None:
-        """Return the first word that looks like an option but is none, without the value after `=`."""
+        """Return the first word that looks like an option but is unknown, without the value after `=`."""
         known = self._option_string_actions
         if not {"-h", "--help"}.isdisjoint(words):
             return None
@@ -60,7 +61,8 @@ class Parser(argparse.ArgumentParser):
             # Like argparse, treat negative numbers and words with blanks as values.
             if name in known or " " in word or not re.match(r"-(?!\.?\d).", word):
                 continue
-            # For a value such as `-z` after `--up`, argparse reports that the value of `--up` is missing.
+            # A word such as `-z` after `--up` is not reported here, because argparse then reports that the
+            # value of `--up` is missing.
             if len(word) > 2 or i == 0 or words[i - 1] not in known or known[words[i - 1]].nargs == 0:
                 return name
         return None
@@ -80,7 +82,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> Parser:
-    """Return the parser of all commands. Parsed options contain the command's function as attribute `run`."""
+    """Return the parser of all commands. The attribute `run` of parsed options is the command's function."""
     parser = Parser(
         prog="jaxsmw",
         description="Match two triangle meshes (OFF, OBJ, PLY, STL, VTK, glTF or MATLAB's MAT) of the same "

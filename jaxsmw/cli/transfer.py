@@ -230,7 +230,7 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
 ) -> tuple[Correspondence | None, RegisteredMesh]:
-    """Return the match, or None if a map is given, and the registered mesh."""
+    """Return the match and the registered mesh. If a map is given, the match is None."""
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
 
     meshes, index_base = (source.mesh, target.mesh), options.index_base
@@ -287,12 +287,12 @@ def _show_landmarks(found: TransferredLandmarks) -> None:
         )
 
 
-# Landmarks are marked if their expected error exceeds this multiple of the median of all landmarks.
+# A landmark is marked if its expected error exceeds this multiple of the median expected error.
 _LARGE = 2
 
 
 def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
-    """Write a mesh with its data, and print what the format cannot hold."""
+    """Write a mesh with its data, and print notes about data that the format cannot hold."""
     from jaxsmw.io.mesh_data import write_mesh_data
 
     with stopwatch.step("writing"):

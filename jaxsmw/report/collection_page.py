@@ -29,10 +29,12 @@ from jaxsmw.runtime.files import atomic_write
 MOST_VERTICES = 20_000
 """The largest number of vertices of each shape on a page. Larger triangulations are simplified."""
 
-# The page has sliders and scores for at most `_MODES` modes. Modes with a smaller share of the variance than
-# `_SMALLEST_SHARE` are not visible, so they are left out, except for the first two modes.
+# The page has sliders and scores for at most `_MODES` modes. Modes whose share of the variance is smaller
+# than `_SMALLEST_SHARE` are left out, because their effect is not visible. The first two modes are always
+# kept.
 _MODES, _SMALLEST_SHARE = 10, 0.002
-# The number of shapes that determine the upright position and the direction of view, besides the template.
+# The template and at most this number of other shapes determine the upright position and the direction of
+# view.
 _SHAPES_IN_VIEW = 8
 _ROUNDS_OF_LAYOUT = 200
 
@@ -71,11 +73,11 @@ def write_collection_page(
     warning: str = "",
     up: Axis | None = None,
 ) -> None:
-    """Writes a web page that shows all shapes of a collection, their matches and their shape model.
+    """Write a web page that shows all shapes of a collection, their matches and their shape model.
 
-    On the page, equal colours mark the same point of the body on every shape. A user can compare any two
-    shapes, and deform the mean shape along the modes of the model. Plots show the matched pairs and the
-    scores of the shapes. The page is one file and needs no network.
+    On the page, each point of the body has the same colour on every shape. A user can compare any two shapes,
+    and deform the mean shape along the modes of the model. Plots show the matched pairs and the scores of the
+    shapes. The page is one file and needs no network.
 
     **Arguments:**
 
@@ -85,11 +87,11 @@ def write_collection_page(
     - `registered`: the positions of the template's vertices on each shape, N arrays (n, 3).
     - `template`: the index of the template.
     - `edges`: the matched pairs of shapes.
-    - `model`: the shape model of the registered shapes, in the same order and with the template as reference.
-      None for a page without mean shape, modes and scores.
+    - `model`: the shape model of the registered shapes; None for a page without mean shape, modes and scores.
+      The model must contain the shapes in the same order, and its reference must be the template.
     - `title`: the heading of the page.
     - `notes`: sentences about decisions, such as the choice of the template.
-    - `left_out`: a dictionary from names of shapes that are not on the page to reasons.
+    - `left_out`: a dictionary from the name of each shape that is not on the page to the reason.
     - `warning`: a sentence below the heading, or an empty text.
     - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis from several shapes.
@@ -105,7 +107,7 @@ def write_collection_page(
     _check(names, faces, registered, template, edges, model)
     corners = np.asarray(faces, dtype=np.int64)
     first = Mesh(np.asarray(registered[template], dtype=np.float64), corners, names[template])
-    # Without a model, the shapes are aligned in the same way, and their modes are not shown.
+    # If no model is given, a model is computed here only to align the shapes. Its modes are not shown.
     shown_model = model or shape_model(registered, weights=first.vertex_areas, reference=template)
     template_mesh = replace(first, vertices=shown_model.aligned[template])
     some = [
@@ -115,7 +117,7 @@ def write_collection_page(
         if i == template or replace(first, vertices=shown_model.aligned[i]).area > 0
     ]
     if up is None:
-        # All shapes are aligned, so each shape gives a guess.
+        # All shapes are aligned, so the guess for each shape is a guess for all shapes.
         guesses = [guess_up(replace(first, vertices=shown_model.aligned[i])) for i in some]
         up = Counter(guesses).most_common(1)[0][0]
     standing = stand(template_mesh, up)
@@ -164,8 +166,8 @@ def write_collection_page(
 def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.ndarray, "g 3"]]:
     """Choose vertices of a mesh and a triangulation of them, so that the picture of the mesh hardly changes.
 
-    The shortest edges are collapsed first (`igl.decimate`). A mesh that is not manifold only loses its
-    unreferenced vertices.
+    The shortest edges are collapsed first (`igl.decimate`). If the mesh is not manifold, only its
+    unreferenced vertices are removed.
 
     **Arguments:**
 
@@ -196,18 +198,19 @@ def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.n
 def layout(
     shapes: Float64[np.ndarray, "N n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "N 2"]:
-    """Places shapes in the plane so that their distances resemble the distances of the shapes.
+    """Place shapes as points in the plane. The distances of the points resemble the distances of the shapes.
 
-    The distance of two aligned shapes is the root mean square over the surface. Classical multidimensional
-    scaling gives the first places (Torgerson 1952). Majorisation then reduces the sum of squared differences
-    of distances (de Leeuw, "Applications of convex analysis to multidimensional scaling", 1977).
+    The distance of two aligned shapes is the root mean square, over the surface, of the distances of
+    corresponding points. Classical multidimensional scaling gives the initial places (Torgerson 1952).
+    Majorisation then reduces the sum of the squared differences between the distances in the plane and the
+    distances of the shapes (de Leeuw, "Applications of convex analysis to multidimensional scaling", 1977).
 
     **Arguments:**
 
     - `shapes`: aligned shapes (N, n, 3).
     - `weights`: the weights of the vertices (n,), with the sum 1.
 
-    **Returns:** Places (N, 2). Both coordinates have the mean 0, in the unit of the shapes. The first
+    **Returns:** Places (N, 2), in the unit of the shapes. Both coordinates have the mean 0. The first
     coordinate has the larger variance.
     """
     count = len(shapes)
@@ -216,7 +219,7 @@ def layout(
     values, vectors = np.linalg.eigh(products)
     order = np.argsort(-values)
     points = vectors[:, order] * np.sqrt(np.maximum(values[order], 0))
-    # The signs of eigenvectors are arbitrary.
+    # The sign of an eigenvector is arbitrary. Its entry with the largest absolute value is made positive.
     points *= np.where(points[np.abs(points).argmax(axis=0), np.arange(count)] < 0, -1, 1)
     distances = squareform(pdist(points))
     places = np.zeros((count, 2))
@@ -269,7 +272,7 @@ def _check(
 
 
 def _some(count: int, template: int) -> list[int]:
-    """The template and a few other shapes, evenly chosen."""
+    """Return the indices of the template and of a few other shapes, which are spread evenly."""
     others = np.linspace(0, count - 1, min(count, _SHAPES_IN_VIEW)).round().astype(int).tolist()
     return list(dict.fromkeys([template, *others]))
 
@@ -296,12 +299,12 @@ def _encode_model(
 
 
 def _plain(text: str) -> str:
-    """The text with question marks for bytes that are not valid UTF-8, as in some file names."""
+    """Replace bytes that are not valid UTF-8 by question marks. Some file names contain such bytes."""
     return text.encode("utf-8", "replace").decode()
 
 
 def _lead(names: Sequence[str], template: int, n: int, shown: int) -> str:
-    """The sentences below the heading."""
+    """Return the sentences below the heading."""
     text = (
         f"Every shape has the {n} vertices of the template, {_plain(names[template])}. Equal colours mark "
         f"the same point of the body on every shape."
@@ -315,7 +318,7 @@ def _statistics(
     left_out: Mapping[str, str],
     model: ShapeModel | None,
 ) -> str:
-    """The HTML list of the numbers of shapes, pairs and modes."""
+    """Return the HTML list of the numbers of shapes, pairs and modes."""
     values = {"Shapes": str(len(names))}
     if left_out:
         values["Left out"] = str(len(left_out))
@@ -331,7 +334,7 @@ def _statistics(
 
 
 def _notes(notes: Sequence[str], left_out: Mapping[str, str]) -> str:
-    """The HTML of the sentences about decisions, and of the shapes that were left out."""
+    """Return the HTML of the sentences about decisions, and of the list of shapes that were left out."""
     parts = []
     if notes:
         items = "".join(f"<li>{html.escape(_plain(note))}</li>" for note in notes)
@@ -346,7 +349,7 @@ def _notes(notes: Sequence[str], left_out: Mapping[str, str]) -> str:
 
 
 def _edge_table(names: Sequence[str], edges: Sequence[PageEdge]) -> str:
-    """The HTML table of the matched pairs, doubtful pairs and large errors first."""
+    """Return the HTML table of the matched pairs. Doubtful pairs and large errors come first."""
     if not edges:
         return ""
     order = sorted(

@@ -47,9 +47,9 @@ _ERROR_SCALE = np.array(
 )
 
 # The colours of signed values in OKLab, from blue for the most negative value to red for the most positive
-# value. Both ends have the same lightness, so neither sign stands out. The scale with the key False is for
-# light backgrounds; its colour for zero is paper white. The scale with the key True is for dark backgrounds;
-# its colour for zero is dark.
+# value. Both ends have the same lightness, so neither sign stands out. The key False gives the scale for
+# light backgrounds, in which the colour for zero is paper white. The key True gives the scale for dark
+# backgrounds, in which the colour for zero is dark.
 _SIGNED_SCALE = {
     False: np.array(
         [
@@ -76,7 +76,7 @@ PLAIN = np.array([0.76, 0.77, 0.79])
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts linear RGB intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
+    """Convert linear RGB intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
 
     Intensities outside of [0, 1] are clipped.
     """
@@ -85,12 +85,12 @@ def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarra
 
 
 def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Converts sRGB colours (…, 3) in [0, 1] to linear RGB intensities (…, 3), which can be averaged."""
+    """Convert sRGB colours (…, 3) in [0, 1] to linear RGB intensities (…, 3), which can be averaged."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """A colour for every vertex, which varies smoothly with the position of the vertex on the body.
+    """Return a colour for every vertex. The colours vary smoothly with the position on the body.
 
     The right side of the body is green, and the left side is red. The hue changes from yellow to blue along
     the height or the length of the body, whichever is larger. Along the other of these two axes, only the
@@ -129,7 +129,7 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) -> Float64[np.ndarray, "m 3"]:
-    """The colours of errors on a scale from 0 to `limit`. Errors above `limit` have the last colour.
+    """Return the colours of errors on a scale from 0 to `limit`. Errors above `limit` have the last colour.
 
     **Arguments:**
 
@@ -147,12 +147,12 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) ->
 def signed_colors(
     values: Float[np.ndarray, " m"], limit: float, *, on_dark: bool = False
 ) -> Float64[np.ndarray, "m 3"]:
-    """The colours of values on a scale from `-limit` (blue) to `limit` (red).
+    """Return the colours of values on a scale from `-limit` (blue) to `limit` (red).
 
     **Arguments:**
 
-    - `values`: m signed numbers, such as the values of a function or the entries of a matrix. Values outside
-      of the scale are clipped.
+    - `values`: signed numbers (m,), such as the values of a function or the entries of a matrix. Values
+      outside of the scale are clipped.
     - `limit`: the end of the scale, positive, in the unit of the values.
     - `on_dark`: whether the background is dark. On a dark background, the colour for the value zero is dark.
       On a light background, this colour is white.
@@ -163,7 +163,7 @@ def signed_colors(
 
 
 def _on_scale(values: np.ndarray, low: float, high: float, scale: np.ndarray) -> np.ndarray:
-    """Interpolates a colour scale from `low` (the first colour) to `high` (the last colour)."""
+    """Interpolate a colour scale from `low` (the first colour) to `high` (the last colour)."""
     stops = np.linspace(low, high, len(scale))
     return _oklab_to_srgb(np.stack([np.interp(values, stops, channel) for channel in scale.T], axis=1))
 

@@ -54,7 +54,7 @@ def draw_correspondence(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """A figure that shows a map by colours: each vertex of X has the colour of its match on Y.
+    """Draw a map by colours: each vertex of X has the colour of its match on Y.
 
     The colour of each vertex of Y depends on its position on the body. Both bodies are shown at the same
     scale and from the same direction. If the map is good, the colours of X are as smooth as the colours of Y,
@@ -101,7 +101,7 @@ def draw_mesh(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """A figure of one shaded mesh.
+    """Draw one shaded mesh.
 
     **Arguments:**
 
@@ -128,7 +128,7 @@ def draw_mesh(
 def draw_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"], *, convention: Convention = "pullback"
 ) -> Figure:
-    """A figure of a functional map C. Positive entries are red, and negative entries are blue.
+    """Draw a functional map C. Positive entries are red, and negative entries are blue.
 
     **Arguments:**
 
@@ -164,7 +164,7 @@ def draw_filters(
     responses: Float[np.ndarray | Array, "filters p"],
     eigenvalues: Float[np.ndarray | Array, " k"],
 ) -> Figure:
-    """A figure of filter responses g_l(lambda), with the frame function G and the eigenvalues of a shape.
+    """Draw filter responses g_l(lambda), with the frame function G and the eigenvalues of a shape.
 
     **Arguments:**
 
@@ -224,15 +224,15 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """A figure of correspondence quality curves.
+    """Draw correspondence quality curves.
 
     A curve shows, for each threshold, the share of matches whose error is at most this threshold.
 
     **Arguments:**
 
-    - `curves`: a dictionary from the name of each map to its curve, which is a pair of thresholds (p,) and
-      shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order. The shares are numbers
-      in [0, 1].
+    - `curves`: a dictionary from the name of each map to its curve. A curve is a pair of two arrays,
+      thresholds (p,) and shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order.
+      The shares are numbers in [0, 1].
     - `mean_errors`: a dictionary from the name of a map to its mean error, which the legend shows. The
       dictionary need not contain all maps.
 
@@ -296,7 +296,7 @@ def draw_functions(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """A figure of functions on bodies, with one row per body and one column per function.
+    """Draw functions on bodies, with one row per body and one column per function.
 
     Positive values are red, and negative values are blue. All bodies in a column have the same colour scale.
     The scale ends at the 99.5th percentile of the absolute values in the column.
@@ -304,9 +304,9 @@ def draw_functions(
     **Arguments:**
 
     - `meshes`: the bodies, which may have different numbers of vertices n.
-    - `functions`: for each body, the values of all functions at its vertices (functions, n).
+    - `functions`: for each body, an array (functions, n) with the values of all functions at its vertices.
     - `titles`: the titles of the columns, one per function.
-    - `marked`: a 0-based vertex for each body, which the figure marks by a ring.
+    - `marked`: for each body, the 0-based vertex that the figure marks by a ring.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
     **Returns:** A `matplotlib.figure.Figure`.
@@ -363,7 +363,7 @@ def draw_forest(
     xlabel: str,
     linear_up_to: float = 1.0,
 ) -> Figure:
-    """A forest plot with one or several panels.
+    """Draw a forest plot with one or several panels.
 
     Each panel shows estimates with their intervals, and a vertical line at zero. The scale is linear near
     zero and logarithmic elsewhere, so small and large estimates are both visible.
@@ -375,7 +375,8 @@ def draw_forest(
       for a missing estimate. All panels have the same series.
     - `rows`: the names of the rows, from top to bottom.
     - `xlabel`: the name of the estimated quantity.
-    - `linear_up_to`: the absolute value of an estimate above which the scale is logarithmic.
+    - `linear_up_to`: the absolute value up to which the scale is linear. Above this value, the scale is
+      logarithmic.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -445,8 +446,7 @@ def draw_heat_maps(
     columns: tuple[str, Sequence[object]],
     label: str,
 ) -> Figure:
-    """A figure that shows tables of positive numbers as heat maps. The colour of each cell represents its
-    number.
+    """Draw tables of positive numbers as heat maps. The colour of each cell represents its number.
 
     Each cell also contains its number as text. All tables have the same logarithmic colour scale.
 
@@ -459,7 +459,7 @@ def draw_heat_maps(
 
     **Returns:** A `matplotlib.figure.Figure`.
 
-    **Raises:** `InputError` if a table does not fit the rows and columns or has an entry that is not
+    **Raises:** `InputError` if a table does not fit the rows and columns, if a table has an entry that is not
     positive, or if matplotlib is missing.
     """
     shape = len(rows[1]), len(columns[1])
@@ -502,7 +502,7 @@ def draw_heat_maps(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Writes a figure as PNG, PDF or SVG. The file is written completely or not at all.
+    """Write a figure as PNG, PDF or SVG. The file is written completely or not at all.
 
     The suffix of the file (`.png`, `.pdf` or `.svg`) determines the format.
 
@@ -517,7 +517,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Checks that matplotlib is installed.
+    """Check that matplotlib is installed.
 
     **Raises:** `InputError` if matplotlib is missing.
     """
@@ -530,7 +530,7 @@ def check_drawable() -> None:
 
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
-    """Checks that `save_figure` can write a file.
+    """Check that `save_figure` can write a file.
 
     **Raises:** `InputError` if the suffix of the file is not `.png`, `.pdf` or `.svg`, if the file cannot be
     written, or if matplotlib is missing.
@@ -554,7 +554,7 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draws the bodies next to each other at the same scale. Above each body are its role and its name.
+    """Draw the bodies next to each other at the same scale. The text above each body is its role and name.
 
     The figure shows the pictures of `render` without rescaling. `right_margin` is in pixels.
     """
@@ -604,7 +604,7 @@ def _shorten(name: str) -> str:
 
 
 def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
-    """Draws the colour bar of errors at the right edge.
+    """Draw the colour bar of errors at the right edge.
 
     With `has_unknown`, a patch below the bar shows the colour of unknown errors.
     """
@@ -628,7 +628,7 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
 
 
 def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
-    """An empty white figure that opens no window. The width and the height are in inches.
+    """Return an empty white figure that opens no window. The width and the height are in inches.
 
     With `plot`, matplotlib chooses the positions of axes and labels automatically.
     """

@@ -15,7 +15,7 @@ from jaxsmw.geometry.mesh import Mesh
 def check_map(
     mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Int[np.ndarray | Array, " m"]
 ) -> Int64[np.ndarray, " m"]:
-    """Checks a pointwise map, and returns the map as an int64 array (m,).
+    """Check a pointwise map, and return the map as an int64 array (m,).
 
     **Arguments:**
 
@@ -42,7 +42,7 @@ def check_map(
 def check_errors(
     mesh_x: Mesh, errors: Mapping[str, Float[np.ndarray | Array, " m"]]
 ) -> dict[str, Float64[np.ndarray, " m"]]:
-    """Checks errors of matches, and returns them as NumPy arrays.
+    """Check the errors of matches, and return the errors as NumPy arrays.
 
     **Arguments:**
 
@@ -66,7 +66,7 @@ def check_errors(
 
 
 def check_error_limit(limit: float) -> None:
-    """Checks the upper end of the colour scale of errors.
+    """Check the upper end of the colour scale of errors.
 
     **Raises:** `InputError` if the limit is not positive or not finite.
     """
@@ -77,7 +77,7 @@ def check_error_limit(limit: float) -> None:
 def check_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"],
 ) -> Float64[np.ndarray, "k_out k_in"]:
-    """Checks a functional map C (k_out, k_in), and returns it as a NumPy array of float64.
+    """Check a functional map C (k_out, k_in), and return it as a NumPy array of float64.
 
     **Raises:** `InputError` if C is not a matrix of finite numbers, or if the matrix is empty.
     """
@@ -91,7 +91,7 @@ def check_functional_map(
 
 
 def describe(mesh: Mesh) -> tuple[str, str]:
-    """The caption of a mesh: the name of its file without the directory, and its number of vertices."""
+    """Return the caption of a mesh: its file name without the directory, and its number of vertices."""
     # File names may contain bytes that are not valid UTF-8. Question marks replace these bytes.
     name = Path(mesh.name).name.encode("utf-8", "replace").decode()
     return name, f"{len(mesh.vertices)} vertices"

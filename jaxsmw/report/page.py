@@ -40,7 +40,7 @@ from jaxsmw.runtime.files import atomic_write
 _WIDE = 0.65
 
 EXPECTED_ERROR = "Expected error"
-"""The name of the errors in `ShownMap.errors` from which the page suggests places for landmarks."""
+"""The key in `ShownMap.errors` of the errors from which the page suggests places for landmarks."""
 
 _EXPLANATIONS = {
     "transfer": (
@@ -106,11 +106,11 @@ def write_page(
     up: Axis | None = None,
     registered: Float[np.ndarray, "m 3"] | None = None,
 ) -> None:
-    """Writes a web page that shows both bodies in 3D and colours them by one map at a time.
+    """Write a web page that shows both bodies in 3D and colours them by one map at a time.
 
     On the page, a user can place landmarks, and load and save landmark files in the coordinates of the mesh
-    files. If the values of a map include expected errors (`EXPECTED_ERROR`), the page suggests places for
-    landmarks.
+    files. If the errors of a map include expected errors (the key `EXPECTED_ERROR`), the page suggests places
+    for landmarks.
 
     The page also shows the match of the point under the pointer. If spectra are given, the page can show the
     wavelets of a refiner's filter bank. The wavelet of scale l around a vertex y is the function
@@ -140,12 +140,14 @@ def write_page(
       of error on the page.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
-    - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
+    - `figures`: the figures at the end of the page. Each figure is a pair: a caption, and the bytes of a PNG
+      file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
     - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file; None (the
-      default) for a page without them. The page can draw X at these positions, over Y. A slider on the page
-      deforms X from its own shape to these positions. The positions take 16 bytes per vertex.
+      default) for a page without these positions. The page can draw X at these positions, on top of Y. A
+      slider on the page deforms X from its own shape to these positions. The positions take 16 bytes per
+      vertex.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
@@ -191,7 +193,7 @@ def write_page(
 
 
 def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """The colours of Y, and the settings of the camera that shows both upright meshes."""
+    """Return the colours of Y, and the settings of the camera that shows both upright meshes."""
     reach = np.max(
         [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
     )
@@ -204,7 +206,7 @@ def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
 
 
 def _encode_map(name: str, shown: ShownMap, mesh_x: Mesh, mesh_y: Mesh) -> dict[str, Any]:
-    """The data from which the viewer shows one map."""
+    """Return the data that the viewer needs to show one map."""
     return {
         "name": name,
         "map": encode(check_map(mesh_x, mesh_y, shown.pointwise_map), "<u4"),
@@ -220,7 +222,7 @@ def _add_wavelets(
     spectra: tuple[Spectrum, Spectrum] | None,
     refiner: WaveletPreservation,
 ) -> int:
-    """Adds eigenvectors and filters to the data of both shapes, and returns the number of filters.
+    """Add eigenvectors and filters to the data of both shapes, and return the number of filters.
 
     The number is 0 if the page shows no wavelets.
     """
@@ -234,7 +236,7 @@ def _add_wavelets(
 
 
 def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spectra: bool) -> dict[str, str]:
-    """A dictionary from the name of each mode of the viewer to the label of the mode on the page."""
+    """Return a dictionary from the name of each mode of the viewer to the label of the mode on the page."""
     modes = {"transfer": "Matching colours"} | {f"error-{i}": name for i, name in enumerate(error_names)}
     if has_spectra:
         modes["wavelets"] = "Wavelets"
@@ -244,7 +246,7 @@ def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spec
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """The HTML of radio buttons. The first button is selected.
+    """Return the HTML of radio buttons. The first button is selected.
 
     `choices` is a dictionary from the value of each button to its label.
     """
@@ -260,7 +262,7 @@ def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
 
 
 def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -> str:
-    """The HTML of one paragraph per mode. The viewer shows the paragraph of the current mode."""
+    """Return the HTML of one paragraph per mode. The viewer shows the paragraph of the current mode."""
     paragraphs = []
     for mode, label in modes.items():
         text = _EXPLANATIONS.get(mode)
@@ -271,7 +273,7 @@ def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -
 
 
 def _comparison(maps: Mapping[str, ShownMap]) -> str:
-    """The HTML table of the maps' statistics, with one row per map and one column per label."""
+    """Return the HTML table of the maps' statistics, with one row per map and one column per label."""
     labels = dict.fromkeys(label for shown in maps.values() for label in shown.statistics)
     if not labels:
         return ""
@@ -289,7 +291,7 @@ def _comparison(maps: Mapping[str, ShownMap]) -> str:
 
 
 def _statistics(statistics: Mapping[str, str]) -> str:
-    """The HTML of the statistics, with one card per label."""
+    """Return the HTML of the statistics, with one card per label."""
     if not statistics:
         return ""
     rows = "".join(
@@ -300,7 +302,7 @@ def _statistics(statistics: Mapping[str, str]) -> str:
 
 
 def _figures(figures: Sequence[tuple[str, bytes]]) -> str:
-    """The HTML of PNG pictures with their captions."""
+    """Return the HTML of PNG pictures with their captions."""
     if not figures:
         return ""
     shown = "".join(

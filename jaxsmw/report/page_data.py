@@ -18,8 +18,8 @@ from jaxsmw.report.inputs import check_functional_map, describe
 from jaxsmw.report.standing import placement
 
 # A page contains between `_FEWEST` and `_EIGENVECTORS` eigenvectors per shape, or no eigenvectors. The
-# eigenvectors of both shapes together have at most `_VALUES` entries, which take one byte each before
-# encoding in base64.
+# eigenvectors of both shapes together have at most `_VALUES` entries. Before the encoding in base64, each
+# entry takes one byte.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 
 COLOR_SCALES = {
@@ -34,10 +34,11 @@ In both signed scales, the middle colour belongs to the value zero.
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
-    """The number of eigenvectors per shape on a page that shows two meshes.
+    """Return the number of eigenvectors per shape on a page that shows two meshes.
 
-    The number is 100, as in the MWP paper, for meshes with at most 60 000 vertices in total. Above 60 000
-    vertices the number decreases, and above 300 000 vertices it is 0.
+    The number depends on the total number of vertices of both meshes. Up to 60 000 vertices, the number of
+    eigenvectors is 100, as in the MWP paper. For more vertices, the number decreases. Above 300 000 vertices,
+    the number is 0.
     """
     room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
     return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
@@ -46,10 +47,10 @@ def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
 def spectra_on_page(
     mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Spectrum, Spectrum] | None:
-    """The spectra of both shapes, truncated to the eigenvectors that a page contains.
+    """Return the spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    If the two spectra have different numbers of eigenvectors, as for a partial pair, they are also truncated
-    to their common range of eigenvalues (`jaxsmw.pair.common_range`).
+    If the two spectra have different numbers of eigenvectors, both are also truncated to their common range
+    of eigenvalues (`jaxsmw.pair.common_range`). This is the case for a partial pair.
 
     **Arguments:**
 
@@ -74,32 +75,32 @@ def spectra_on_page(
 
 
 def encode_bytes(data: bytes) -> str:
-    """Encodes bytes as base64 text."""
+    """Encode bytes as base64 text."""
     return base64.b64encode(data).decode()
 
 
 def encode(array: Shaped[np.ndarray, " *shape"], dtype: str) -> str:
-    """Converts an array to a NumPy data type such as `"<f4"`, and encodes its entries as base64 text."""
+    """Convert an array to a NumPy data type such as `"<f4"`, and encode its entries as base64 text."""
     return encode_bytes(array.astype(dtype).tobytes())
 
 
 def encode_mesh(mesh: Mesh) -> dict[str, Any]:
-    """Encodes the vertices of a mesh as float32 and the faces as uint32, both in base64."""
+    """Encode the vertices of a mesh as float32 and the faces as uint32, both in base64."""
     return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
 
 
 def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
-    """Encodes a shape: its upright mesh, its name, and the similarity that takes the page back to the file.
+    """Encode a shape: its upright mesh, its name, and the transformation from the page to its file.
 
     The page stores the positions of vertices in float32, but computes in float64. To convert a point on a
-    triangle to the coordinates of the file, the page interpolates the shown corners and applies the
-    similarity (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times the diagonal
-    of the bounding box, plus the float64 rounding of the file's own coordinates.
+    triangle to the coordinates of the file, the page interpolates the shown corners. The page then applies a
+    similarity transformation (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times
+    the diagonal of the bounding box, plus the float64 rounding of the file's own coordinates.
 
     **Arguments:**
 
     - `mesh`: the mesh in the coordinates of its file.
-    - `standing`: the same mesh as shown, from `jaxsmw.report.standing.stand_pair`.
+    - `standing`: the same mesh as the page shows it; a result of `jaxsmw.report.standing.stand_pair`.
     """
     matrix, offset = placement(mesh, standing)
     return encode_mesh(standing) | {
@@ -111,13 +112,13 @@ def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
 def encode_registered(
     registered: Float[np.ndarray, "m 3"], mesh_x: Mesh, mesh_y: Mesh, standing_y: Mesh
 ) -> str:
-    """Converts registered positions to the coordinates of the page, and encodes them.
+    """Convert registered positions to the coordinates of the page, and encode them.
 
     **Arguments:**
 
     - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file.
     - `mesh_x`, `mesh_y`: X (m vertices) and Y, in the coordinates of their files.
-    - `standing_y`: Y as shown.
+    - `standing_y`: Y as the page shows it.
 
     **Returns:** The positions on the page as float32 in base64.
 
@@ -135,15 +136,15 @@ def encode_registered(
 
 
 def encode_colors(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """Encodes colours (n, 3) in [0, 1] as base64 text, with three bytes per colour."""
+    """Encode colours (n, 3) in [0, 1] as base64 text, with three bytes per colour."""
     return encode(np.round(255 * colors), "u1")
 
 
 def encode_positions(positions: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """Rounds positions or displacements to 16 bits per coordinate, and encodes them in base64.
+    """Round positions or displacements to 16 bits per coordinate, and encode them in base64.
 
-    Coordinate j of vertex i is `low[j] + step[j] * code`, with the code at index 3 i + j. The rounding error
-    is at most 1 / 131070 of the extent in each direction.
+    Coordinate j of vertex i is `low[j] + step[j] * code`, where `code` is the code with the index 3 i + j.
+    The rounding error is at most 1 / 131070 of the extent in each direction.
 
     **Arguments:**
 
@@ -158,7 +159,7 @@ def encode_positions(positions: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
 
 
 def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filters k"]) -> dict[str, Any]:
-    """Encodes the eigenvectors of a shape, and the filter responses at its eigenvalues (filters, k)."""
+    """Encode the eigenvectors of a shape, and the filter responses at its eigenvalues (filters, k)."""
     return {
         "eigenvectors": encode_rounded(np.asarray(spectrum.eigenvectors).T),
         "responses": encode(np.asarray(responses), "<f4"),
@@ -166,13 +167,13 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 
 
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
-    """Rounds the numbers of a matrix to one byte each, and encodes them in base64.
+    """Round the numbers of a matrix to one byte each, and encode them in base64.
 
     Each row has its own unit. A byte c encodes the number sign(c) c² times the unit of its row. Small numbers
     therefore have smaller rounding errors than large numbers. For example, an eigenvector can be large on one
     limb and small on the rest of the body. If the encoded numbers were evenly spaced, the wavelets on the
-    rest of the body would have visible errors. On people and animals, the root mean square of the errors of
-    wavelets is 0.005 times the length of the colour scale.
+    rest of the body would have visible errors. On people and animals, the root-mean-square error of wavelets
+    is 0.005 times the length of the colour scale.
 
     **Arguments:**
 
@@ -188,7 +189,7 @@ def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
 def encode_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"] | None, convention: Convention
 ) -> dict[str, Any] | None:
-    """Encodes the entries of a functional map C (k_out, k_in), row by row, as float32 in base64.
+    """Encode the entries of a functional map C (k_out, k_in), row by row, as float32 in base64.
 
     The result is None if C is None.
 

@@ -22,20 +22,20 @@ ELEVATION = np.radians(8)
 _LIGHTS = ((-0.45, 0.60, 0.65, 0.72), (0.85, 0.15, 0.50, 0.22))
 _AMBIENT, _SKY = 0.32, 0.13
 
-# `_SUPERSAMPLING` is the number of samples per pixel in each direction. Faces are drawn in chunks.
-# The bounding boxes of the faces of a chunk together contain about `_CHUNK` samples.
+# `_SUPERSAMPLING` is the number of samples per pixel in each direction. Faces are drawn in chunks. In each
+# chunk, the bounding boxes of all faces together contain about `_CHUNK` samples.
 _SUPERSAMPLING = 2
 _CHUNK = 100_000
 
 
 def choose_azimuth(meshes: Sequence[Mesh]) -> float:
-    """The azimuth from which a common camera shows all meshes well.
+    """Return the azimuth from which a common camera shows all meshes well.
 
     The best direction of view is the horizontal direction in which the bodies are thin. This direction shows
     people from the front and animals from the side. Directions close to a preferred direction r are favoured.
     The direction r shows a body from the front and a little from the side. The chosen direction is the
-    eigenvector of M - 0.8 n r r^T with the smallest eigenvalue. Here n is the number of meshes, and M is the
-    sum of the meshes' horizontal covariance matrices, each scaled to trace 1.
+    eigenvector of M - 0.8 n r r^T with the smallest eigenvalue, where n is the number of meshes. The matrix M
+    is the sum of the meshes' horizontal covariance matrices, each of which is scaled to trace 1.
 
     **Arguments:**
 
@@ -56,7 +56,7 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
 
 
 def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
-    """The axes of the camera at an azimuth.
+    """Return the axes of the camera at an azimuth.
 
     **Arguments:**
 
@@ -73,7 +73,7 @@ def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
 def render(
     mesh: Mesh, colors: Float64[np.ndarray, "n 3"], *, azimuth: float, scale: float, width: int, height: int
 ) -> UInt8[np.ndarray, "height width 4"]:
-    """A picture of a mesh with coloured vertices, smoothly shaded, on a transparent background.
+    """Render a mesh with coloured vertices and smooth shading on a transparent background.
 
     The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
     samples per pixel prevents cracks and wrongly sorted triangles. A strong light comes from the upper left,
@@ -84,7 +84,7 @@ def render(
     **Arguments:**
 
     - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices.
-    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3), interpolated over the faces.
+    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3). The colours are interpolated over the faces.
     - `azimuth`: the viewer's azimuth in radians; see `choose_azimuth`.
     - `scale`: the number of pixels per unit of length.
     - `width`, `height`: the size of the picture in pixels.
@@ -134,10 +134,10 @@ def _rasterize(
     columns: int,
     rows: int,
 ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """For each sample: the frontmost face (-1 if there is none), the barycentric weights in this face, and
-    the depth.
+    """Return the frontmost face of each sample, the barycentric weights in this face, and the depth.
 
-    Each face is tested against all samples in its bounding box. One chunk of faces is processed at a time.
+    The face is -1 if there is no face at the sample. Each face is tested against all samples in its bounding
+    box. One chunk of faces is processed at a time.
     """
     front = np.full(rows * columns, -1)
     weights = np.zeros((rows * columns, 3))
@@ -179,7 +179,7 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """The share of the light that reaches each sample, between 0 and 1.
+    """Return the share of the light that reaches each sample, between 0 and 1.
 
     Samples just behind the outline of a nearer part of the body receive less light. The share is computed by
     unsharp masking of the depth (Luft et al. 2006).

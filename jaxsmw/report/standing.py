@@ -12,8 +12,8 @@ from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh
 
-# For each axis, the rotation that makes this axis of a file point up. In files with y up, bodies face +z. In
-# files with z up, bodies face -y. In both cases, bodies face +z after the rotation.
+# A dictionary from each axis to the rotation that makes this axis of a file point up. In files with y up,
+# bodies face +z. In files with z up, bodies face -y. In both cases, bodies face +z after the rotation.
 _STAND = {
     "x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -28,12 +28,12 @@ _STAND = {
 _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # A body is slender along y if its spread along z is at most this multiple of its spread along y. For standing
 # people in y-up files, the spread along z is at most 0.42 times the spread along y. For animals in z-up
-# files, the spread along z is at least 0.47 times the spread along y, except for two animals that leap or
-# crouch.
+# files, the spread along z is at least 0.47 times the spread along y. The only exceptions are two animals
+# that leap or crouch.
 _SLENDER = 0.45
-# This number is added to the score of the usual axis, y or z (see `guess_up`). For people who stand on one
-# foot with raised arms, the score of an upside-down axis is up to 0.18 higher than that of the correct axis.
-# For bodies that sit or leap, the score of a wrong axis is up to 0.09 higher than that of the correct axis.
+# The usual axis is y or z (see `guess_up`). Its number in this dictionary is added to its score. For people
+# who stand on one foot with raised arms, an upside-down axis scores up to 0.18 higher than the correct axis.
+# For bodies that sit or leap, a wrong axis scores up to 0.09 higher than the correct axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, in units of the square root of the area. Differences outside of the
@@ -53,10 +53,10 @@ _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
 
 
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
-    """The mesh turned upright and scaled to area 1, with its bounding box centred on the origin.
+    """Turn a mesh upright, scale it to area 1, and centre its bounding box on the origin.
 
-    Faces are reoriented where needed, so adjacent faces have consistent orientations. Vertices are not
-    renumbered.
+    Faces are reoriented where needed, so that adjacent faces have consistent orientations. The numbering of
+    the vertices does not change.
 
     **Arguments:**
 
@@ -91,7 +91,7 @@ def _check_area(mesh: Mesh) -> None:
 
 
 def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
-    """Both meshes turned upright and scaled for a common picture; see `stand`.
+    """Turn both meshes upright, and scale them for a common picture; see `stand`.
 
     Y is scaled to area 1. The scale of X depends on the ratio of the smaller area to the larger area. If the
     ratio is between 1/16 and 0.6, one of the shapes seems to be partial, and X keeps its size relative to Y.
@@ -116,14 +116,17 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
 
 
 def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """The similarity that takes a standing mesh back to its file: `file = standing @ matrix + offset`.
+    """Return the similarity transformation from a standing mesh back to the mesh in its file.
+
+    The transformation is `file = standing @ matrix + offset`.
 
     **Arguments:**
 
     - `mesh`: the mesh as read from its file.
     - `standing`: the result of `stand` or `stand_pair` for this mesh.
 
-    **Returns:** The matrix (3, 3), a rotation times the scale, and the offset (3,), in the unit of the file.
+    **Returns:** The matrix (3, 3), which is a rotation times the scale, and the offset (3,) in the unit of
+    the file.
     """
     used = mesh.referenced_vertices
     scale = np.sqrt(mesh.area / standing.area)
@@ -136,7 +139,7 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
 
 
 def guess_up(mesh: Mesh) -> Axis:
-    """Guesses which axis of the file points up, from the limbs on which the body stands.
+    """Guess which axis of the file points up, from the limbs on which the body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
     axis (`_hanging_limbs`). Legs and arms usually hang down, and only the head points up. The second term
@@ -174,11 +177,13 @@ def guess_up(mesh: Mesh) -> Axis:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """A coarse graph of the mesh. Its points are the means of the vertices in each grid cell. An edge joins
-    two points if an edge of the mesh joins the two cells.
+    """Return the points and the edges of a coarse graph of the mesh.
+
+    Each point is the mean of the vertices in one grid cell. An edge joins two points if an edge of the mesh
+    joins their two cells.
     """
     used = mesh.vertices[mesh.referenced_vertices]
-    # A thin mesh may be more cells long than an integer can count, so the keys remain floats.
+    # The number of cells along a thin mesh may exceed the range of integers, so the keys remain floats.
     keys = np.floor((used - used.min(axis=0)) / cell)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     cells = cells.ravel()
@@ -190,13 +195,13 @@ def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"]
 
 
 def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, "e 2"]) -> float:
-    """The sum of the squared lengths of the limbs that hang down.
+    """Return the sum of the squared lengths of the limbs that hang down.
 
-    A limb extends from its lowest point up to the height at which it joins a part of the body that reaches
-    lower. The length of a limb is the persistence of its component in the sublevel sets of the height
-    (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb that
-    contains the lowest point of the body is left out. For a standing quadruped, the sum therefore contains
-    three of the four legs. For a quadruped that lies on its back, the sum contains no leg.
+    A limb extends upwards from its lowest point. The limb ends at the height at which it joins a part of the
+    body that reaches lower. The length of a limb is the persistence of its component in the sublevel sets of
+    the height (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002).
+    The limb that contains the lowest point of the body is left out. For a standing quadruped, the sum
+    therefore contains three of the four legs. For a quadruped that lies on its back, the sum contains no leg.
     """
     parent, lowest = list(range(len(heights))), heights.tolist()
 
@@ -218,7 +223,9 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
 
 
 def _stability(heights: Float64[np.ndarray, " c"], ground: Float64[np.ndarray, "c 2"]) -> float:
-    """The distance of the body's centre from the boundary of its support, clipped to `_STABILITY_RANGE`.
+    """Return the distance of the body's centre from the boundary of its support.
+
+    The distance is clipped to `_STABILITY_RANGE`.
 
     The distance is negative if the centre is outside of the support. The support is the convex hull of the
     lowest points, projected to the ground. The body's centre is at the origin.

@@ -84,23 +84,24 @@ def write_report(
     up: Axis | None = None,
     registered: RegisteredMesh | None = None,
 ) -> list[Path]:
-    """Writes pictures of a match, an interactive page and a summary to a directory.
+    """Write pictures of a match, an interactive page and a summary to a directory.
 
-    The report contains the expected error, and the measured errors if given.
+    The report contains the expected error. If measured errors are given, the report also contains them.
 
     **Arguments:**
 
-    - `directory`: the directory of the report, which is created if it does not exist. The function writes
-      `report.html` (an interactive page with both bodies, the map and the initial map), `correspondence.png`,
-      `functional_map.png`, `filters.png` (if a stage has filters), `quality.png` (if errors are given) and
-      `summary.json`.
+    - `directory`: the directory of the report, which is created if it does not exist. The function always
+      writes `report.html`, `correspondence.png`, `functional_map.png` and `summary.json`. The file
+      `report.html` is an interactive page with both bodies, the map and the initial map. The function writes
+      `filters.png` if a stage has filters, and `quality.png` if errors are given.
     - `correspondence`: the result of `match`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
     - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
       default, `Correspondence.expected_error` computes it.
-    - `settings`: a dictionary of settings to include in `summary.json`, serialisable as JSON.
+    - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
+      JSON.
     - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
       default `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and
       prints the sum as the total time.
@@ -160,7 +161,7 @@ def _shown_maps(
     errors: Mapping[str, GeodesicError],
     expected_error: Float[np.ndarray, " m"],
 ) -> dict[str, ShownMap]:
-    """The refined map and the initial map, with the errors and functional maps that the page shows."""
+    """Return the refined map and the initial map, with the errors and functional maps that the page shows."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
     convention = correspondence.preset.stages[-1].refiner.convention
@@ -189,7 +190,7 @@ def _save_figures(
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
 ) -> tuple[list[Path], dict[Path, str]]:
-    """Writes all figures. Returns their files, and the captions of the figures that the page also shows."""
+    """Write all figures. Return their files, and the captions of those figures that are also on the page."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
@@ -213,9 +214,9 @@ def _save_figures(
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
-    """The refiner and the number of eigenvectors of the last stage with a `WaveletPreservation` refiner.
+    """Return the refiner and the number of eigenvectors of the last stage that preserves wavelets.
 
-    The result is None if there is no stage with such a refiner.
+    The refiner of such a stage is a `WaveletPreservation`. The result is None if there is no such stage.
     """
     for stage in reversed(correspondence.preset.stages):
         if isinstance(stage.refiner, WaveletPreservation):
@@ -233,7 +234,7 @@ def write_comparison(
     partial: bool = False,
     up: Axis | None = None,
 ) -> None:
-    """Writes an interactive page with several maps of one pair. The page shows one map at a time.
+    """Write an interactive page with several maps of one pair. The page shows one map at a time.
 
     The page also shows the functional maps, and the wavelets of the MWP paper's filter bank. If the
     eigenvectors of the meshes cannot be computed, the function issues a warning, and the page shows no
@@ -245,9 +246,9 @@ def write_comparison(
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
     - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
       vertices of Y. The page lists the maps in the order of the dictionary.
-    - `errors`: a dictionary from the same names to a `GeodesicError`. The page shows these errors as colours.
-      The page also contains the correspondence quality curves, and a table of statistics such as the mean
-      errors.
+    - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows these
+      errors as colours. The page also contains the correspondence quality curves, and a table of statistics
+      such as the mean errors.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
@@ -287,7 +288,7 @@ def write_comparison(
 
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
-    """The spectra for a page of two meshes; None if the meshes have too many vertices.
+    """Return the spectra for a page of two meshes, or None if the meshes have too many vertices.
 
     If the spectra cannot be computed, the result is also None, and a warning gives the reason.
     """
@@ -308,7 +309,7 @@ def _encoded(
     spectrum_y: Spectrum,
     convention: Convention = "pullback",
 ) -> Float[np.ndarray, "k_out k_in"]:
-    """The functional map of a pointwise map, with the float type of the spectra."""
+    """Compute the functional map of a pointwise map, with the float type of the spectra."""
     with jax.enable_x64(spectrum_x.eigenvectors.dtype == np.float64):
         encoded = compiled(encode)(
             jax.device_put(pointwise_map), spectrum_x, spectrum_y, convention=convention
@@ -321,7 +322,10 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
-    """A dictionary from the label of each error statistic to its value as text; empty without errors."""
+    """Return a dictionary from the label of each error statistic to its value as text.
+
+    If there are no errors, the dictionary is empty.
+    """
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -331,7 +335,7 @@ def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
 
 
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
-    """A figure of the filters of a bank and of their frame function, as functions of the eigenvalue.
+    """Draw the filters of a bank and their frame function, as functions of the eigenvalue.
 
     **Arguments:**
 
@@ -348,7 +352,7 @@ def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
 
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
-    """A figure of the correspondence quality curves of maps, with their mean errors in the legend.
+    """Draw the correspondence quality curves of maps, with the mean error of each map in the legend.
 
     **Arguments:**
 
@@ -374,7 +378,7 @@ def summarize(
     expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """The sizes, errors and times of a match as text.
+    """Describe the sizes, errors and times of a match as text.
 
     **Arguments:**
 
@@ -411,17 +415,20 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """A dictionary of the facts on which results depend: package versions, machine and device."""
+    """Return a dictionary of the facts on which results depend: package versions, machine and device."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
 
 
 def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """A dictionary from the label `Error` to the errors of the m source vertices; empty without errors."""
+    """Return a dictionary from the label `Error` to the errors of the m source vertices.
+
+    If there are no errors, the dictionary is empty.
+    """
     return {} if error is None else {"Error": _per_vertex(error, m)}
 
 
 def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """The mean error of each of the m source vertices; NaN for a vertex without errors."""
+    """Return the mean error of each of the m source vertices; NaN for a vertex without errors."""
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
     return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)

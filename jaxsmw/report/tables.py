@@ -30,13 +30,14 @@ class MethodSummary(NamedTuple):
     - `mean`, `median`: the mean and the median of the errors of all pairs. The error of a pair is its mean
       geodesic error, in thousandths of the square root of the target's area.
     - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. For each pair, the error of
-      the method `REFERENCE` is subtracted from the error of this method. `difference` is the mean of these
-      differences over all pairs, with its confidence interval, in the unit of `mean`. `difference` is NaN for
-      `REFERENCE` itself.
+      the method `REFERENCE` is subtracted from the error of this method. `difference` contains the mean of
+      these differences over all pairs and the confidence interval of this mean, in the unit of the attribute
+      `mean`. `difference` is NaN for `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
     - `area_under_curve`: the mean area under the correspondence quality curves of all pairs, at most 1.
-    - `coverage`: the mean share of a target's area that belongs to matched vertices, in [0, 1].
+    - `coverage`: the share of a target's area that belongs to matched vertices, in [0, 1]. The value is the
+      mean over all pairs.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
     - `pipeline_seconds`: the median time in seconds from the meshes to the result, which includes the
       precomputation of both shapes.
@@ -58,7 +59,7 @@ class MethodSummary(NamedTuple):
 
 
 def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
-    """Summarises the results of a benchmark for each method.
+    """Summarise the results of a benchmark for each method.
 
     **Arguments:**
 
@@ -97,7 +98,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Returns a dictionary from each pair (source, target) to its mean error, without failed pairs.
+    """Return a dictionary from each pair (source, target) to its mean error, without failed pairs.
 
     The errors are in the unit of `MethodSummary.mean`.
     """
@@ -121,7 +122,7 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
-    """Returns the precomputation time of both shapes of a pair, in seconds."""
+    """Return the precomputation time of both shapes of a pair, in seconds."""
     sides = {row["source"], row["target"]}
     return sum(
         float(shapes[side][column])
@@ -148,14 +149,14 @@ _COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
 
 
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a Markdown table with one row for each method in `summaries`."""
+    """Return a Markdown table with one row for each method in `summaries`."""
     header = ["method", *(title for title, _ in _COLUMNS)]
     rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
     return markdown([header, *rows])
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Returns a Markdown table of text cells; the first row is the header."""
+    """Return a Markdown table of text cells; the first row is the header."""
     return "".join(
         "| " + " | ".join(cells) + " |\n" for cells in (rows[0], ["---"] * len(rows[0]), *rows[1:])
     )
@@ -165,7 +166,7 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Returns a LaTeX table with one row for each method in `summaries`.
+    """Return a LaTeX table with one row for each method in `summaries`.
 
     The horizontal lines of the table need the LaTeX package booktabs. The smallest mean error is in bold.
     """
@@ -183,7 +184,7 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
 def write_tables(
     directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
 ) -> dict[str, MethodSummary]:
-    """Writes `summary.md`, `table.tex`, `curves.png` and `results.parquet` to a directory.
+    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet` to a directory.
 
     **Arguments:**
 
@@ -214,7 +215,7 @@ def write_tables(
 
 
 def _introduction(data_set: DataSet, results: Results, settings: Settings) -> str:
-    """Returns the paragraph above the table of `summary.md`."""
+    """Return the paragraph above the table of `summary.md`."""
     pairs = len({(row["source"], row["target"]) for row in results.rows})
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
@@ -240,13 +241,13 @@ def _write(path: Path, text: str) -> None:
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """Writes rows of results to a Parquet file with typed columns, for pandas and polars.
+    """Write rows of results to a Parquet file with typed columns, for pandas and polars.
 
     **Arguments:**
 
     - `path`: the file to create or to replace.
-    - `rows`: rows with the columns `RESULT_COLUMNS`, in which all values are text. In the file, the column
-      `curve` contains lists of shares.
+    - `rows`: rows with the columns `RESULT_COLUMNS`. All values in these rows are text. In the file, the
+      column `curve` contains lists of shares.
 
     **Raises:** `InputError` if the file cannot be written.
     """

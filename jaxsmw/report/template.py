@@ -17,13 +17,14 @@ from jaxsmw.report.page_data import COLOR_SCALES, encode_bytes
 
 
 def fill_template(template: str, script: str, data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
-    """The HTML of a page: a template, filled with the data, the fragments and a script.
+    """Return the HTML of a page: a template, filled with the data, the fragments and a script.
 
     **Arguments:**
 
     - `template`, `script`: names of files in `report/assets`.
-    - `data`: the data of the script, which JSON can represent.
-    - `fragments`: a dictionary from placeholders of the template to HTML. Texts must be escaped.
+    - `data`: the data of the script. JSON must be able to represent the data.
+    - `fragments`: a dictionary from each placeholder of the template to its HTML. Texts in the HTML must be
+      escaped.
     """
     assets = files("jaxsmw.report") / "assets"
     code = (assets / script).read_text("utf-8")
@@ -42,6 +43,6 @@ def fill_template(template: str, script: str, data: Mapping[str, Any], fragments
 
 
 def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
-    """Up to nine colours of a colour scale, as text for a CSS gradient."""
+    """Return up to nine colours of a colour scale, as text for a CSS gradient."""
     chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))

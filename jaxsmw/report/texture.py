@@ -24,7 +24,7 @@ _PIXELS, _SQUARES = 1024, 32
 def write_textured_pair(
     directory: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints
 ) -> None:
-    """Writes `source.obj` and `target.obj` with the same checkerboard picture as texture.
+    """Write `source.obj` and `target.obj` with the same checkerboard picture as texture.
 
     The picture is projected onto the target along the shortest principal axis of the target. The projection
     has no seams, and the front and the back of the target look the same. Each source vertex receives the
@@ -33,9 +33,10 @@ def write_textured_pair(
     **Arguments:**
 
     - `directory`: an existing directory, to which `TEXTURE_FILES` are written. Existing files with these
-      names are replaced, each completely or not at all.
+      names are replaced. Each file is replaced completely or not at all.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: m points on Y, the matches of the vertices of X, such as `Correspondence.surface_points()`.
+    - `points`: one `SurfacePoints` with m points on Y, which are the matches of the vertices of X. The result
+      of `Correspondence.surface_points()` is an example.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -52,7 +53,7 @@ def write_textured_pair(
 
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
-    """The texture coordinates of all vertices (n, 2), along the two longest principal axes of the mesh.
+    """Return the texture coordinates (n, 2) of all vertices along the mesh's two longest principal axes.
 
     The texture coordinates of referenced vertices are in [0, 1].
     """
@@ -66,7 +67,7 @@ def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
 
 
 def _checkered() -> Float64[np.ndarray, "h w 3"]:
-    """A checkerboard of light and dark squares, whose hues show their position in the picture."""
+    """Return a checkerboard of light and dark squares. The hue of a square shows its position."""
     row, column = np.mgrid[:_PIXELS, :_PIXELS] * _SQUARES // _PIXELS
     across, up = column / (_SQUARES - 1), row / (_SQUARES - 1)
     colors = np.stack([0.25 + 0.75 * across, 0.25 + 0.75 * up, 1 - 0.75 * across], axis=2)
@@ -74,7 +75,7 @@ def _checkered() -> Float64[np.ndarray, "h w 3"]:
 
 
 def _obj(mesh: Mesh, coordinates: Float64[np.ndarray, "n 2"]) -> str:
-    """The text of an OBJ file with texture coordinates."""
+    """Return the text of an OBJ file with texture coordinates."""
     lines = ["mtllib texture.mtl", "usemtl texture"]
     lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"vt {u:.9f} {v:.9f}" for u, v in coordinates.tolist()]

@@ -42,13 +42,13 @@ from jaxsmw.preparation import prepare
 from jaxsmw.runtime.journal import Row
 
 DATA_SETS = ("faust_r", "tosca_r")
-# Shapes are padded to a multiple of this number of vertices. All shapes of a data set then share one compiled
-# program.
+# Shapes are padded to a multiple of this number of vertices, so that all shapes of a data set share one
+# compiled program.
 _PADDING = 1024
 MOVE = 0.02
 """An iteration moves a match if the old and the new match are farther apart than this Euclidean distance.
 
-The unit is the square root of the area. The distance is about the length of an edge.
+The unit is the square root of the area. This distance is about the length of an edge.
 """
 INVARIANCE_FRAMES = ("Meyer", "cubic spline")
 SEARCH = DEFAULT._replace(update="nearest neighbors")
@@ -281,11 +281,12 @@ def measure_invariance(
 ) -> list[Row]:
     """Compare the wavelets of both shapes around corresponding vertices, for each frame and scale.
 
-    The vectors a and b contain the values of two such wavelets at corresponding points.
+    For two such wavelets, the vectors a and b contain their values at corresponding points. The relative
+    difference of the wavelets is `|a - b| / sqrt((|a|² + |b|²) / 2)`. This difference is 0 for equal wavelets
+    and sqrt(2) for unrelated wavelets.
 
     **Returns:** Rows of `invariance.csv`. Each row contains the median correlation and the median relative
-    difference over all wavelet centres. The relative difference is `|a - b| / sqrt((|a|² + |b|²) / 2)`. This
-    difference is 0 for equal wavelets and sqrt(2) for unrelated wavelets.
+    difference over all wavelet centres.
     """
     banks = _frames(settings.number_of_filters)
     vertices = pair.sources, pair.targets
@@ -367,7 +368,7 @@ def _search(method: Refiner, prepared: Prepared, state: State) -> Int32[Array, "
 def measure_times(data: Path, names: list[PairName], wanted: list[Variant], settings: Settings) -> list[Row]:
     """Measure how long every variant takes to compute a functional map, and time a nearest-neighbour search.
 
-    The functional map is that of the second iteration.
+    The variants compute the functional map of the second iteration.
 
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """

@@ -113,7 +113,10 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """Return the mean paired difference from the default with its interval; NaN without measurements."""
+        """Return the mean paired difference from the default and its interval.
+
+        If there are no measurements, all values are NaN.
+        """
         found = None if variant is None else self.comparisons.get((variant, data_set))
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 

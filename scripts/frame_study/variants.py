@@ -113,8 +113,8 @@ QUICK_FRAMES = (
 )
 
 # Each ablation combines a frame with an update that `UPDATES` does not contain. A gain is a factor by which C
-# is multiplied. The gain changes the matches, because C maps the queries or the targets of the
-# nearest-neighbour search, but not both.
+# is multiplied. In the nearest-neighbour search, C maps either the queries or the targets, but not both.
+# Therefore the gain changes the matches.
 GAINS = {f"filtering x {gain}": gain for gain in (0.7, 1.2, 1.5, 2.0, 3.0)}
 ABLATIONS = (
     ("Meyer", "projected"),
@@ -131,7 +131,7 @@ def variants(frame_names: Iterable[str]) -> list[Variant]:
 
 
 def twins(names: Iterable[Variant], banks: Mapping[str, FilterBank]) -> dict[Variant, Variant]:
-    """Return a dictionary from variants to other variants that provably give the same result.
+    """Return a dictionary from variants to their twins: other variants that provably give the same result.
 
     In the pushforward convention and the area norm, least squares divides the columns of the filtered map by
     the frame function. The frame function of a Parseval frame is 1, so least squares equals filtering.
@@ -266,7 +266,7 @@ def octaves(eigenvalues: Float[np.ndarray, " k"], number_of_filters: int) -> Flo
 def band_mask(
     octaves_out: Float64[np.ndarray, " k_out"], octaves_in: Float64[np.ndarray, " k_in"], half_width: float
 ) -> Float64[np.ndarray, "k_out k_in"]:
-    """Return a smooth mask around the diagonal that is not the kernel of any filter bank.
+    """Return a smooth mask around the diagonal. No filter bank has this mask as its kernel.
 
     The variable d is the distance from the diagonal in octaves, divided by the half-width. The mask is 1 for
     d <= 0.5, falls like a cosine from d = 0.5 to d = 1.5, and is 0 for d >= 1.5. If both spectra are
