@@ -59,16 +59,15 @@ def check_between(
 
     If the parameter is traced, only its number of dimensions is checked.
 
-    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if its numbers are not all
-    finite and strictly between `low` and `high`.
+    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if one of its numbers is not
+    finite or does not lie strictly between `low` and `high`.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
-    # Under `jax.jit`, JAX would trace the comparison even if both numbers are constants, so NumPy compares
-    # them.
+    # NumPy makes this comparison, because under `jax.jit`, JAX traces even comparisons between constants.
     host = np.asarray(value)
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"

@@ -1,18 +1,19 @@
 r"""The functional map of a pointwise map, and the wavelet-preservation energy.
 
-T: X -> Y is a pointwise map, and P (m, n) is its matrix, with a one at (x, T(x)) in each row x. Phi_X and
-Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering. There are two
-conventions for the direction of a functional map C:
+The pointwise map T: X -> Y has a matrix P (m, n), whose row x has a one in column T(x) and zeros elsewhere.
+Phi_X and Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering.
+There are two conventions for the direction of a functional map C:
 
 - **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, and `C_0 = Phi_X^+ P Phi_Y`.
   The MWP authors' program uses this convention.
 - **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
   equations of the MWP paper use this convention.
 
-This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions,
-every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C maps a_x to
-b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation (5) of the
-MWP paper uses, all vertices have the same weight. The following table defines the weights and the vectors:
+In this module, "in" denotes the shape that C maps from, and "out" denotes the shape that C maps to. In both
+conventions, every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C
+maps a_x to b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation
+(5) of the MWP paper uses, all vertices have the same weight. The following table defines the weights and the
+vectors:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -38,10 +39,10 @@ m x n:
 
 The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
 called orthonormal if `sum_x w a a^T` is the identity. Then `gram` is a diagonal matrix that contains the
-frame function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval
-frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward convention with
-the area norm, the inputs are always orthonormal. In the pullback convention with the area norm, the inputs
-are orthonormal if T preserves area. `docs/frames.md` derives these results.
+values of the frame function. The minimiser is `cross` with each column divided by the corresponding value.
+For a Parseval frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward
+convention with the area norm, the inputs are always orthonormal. In the pullback convention with the area
+norm, the inputs are orthonormal if T preserves area. `docs/frames.md` derives these results.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
 
 
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
-    """Returns the transpose (n, k) of the pseudo-inverse `Phi^+` (k, n) of the eigenvectors.
+    """Return the transposed pseudo-inverse of the eigenvectors: `Phi^+` (k, n) as an array (n, k).
 
     **Arguments:**
 
@@ -113,7 +114,7 @@ def encode(
     """Returns the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
 
     Phi_X and Phi_Y contain the eigenvectors as columns, and `Phi^+` is a pseudo-inverse of Phi. P (m, n) is
-    the matrix of T, with a one at (x, T(x)) in each row x.
+    the matrix of T: row x has a one in column T(x) and zeros elsewhere.
 
     **Arguments:**
 
@@ -157,9 +158,9 @@ def multiscale_kernel(
     """Returns the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
 
     For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrices
-    Lambda_out and Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps
-    from.
+    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrix
+    Lambda_out contains the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains
+    the eigenvalues of the shape that C maps from.
 
     **Arguments:**
 
@@ -247,7 +248,7 @@ class QuadraticEnergy(eqx.Module):
 
 
 class WaveletProblem(eqx.Module):
-    """The data from which a `Solution` computes the functional map C of a pointwise map from X to Y.
+    """The data that a `Solution` needs to compute the functional map C of a pointwise map from X to Y.
 
     The properties `spectra` and `responses` are pairs in the order (out, in): first the shape that C maps to,
     then the shape that C maps from. A solution can therefore use the same code for both conventions.
@@ -306,9 +307,9 @@ class WaveletProblem(eqx.Module):
         module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
 
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
-        also for frames that are not tight. `problem.energy(T).constant` is the energy of C = 0. In the
-        pullback convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame
-        function at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
+        even if the frame is not tight. `problem.energy(T).constant` is the energy of C = 0. In the pullback
+        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame function
+        at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 

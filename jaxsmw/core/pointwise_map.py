@@ -102,8 +102,8 @@ def decode_to_triangles(
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
     `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions on Y
     therefore stay smooth when they are transferred to X. For shapes of 5000 vertices, `decode_to_triangles`
-    takes about one second, ten times as long as `decode` without patches. The time grows with the product of
-    the numbers of vertices of X and Y.
+    takes about one second, ten times as long as `decode` without patches. The time grows with the number of
+    vertices of X times the number of vertices of Y.
 
     **Arguments:**
 
@@ -131,8 +131,8 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
     Y.
 
-    The number of vertices per patch of Y grows with the square root of Y's number of vertices. With patches
-    of this size, the time of a search grows with the number of vertices to the power 1.5.
+    A patch of Y contains more vertices if Y is finer: the patch size grows with the square root of Y's number
+    of vertices. With patches of this size, the search time grows as the number of vertices to the power 1.5.
 
     **Arguments:**
 

@@ -29,15 +29,15 @@ class History(eqx.Module):
 
     **Attributes:**
 
-    - `changed`: (iterations,), the share, from 0 to 1, of the vertices of X whose match changed in each
-      iteration. If the refinement uses samples, `changed` is computed from the samples of X only, and its
-      first and last entries are NaN.
+    - `changed`: (iterations,), the share of X's vertices whose match changed in each iteration, from 0 to 1.
+      If the refinement uses samples, `changed` is computed from the samples of X only, and its first and last
+      entries are NaN.
     - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
       from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
       equation (5) of the MWP paper.
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
-      and from the pointwise map that was recovered from this state. This is the mean squared distance between
-      matched points of the embeddings, in which lower is better.
+      and from the pointwise map that was recovered from this state. The objective is the mean squared
+      distance between matched points of the embeddings; lower is better.
     - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. The entries of
       skipped iterations repeat the final map. After a failure, all entries of `pointwise_maps` are -1.
       `pointwise_maps` is None if the refinement uses samples, because the iterations then map only the
@@ -123,7 +123,7 @@ def refine(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-    - `pointwise_map`: the initial map T, an integer array (m,). The array contains, for each vertex of X, the
+    - `pointwise_map`: the initial map T, an integer array (m,). Entry i is the match of vertex i of X, as the
       index of a vertex of Y, from 0 to n - 1.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
     - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
@@ -202,8 +202,8 @@ class _Record(NamedTuple):
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
         """Appends the final search of all vertices to the record of a refinement on samples.
 
-        The first and the last map cannot be compared with an earlier map of the same vertices. Their entries
-        in `changed` become NaN.
+        The first and the last map cannot be compared with an earlier map of the same vertices, so their
+        entries in `changed` become NaN.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -357,8 +357,8 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 def checked(state: State, result: RESULTS) -> RESULTS:
     """Checks the state that an update computed, and returns the status code of the update.
 
-    If `result` is a failure, this failure is returned unchanged. A state that contains NaN or infinity is a
-    failure, and so is a functional map whose entries are all zero.
+    If `result` is a failure, this failure is returned unchanged. A state also counts as a failure if it
+    contains NaN or infinity, or if all entries of its functional map are zero.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)

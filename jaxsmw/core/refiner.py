@@ -24,7 +24,7 @@ class Problem(eqx.Module):
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of source X (m vertices) and target Y (n vertices).
-    - `samples`: a pair of integer arrays, the sampled vertices of X (s_x,) and of Y (s_y,); None if the
+    - `samples`: the sampled vertices of X (s_x,) and of Y (s_y,), as a pair of integer arrays; None if the
       refiner iterates on all vertices.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
@@ -148,8 +148,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
         """Recovers the reverse map Y -> X (n,) from a state.
 
-        The map assigns to each vertex of Y the vertex of X that is nearest in the `embeddings`. `prepared`
-        must be the result of `prepare` for a problem without samples.
+        The map sends each vertex of Y to the nearest vertex of X in the `embeddings`. `prepared` must be the
+        result of `prepare` for a problem without samples.
         """
 
     @abc.abstractmethod
@@ -170,11 +170,12 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """Returns two point sets in which each vertex of X is close to its match on Y.
 
-        In these embeddings, `jaxsmw.Correspondence.surface_points` finds the nearest point to each vertex of
-        X on the triangles around its match.
+        For each vertex of X, `jaxsmw.Correspondence.surface_points` searches the triangles around its match.
+        The result is the point of these triangles that is nearest in the embeddings.
 
-        **Returns:** One point per vertex of X to be matched (m, d), and one point per vertex of Y (n, d).
-        Each refiner chooses the dimension d and the unit, which is the same for both point sets.
+        **Returns:** Two arrays: one point for each vertex of X to be matched (m, d), and one point for each
+        vertex of Y (n, d). Each refiner chooses the dimension d and the unit, which is the same for both
+        point sets.
         """
         return spectral_embeddings(state.functional_map, prepared.spectrum_x, prepared.spectrum_y)
 
@@ -220,7 +221,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
 
 def reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
-    """Recovers the reverse map Y -> X (n,) of a refiner's state for all vertices.
+    """Recover the reverse map Y -> X (n,) of all vertices from a refiner's state.
 
     **Arguments:**
 

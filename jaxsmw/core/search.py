@@ -107,9 +107,9 @@ def in_blocks(
 def _maximum(values: Array, axis: int, parts: int) -> Array:
     """Returns the maximum along an axis.
 
-    The axis is first divided into parts of equal width, which may overlap. The elementwise maximum of all
-    parts has this width, and the function returns its maximum along the axis. On CPUs, this order of
-    operations reduces the time of a search by about 10 %.
+    The function divides the axis into parts of equal width, which may overlap, and computes the elementwise
+    maximum of all parts. The result is the maximum of this narrower array along the axis. On CPUs, this order
+    of operations reduces the time of a search by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -132,7 +132,7 @@ def _nearest(
     masked: Bool[Array, "c block"],
     n: int,
 ) -> Int[Array, " block"]:
-    """Returns the database row of the candidate that is nearest to each query.
+    """Return, for each query, the database row of the nearest candidate.
 
     If several candidates are equally near, the result is the lowest row. If all distances are NaN, the result
     is n.
@@ -152,11 +152,11 @@ class Patches(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (p, s), the indices of the s points of each of the p patches, in ascending order, with padding
-      at the end.
+    - `rows`: (p, s), one row per patch: the indices of the patch's points in ascending order, with padding at
+      the end.
     - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch. These
-      combinations give the r directions along which the points of the patch differ most.
+    - `variations`: (p, r, s), for each patch, the coefficients of r linear combinations of its s points.
+      These combinations are the r directions along which the points of the patch differ most.
     """
 
     rows: Int32[Array, "p s"]
@@ -203,7 +203,7 @@ def _halved(
 ) -> Int32[Array, " total"]:
     """Returns the indices of all points, ordered by patch.
 
-    Each of the 2^levels equal parts of this array contains the points of one patch.
+    This array has 2^levels parts of equal length, and each part contains the points of one patch.
     """
     total, dtype = coordinates.shape[0], coordinates.dtype
 
@@ -254,7 +254,7 @@ def _centered(
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """Returns r orthonormal vectors for each group, whose span contains the r given vectors of the group."""
+    """Return, for each group, r orthonormal vectors whose span contains the r given vectors of the group."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -268,12 +268,12 @@ def nearest_neighbor_in_patches(
 
     Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
-    gives a lower bound on the distances from a query to the points of the patch. The computation of this
-    bound needs only r + 1 scalar products. For each query, the patch with the nearest box gives a first
-    candidate. The queries are also divided into patches. The search skips a database patch for a whole patch
-    of queries if the database patch cannot contain a nearer point for any of these queries. The bounds allow
-    for rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions,
-    the search skips no patch, and `nearest_neighbor` is faster.
+    gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
+    only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. The
+    queries are divided into patches, too. If a database patch cannot contain a nearer point for any query of
+    a patch, the search skips the database patch for this whole patch of queries. The bounds allow for
+    rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions, the
+    search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
@@ -328,7 +328,7 @@ def nearest_vertices(
     database_mask: Bool[Array, " n"],
     patches: tuple[Patches, Patches] | None,
 ) -> Int32[Array, " m"]:
-    """Returns the index of the database row that is nearest to each query, (m,).
+    """Return, for each query, the index of the nearest database row, (m,).
 
     `patches` contains the patches of the queries and the patches of the database, as returned by
     `make_patches`. If `patches` is None, the search is exhaustive. The exhaustive search never chooses rows
@@ -408,8 +408,8 @@ def _bounds(
 
     **Returns:** Two arrays (p, block) and a list. The first array contains the squared distances from the
     queries to the boxes around the patches. The second array contains lower bounds on the distances from the
-    queries to the points of the patches. Entry i of the list is an array (p, block). It contains
-    coordinate i of each query, relative to the centre of the patch.
+    queries to the points of the patches. Entry i of the list is an array (p, block), which contains
+    coordinate i of each query relative to the centre of each patch.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
@@ -433,8 +433,8 @@ def _distance_to_promising_patch(
 ) -> Float[Array, " block"]:
     """Returns the distance from each query to one point of the patch with the nearest box.
 
-    Among the points of this patch, the function chooses the nearest point after projection onto the axes of
-    the box.
+    Of all points of this patch, the function chooses the one that is nearest to the query after projection
+    onto the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
     # A minimum, followed by a search for its position, takes a third of the time of argmin.
@@ -463,7 +463,7 @@ class _Found(NamedTuple):
 def _two_best_rows(
     boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
-    """Finds the two best candidates of each query, in two different patches, among the needed patches.
+    """Find, for each query, the two best candidates from two different patches among the needed patches.
 
     Each step of the search compares the queries with _GROUP patches.
 

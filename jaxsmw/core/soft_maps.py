@@ -1,8 +1,8 @@
 """Soft maps, which match each query point to several database points with differentiable shares.
 
 A `Recovery` computes a soft map from two point sets. `Softmax` computes the shares of a query from its
-distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` also
-makes the total area that each database point receives equal to the point's own area.
+distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` adjusts
+the shares so that the total area that each database point receives equals its own area.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class SoftMap(eqx.Module):
       area-weighted mean of the database is the origin.
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
       zero. The shares of a query of area zero are still computed from its position.
-    - `potentials`: g (n,), without unit. A database row with a higher potential receives larger shares
-      from all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
+    - `potentials`: g (n,), dimensionless. A database row with a higher potential receives larger shares from
+      all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
       computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
-    - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
-      areas. It is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
+    - `residual`: the share of the total area that database rows receive in excess of their own areas, from 0
+      to 1. The residual is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
     - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
       residual is NaN.
     - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
@@ -146,7 +146,7 @@ class SparseSoftMap(eqx.Module):
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the index of the nearest database row of each query, (m,)."""
+        """Return, for each query, the index of the nearest database row, (m,)."""
         return self.rows[:, 0]
 
 
@@ -184,9 +184,9 @@ class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
     This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
-    `refine_softly` or `WaveletPreservationLayer`. `refine_softly` passes the m vertices of X in the spectral
-    embedding as queries, and the n vertices of Y as database rows. Ready subclasses are `Softmax`,
-    `NearestFew` and `Sinkhorn`.
+    `refine_softly` or `WaveletPreservationLayer`. In `refine_softly`, the points belong to the spectral
+    embedding: the m vertices of X are the queries, and the n vertices of Y are the database rows. Ready
+    subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
     The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
@@ -216,8 +216,8 @@ class Softmax(Recovery):
     """A recovery that gives shares to all database rows, and larger shares to nearer rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
     `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
@@ -256,8 +256,8 @@ class NearestFew(Recovery):
     """A recovery that gives shares only to the nearest database rows of each query.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
     where `distance` is the distance between the query and the row. The shares are differentiable, but
@@ -315,8 +315,8 @@ class Sinkhorn(Recovery):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The function `sinkhorn` computes the shares. The area that all queries together send to a database row
     equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
@@ -329,7 +329,7 @@ class Sinkhorn(Recovery):
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
       nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps and need more iterations.
-    - `iterations`: the largest number of iterations of `sinkhorn`, an integer of at least 1.
+    - `iterations`: the maximum number of iterations of `sinkhorn`, an integer of at least 1.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
 
@@ -404,7 +404,7 @@ def sinkhorn(
       times the variance. If the temperature is below this error, the error is used as the temperature. In
       this case, derivatives with respect to the temperature are zero. If the temperature is not positive, the
       result is NaN.
-    - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
+    - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
       are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
@@ -485,7 +485,7 @@ def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Returns `-distance² / temperature` up to an additive constant for each query.
+    """Return `-distance² / temperature`, up to a constant that depends only on the query.
 
     The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
     at once. This layout halves the run time.

@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""A function that takes a functional map to the functional map of the next iteration and a status code."""
+"""A function that takes a functional map, and returns the next functional map and a status code."""
 
 
 class SoftRefinement(eqx.Module):
@@ -33,9 +33,9 @@ class SoftRefinement(eqx.Module):
     - `functional_map`: the final functional map C (k_out, k_in). By default, C is a pullback (k_X, k_Y),
       which takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y,
       k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
-    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C. Its
-      `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()` returns an integer
-      array (m,).
+    - `soft_map`: the soft map from X to Y that the recovery computes from C, a `SoftMap` or a
+      `SparseSoftMap`. Its `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()`
+      returns an integer array (m,).
     - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
       `RESULTS[result]` is a sentence that explains the status.
     - `iterations`: the number of functional maps that were computed after the first functional map.
@@ -290,8 +290,8 @@ def _to_the_fixed_point(
 ) -> _Loop:
     """Iterates up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # One more iteration gives the status code of an update and the last change of the functional map, which
-    # the fixed-point solver does not return.
+    # The fixed-point solver returns neither the status code of an update nor the last change of the
+    # functional map. One more iteration computes both.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)

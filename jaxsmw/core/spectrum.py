@@ -70,8 +70,10 @@ class Spectrum(eqx.Module):
         )
 
     def reflect(self) -> Spectrum:
-        """Returns the spectrum of the mirror image: the first coordinates of all positions and normals change
-        their signs. The attribute `descriptors` is not changed.
+        """Return the spectrum of the mirror image.
+
+        The first coordinate of each position and of each normal changes its sign. The attribute `descriptors`
+        is not changed.
         """
         flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(
@@ -100,9 +102,9 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
-        """Returns the spectrum with masked vertices appended, up to `number_of_vertices` vertices in total.
+        """Return the spectrum with masked vertices appended, so that it has `number_of_vertices` vertices.
 
-        **Raises:** `ValueError` if the shape already has more vertices.
+        **Raises:** `ValueError` if the shape already has more than `number_of_vertices` vertices.
         """
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:

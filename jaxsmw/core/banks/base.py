@@ -37,7 +37,7 @@ class FilterBank(eqx.Module):
         - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
           last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other eigenvalues.
 
-        **Returns:** The responses (filters, p), numbers without unit. Row 0 is the scaling function.
+        **Returns:** The responses (filters, p), which are dimensionless. Row 0 is the scaling function.
         """
 
 

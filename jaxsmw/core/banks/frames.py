@@ -34,7 +34,8 @@ class FrameBounds(NamedTuple):
 
     **Attributes:**
 
-    - `lower`, `upper`: the minimum and the maximum of the frame function, arrays of shape () without unit.
+    - `lower`, `upper`: the minimum and the maximum of the frame function, as dimensionless arrays of shape
+      ().
     """
 
     lower: Float[Array, ""]
@@ -68,7 +69,7 @@ def frame_bounds(
       filters.
 
     **Returns:** A `FrameBounds` with the attributes `lower` and `upper`, the smallest and the largest value
-    of G, as arrays of shape () without unit.
+    of G, as dimensionless arrays of shape ().
 
     **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
     the bank returns responses that are not of shape (filters, points).

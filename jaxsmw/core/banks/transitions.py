@@ -71,9 +71,9 @@ def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 class Meyer(_DyadicBands):
     """The Meyer frame: a filter bank of octave bands that is a Parseval frame.
 
-    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. It
-    falls to 0 over the next octave, while the first wavelet rises. The last wavelet rises from
-    `lambda_max / 2` to lambda_max.
+    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. The
+    scaling function then falls to 0 over the next octave, while the first wavelet rises. The last wavelet
+    rises from `lambda_max / 2` to lambda_max.
 
     `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
     is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same

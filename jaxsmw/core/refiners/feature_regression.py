@@ -42,8 +42,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
     increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. If the initial map is as accurate as a result of
-    `WaveletPreservation`, refinement reduces its error. docs/accuracy.md contains the measurements.
+    The method does not assume isometry. Refinement reduces the error of an initial map that is as accurate as
+    a map from `WaveletPreservation`. docs/accuracy.md contains the measurements.
 
     If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
     smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
@@ -113,14 +113,14 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the Mahalanobis distance, (m,)."""
+        """Return, for each vertex of X, the nearest vertex of Y in the Mahalanobis distance, (m,)."""
         if prepared.patches is None:
             return state.forward.search(prepared.x, prepared.all_y)
         queries, database = self._eigenvector_embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
-        """Returns the vertex of X that is nearest to each vertex of Y, (n,).
+        """Return, for each vertex of Y, the nearest vertex of X, (n,).
 
         Distances are computed between the points of `embeddings`.
         """
@@ -138,7 +138,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
-        """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
+        """Return dimensionless points (m, d_x) for X and (n, d_x) for Y.
 
         The dimension d_x is the number of features of X. The distance between a point of X and a point of Y
         is a Mahalanobis distance. This distance compares the features of the vertex of X with the prediction
@@ -160,11 +160,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The features, weights and mask of the vertices of one shape. The weights are the vertex areas, scaled
-    to sum 1.
+    """The features, weights and mask of the vertices of one shape.
 
     Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
-    vertex if the spectrum has descriptors.
+    vertex if the spectrum has descriptors. The weights are the vertex areas, scaled so that they sum to 1.
     """
 
     values: Float[Array, "n d"]
@@ -226,13 +225,13 @@ class Prediction(NamedTuple):
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
-        """Returns the target vertex that is nearest to each query vertex, (m,)."""
+        """Return, for each query vertex, the nearest target vertex, (m,)."""
         return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """Returns the squared distance from each query vertex to its match, (m,), without unit."""
+        """Return the squared distance from each query vertex to its match, (m,), dimensionless."""
         points, database = self.embeddings(queries, targets)
         return jnp.sum((points - database[matches]) ** 2, axis=1)
 

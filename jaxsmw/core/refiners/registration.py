@@ -139,12 +139,12 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,)."""
+        """Return, for each vertex of X, the nearest vertex of Y in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
-        """Returns the vertex of X that is nearest to each vertex of Y in the `embeddings`, (n,)."""
+        """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
         database, queries = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.x.mask, prepared.reverse_patches)
 
@@ -217,7 +217,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Returns a surface that contains only the given vertices (s,), whose spectrum is `spectrum`."""
+        """Return a surface that contains only the given vertices (s,), with their spectrum `spectrum`."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)

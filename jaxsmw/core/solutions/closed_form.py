@@ -40,10 +40,10 @@ class Filtering(Solution[PreparedFiltering]):
     """A solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (equation (8) of the MWP paper), where g_l
-    are the filters of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the
-    shape that C maps to and of the shape that C maps from. The sum equals the elementwise product of C_0 and
-    the `multiscale_kernel` of the bank, so no linear system is solved. `Filtering` is a `Solution`, for the
-    argument `solution` of `WaveletPreservation`.
+    are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C
+    maps to. The diagonal matrix Lambda_in contains the eigenvalues of the shape that C maps from. The sum
+    equals the elementwise product of C_0 and the `multiscale_kernel` of the bank, so no linear system is
+    solved. `Filtering` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close

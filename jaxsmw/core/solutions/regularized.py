@@ -45,9 +45,10 @@ class RegularizedLeastSquares(Solution[None]):
     functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
-      Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps from. Both
-      matrices are divided by the larger of the two shapes' largest eigenvalues.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
+      the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains the eigenvalues of
+      the shape that C maps from. Both matrices are divided by the larger of the two shapes' largest
+      eigenvalues.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
@@ -62,9 +63,9 @@ class RegularizedLeastSquares(Solution[None]):
 
     The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. First,
     these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
-    steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver starts from the
-    functional map of the previous iteration; in the first iteration, it starts from an estimate. C is
-    differentiable, by implicit differentiation at the minimum.
+    steps. The linear system of each step is solved by conjugate gradients, without a matrix of size k² x k².
+    The solver starts from the functional map of the previous iteration; in the first iteration, it starts
+    from an estimate. C is differentiable, by implicit differentiation at the minimum.
 
     The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
@@ -79,9 +80,9 @@ class RegularizedLeastSquares(Solution[None]):
       `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
       by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: a positive number, by default 1e-3, which is both the relative and the absolute
+    - `tolerance`: a positive number, by default 1e-3. This number is both the relative and the absolute
       tolerance of `optimistix.GaussNewton`.
-    - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
+    - `max_steps`: the maximum number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
     **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
