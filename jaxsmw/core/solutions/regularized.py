@@ -87,8 +87,8 @@ class RegularizedLeastSquares(Solution[None]):
 
     **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
     `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given, but neither descriptor
-    term has a weight, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
+    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given without a weight for a
+    descriptor term, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
     `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
     """
 
