@@ -81,7 +81,7 @@ class Refinement(eqx.Module):
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
-        """Returns the same refinement without the vertices that `Spectrum.pad` added to X.
+        """Return the same refinement without the vertices that `Spectrum.pad` added to X.
 
         **Arguments:**
 
@@ -200,7 +200,7 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Appends the final search of all vertices to the record of a refinement on samples.
+        """Append the final search of all vertices to the record of a refinement on samples.
 
         The first and the last map cannot be compared with an earlier map of the same vertices, so their
         entries in `changed` become NaN.
@@ -214,7 +214,7 @@ class _Record(NamedTuple):
         )
 
     def history(self, successful: Bool[Array, ""]) -> History:
-        """Returns the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
+        """Return the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
         maps = self.pointwise_map
         if maps is not None:
             maps = jnp.where(successful, maps, -1)
@@ -239,7 +239,7 @@ class _Loop:
     def init(
         self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """Computes the first state from the initial map of all vertices.
+        """Compute the first state from the initial map of all vertices.
 
         The first iteration compares its map with `first_map` to count the changed matches. `first_map` is the
         initial map or, if the loop runs on samples, an array of -1.
@@ -256,7 +256,7 @@ class _Loop:
         )
 
     def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        """Runs one iteration, or does nothing if the loop has terminated."""
+        """Run one iteration, or do nothing if the loop has terminated."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
         return lax.cond(
@@ -264,15 +264,15 @@ class _Loop:
         )
 
     def terminate(self, progress: _Progress) -> Bool[Array, ""]:
-        """Returns whether the loop has finished its last iteration."""
+        """Return whether the loop has finished its last iteration."""
         return progress.finished
 
     def search(
         self, prepared: Prepared, state: State, before: Int32[Array, " s"]
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """Recovers the pointwise map from a state.
+        """Recover the pointwise map from a state.
 
-        Returns the map, the share of matches that differ from the map `before`, and the objective.
+        Return the map, the share of matches that differ from the map `before`, and the objective.
         """
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
@@ -339,7 +339,7 @@ def _check_arguments(
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Checks that both arguments are spectra and have the same float type.
+    """Check that both arguments are spectra and have the same float type.
 
     **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the spectra have different
     float types.
@@ -355,7 +355,7 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Checks the state that an update computed, and returns the status code of the update.
+    """Check the state that an update computed, and return the status code of the update.
 
     If `result` is a failure, this failure is returned unchanged. A state also counts as a failure if it
     contains NaN or infinity, or if all entries of its functional map are zero.
@@ -369,7 +369,7 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Checks the inputs of a refinement, and returns the status code of the refinement.
+    """Check the inputs of a refinement, and return the status code of the refinement.
 
     If a spectrum contains NaN or infinity, or the initial map is invalid, the status code names this fault.
     If the inputs are valid, `result` is returned unchanged.

@@ -67,7 +67,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfers functions on Y, such as colours, to the queries.
+        """Transfer functions on Y, such as colours, to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -95,7 +95,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns, for each query, the index of the database row with the largest share per area, (m,).
+        """Return, for each query, the index of the database row with the largest share per area, (m,).
 
         The shares are divided by the areas of the rows, because shares alone would favour rows of large area.
         """
@@ -123,7 +123,7 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfers functions on Y, such as colours, to the queries.
+        """Transfer functions on Y, such as colours, to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -155,7 +155,7 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Transfers functions on Y to X along a pointwise map or a soft map from X to Y.
+    """Transfer functions on Y to X along a pointwise map or a soft map from X to Y.
 
     With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
     receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
@@ -202,7 +202,7 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """Returns the soft map from the queries to the database. Database rows of zero area have share zero.
+        """Return the soft map from the queries to the database. Database rows of zero area have share zero.
 
         **Arguments:**
 
@@ -245,7 +245,7 @@ class Softmax(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
@@ -294,7 +294,7 @@ class NearestFew(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
@@ -357,7 +357,7 @@ class Sinkhorn(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         return sinkhorn(
             queries,
             database,
@@ -379,7 +379,7 @@ def sinkhorn(
     iterations: int = 200,
     tolerance: float | Float[Array, ""] = 0.01,
 ) -> SoftMap:
-    """Returns the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
+    """Return the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
 
     The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
     transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
@@ -438,7 +438,7 @@ class _SinkhornState(NamedTuple):
 def _sinkhorn_potentials(
     transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]
 ) -> tuple[Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]:
-    """Returns the potentials of `sinkhorn`, their residual, and the number of iterations."""
+    """Return the potentials of `sinkhorn`, their residual, and the number of iterations."""
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape
     log_b, rest = _log(b), -m % _BLOCK
@@ -448,7 +448,7 @@ def _sinkhorn_potentials(
     )
 
     def update(potentials: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """Returns the next potentials, and the residual of the given potentials."""
+        """Return the next potentials, and the residual of the given potentials."""
 
         def add(arrived: Float[Array, " n"], block: tuple[Array, Array]) -> tuple[Float[Array, " n"], None]:
             log_shares = _log_kernel(database, block[0], temperature) + (log_b + potentials)[:, None]
@@ -475,7 +475,7 @@ def _sinkhorn_potentials(
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the logarithms of areas.
+    """Return the logarithms of areas.
 
     The logarithm of a zero area is -inf, and its derivative is zero instead of infinity.
     """
@@ -513,7 +513,7 @@ class _Transport(NamedTuple):
         converged: Bool[Array, ""],
         iterations: Int32[Array, ""],
     ) -> SoftMap:
-        """Returns the soft map with the given potentials."""
+        """Return the soft map with the given potentials."""
         points, areas = (self.queries, self.database), (self.query_areas, self.database_areas)
         return SoftMap(*points, *areas, potentials, self.temperature, residual, converged, iterations)
 
@@ -525,7 +525,7 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Scales the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
+    """Scale the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
 
     The centre of the database becomes the origin, because distances between points far from the origin have
     large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A

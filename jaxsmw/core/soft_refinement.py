@@ -63,7 +63,7 @@ def refine_softly(
     differentiation: Differentiation = "checkpointed",
     tolerance: float = 1e-4,
 ) -> SoftRefinement:
-    """Refines a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
+    """Refine a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
 
     The outcome is differentiable with respect to the spectra, the parameters of the filter bank, the weights
     and descriptors of the solution, and the temperature of the recovery. If the initial map is a soft map,
@@ -140,7 +140,7 @@ def refine_softly(
 
 
 def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
-    """Returns the vertices of Y that an initial map contains, or None for a dense soft map.
+    """Return the vertices of Y that an initial map contains, or None for a dense soft map.
 
     **Raises:** `ValueError` if the map has the wrong size; `TypeError` if the argument is neither an array
     nor a soft map.
@@ -216,7 +216,7 @@ class WaveletPreservationLayer(eqx.Module):
         spectrum_x: Spectrum,
         spectrum_y: Spectrum,
     ) -> SoftRefinement:
-        """Matches two shapes by the features of their vertices.
+        """Match two shapes by the features of their vertices.
 
         **Arguments:**
 
@@ -265,7 +265,7 @@ class _Loop(NamedTuple):
 def _through_iterations(
     step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
 ) -> _Loop:
-    """Runs a fixed number of iterations. Derivatives are computed through all iterations."""
+    """Run a fixed number of iterations. Derivatives are computed through all iterations."""
 
     def follow(state: _State, _: None) -> tuple[_State, None]:
         following, how = step(state.functional_map)
@@ -288,7 +288,7 @@ class _State(NamedTuple):
 def _to_the_fixed_point(
     step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
 ) -> _Loop:
-    """Iterates up to the fixed point. Derivatives are computed by the implicit function theorem."""
+    """Iterate up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
     # The fixed-point solver returns neither the status code of an update nor the last change of the
     # functional map. One more iteration computes both.
@@ -303,7 +303,7 @@ def _fixed_point(
     iterations: int,
     tolerance: float,
 ) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
-    """Returns the fixed point of a step, the number of iterations, and whether the iterations converged."""
+    """Return the fixed point of a step, the number of iterations, and whether the iterations converged."""
     # These imports are local because they take as long as the computation of an eigenbasis.
     import lineax as lx
     import optimistix as optx
@@ -333,7 +333,7 @@ def _fixed_point(
 def _differentiable_if(
     converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map, with NaN derivatives if the iterations have not converged.
+    """Return the functional map, with NaN derivatives if the iterations have not converged.
 
     The implicit function theorem holds only at fixed points.
     """

@@ -24,7 +24,7 @@ def nearest_point_on_triangles(
     *,
     face_mask: Bool[Array, " f"] | None = None,
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Finds, for each query, the nearest point on a set of triangles in a space of any dimension.
+    """Find, for each query, the nearest point on a set of triangles in a space of any dimension.
 
     The search is exact up to rounding errors, in Euclidean distance. Every query is compared with all
     triangles, but no array of size m x f is stored. If the nearest point belongs to several triangles, for
@@ -76,7 +76,7 @@ def nearest_point_on_candidates(
     rows: Int[Array, " p"],
     candidates: Int[Array, " p"],
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Finds, for each query, the nearest point on the query's own candidate triangles, in any dimension.
+    """Find, for each query, the nearest point on the query's own candidate triangles, in any dimension.
 
     The time grows with the number of candidates, not with the number of all triangles.
 

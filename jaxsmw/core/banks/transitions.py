@@ -24,7 +24,7 @@ class _Transitions(FilterBank):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        """Returns the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
+        """Return the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -47,7 +47,7 @@ class _DyadicBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
+        """Return `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
@@ -60,7 +60,7 @@ class _DyadicBands(_Transitions):
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns the Meyer polynomial nu(u), elementwise, for numbers u from 0 to 1.
+    """Return the Meyer polynomial nu(u), elementwise, for numbers u from 0 to 1.
 
     The polynomial rises from 0 to 1, and its first 3 derivatives vanish at 0 and 1. It satisfies
     `nu(u) + nu(1 - u) = 1`.
@@ -130,7 +130,7 @@ class _TwoBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Returns `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
+        """Return `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]

@@ -27,7 +27,7 @@ class Warp(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Returns the warped points (p,), in any unit.
+        """Return the warped points (p,), in any unit.
 
         **Arguments:**
 

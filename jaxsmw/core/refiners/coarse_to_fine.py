@@ -88,13 +88,13 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
         return active(sizes[0]), active(sizes[1])
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether this iteration and all later iterations use all eigenvectors."""
+        """Return whether this iteration and all later iterations use all eigenvectors."""
         assert isinstance(state, CoarseToFineState)
         return state.iteration >= len(self.levels)
 
 
 def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Checks that two shapes have the same number of descriptors, which may be zero.
+    """Check that two shapes have the same number of descriptors, which may be zero.
 
     **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
     """

@@ -68,7 +68,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
-        """Collects the features of all vertices and, if there are samples, of the samples.
+        """Collect the features of all vertices and, if there are samples, of the samples.
 
         **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
         """
@@ -85,7 +85,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Computes both regressions from matched features. Returns the next state and `RESULTS.successful`.
+        """Compute both regressions from matched features. Return the next state and `RESULTS.successful`.
 
         If there is a previous state, the regressions also use the matches of the reverse map.
         """
@@ -132,7 +132,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def energy(
         self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the uncertainty of the predictions; see `Regression.uncertainty`."""
+        """Return the uncertainty of the predictions; see `Regression.uncertainty`."""
         return state.uncertainty
 
     def embeddings(
@@ -149,7 +149,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Returns the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
+        """Return the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
 
         The search in patches uses only these coordinates, because the vertices of a patch are close together
         in them.
@@ -221,7 +221,7 @@ class Prediction(NamedTuple):
     def embeddings(
         self, queries: _Features, targets: _Features
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
-        """Returns the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
+        """Return the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
@@ -282,7 +282,7 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """Returns the functional map, and the prediction of the features of X from the features of Y.
+    """Return the functional map, and the prediction of the features of X from the features of Y.
 
     The functional map and the prediction use only the active eigenvectors.
     """

@@ -83,7 +83,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Returns a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
+        """Return a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
 
         **Arguments:**
 
@@ -106,7 +106,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         )
 
     def prepare(self, problem: Problem) -> PreparedWavelets:
-        """Evaluates the filter bank, and prepares the solution and the nearest-neighbour search."""
+        """Evaluate the filter bank, and prepare the solution and the nearest-neighbour search."""
         spectrum_x, spectrum_y = problem.query_spectra()
         wavelets = self.problem(spectrum_x, spectrum_y, sampled=problem.samples is not None)
         patches = chosen_patches(self.search, spectrum_x, spectrum_y)
@@ -115,7 +115,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Computes the functional map with `solution`. Returns the next state and a status code.
+        """Compute the functional map with `solution`. Return the next state and a status code.
 
         The status code is a member of `RESULTS`.
         """
@@ -137,13 +137,13 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the energy of equation (5) of the MWP paper, with the vertex areas as weights."""
+        """Return the energy of equation (5) of the MWP paper, with the vertex areas as weights."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(
         self, prepared: PreparedWavelets, state: State
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Returns the `spectral_embeddings` of the functional map."""
+        """Return the `spectral_embeddings` of the functional map."""
         return spectral_embeddings(
             state.functional_map, prepared.spectrum_x, prepared.spectrum_y, convention=self.convention
         )

@@ -65,7 +65,7 @@ class Filtering(Solution[PreparedFiltering]):
         check_choice("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
-        """Returns the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
+        """Return the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
         spectrum_out, _ = problem.spectra
         pseudo_inverse: PseudoInverse = "least_squares" if problem.sampled else self.pseudo_inverse
         return PreparedFiltering(
@@ -79,7 +79,7 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the filtered map C (k_out, k_in), and `RESULTS.successful`."""
+        """Return the filtered map C (k_out, k_in), and `RESULTS.successful`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
@@ -102,7 +102,7 @@ class NearestOrthogonal(Solution[PreparedT]):
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
-        """Returns the values that the other solution prepares."""
+        """Return the values that the other solution prepares."""
         return self.solution.prepare(problem)
 
     def solve(
@@ -112,7 +112,7 @@ class NearestOrthogonal(Solution[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the polar factor (k_out, k_in) of the other solution's map, and the status code."""
+        """Return the polar factor (k_out, k_in) of the other solution's map, and the status code."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
         return product(left, right), result
@@ -149,7 +149,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
+        """Return the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

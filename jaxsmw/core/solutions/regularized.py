@@ -140,7 +140,7 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
+        """Return the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
 
         The solver starts from `previous`, or from an estimate if `previous` is None.
 
@@ -167,7 +167,7 @@ class RegularizedLeastSquares(Solution[None]):
         *,
         initial: Float[Array, "k_out k_in"] | None = None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the weighted terms, with a given energy in place of the wavelet-preservation energy.
+        """Minimise the weighted terms, with a given energy in place of the wavelet-preservation energy.
 
         **Arguments:**
 
@@ -195,7 +195,7 @@ class RegularizedLeastSquares(Solution[None]):
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
         initial: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Implements `solve` and `minimize`.
+        """Implement `solve` and `minimize`.
 
         `descriptors` contains the descriptors of the shape that C maps to, and then those of the other shape.
         """
@@ -228,7 +228,7 @@ class RegularizedLeastSquares(Solution[None]):
         shape: tuple[int, int],
         dtype: DTypeLike,
     ) -> QuadraticEnergy:
-        """Returns the weighted sum of the given energy and the descriptor-preservation term."""
+        """Return the weighted sum of the given energy and the descriptor-preservation term."""
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError(
                 "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
@@ -257,7 +257,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_in: Float[Array, " k_in"],
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Returns all terms of the objective that have a weight. The first term is the quadratic energy."""
+        """Return all terms of the objective that have a weight. The first term is the quadratic energy."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -278,9 +278,9 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
+        """Minimise the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
 
-        Returns the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
+        Return the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
 
         If `solvable` is False, the residuals are replaced by zeros, so the solver stops immediately.
         """
@@ -322,7 +322,7 @@ class _Term(NamedTuple):
 
 
 def _energy_term(energy: QuadraticEnergy) -> _Term:
-    """Returns the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
+    """Return the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
 
     The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
     the gram matrix, because the factor has the same inner products as the columns. Adding the rounding error
@@ -339,7 +339,7 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """Returns the weighted term of Laplacian commutativity."""
+    """Return the weighted term of Laplacian commutativity."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -347,7 +347,7 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """Returns the weighted term of orthogonality."""
+    """Return the weighted term of orthogonality."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -355,7 +355,7 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """Returns the weighted term of descriptor commutativity."""
+    """Return the weighted term of descriptor commutativity."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
