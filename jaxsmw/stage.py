@@ -162,8 +162,9 @@ class Stage:
     ) -> tuple[Spectrum, Spectrum]:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        For a partial pair, the spectra are then cut at a common limit, the smaller of their two largest
-        eigenvalues: eigenpairs with eigenvalues above this limit are removed (`jaxsmw.pair.common_range`).
+        For a partial pair, the spectra are then cut at a common limit, the smaller of the two spectra's
+        largest eigenvalues: eigenpairs with eigenvalues above this limit are removed
+        (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 
